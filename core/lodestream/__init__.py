@@ -1,0 +1,98 @@
+"""Lodestream: progressive transmission of structured quadrilateral surfaces.
+
+Names are loaded when they are first used, so that importing this package loads neither the compiler of the kernels nor
+any reader of files.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .decoder import Decoder, View, decode
+    from .encoder import encode
+    from .errors import (
+        CorruptStreamError,
+        FormatError,
+        InputError,
+        LodestreamError,
+        NotFoundError,
+        OptionError,
+        ProtocolError,
+        RemoteError,
+        StreamError,
+        TooLargeError,
+        TruncatedStreamError,
+        UnsupportedVersionError,
+    )
+    from .formats import read, write
+    from .hierarchy import coarsen, hierarchy
+    from .surface import Surface
+    from .target import Target, Tolerance
+
+_HOMES = {
+    "Decoder": "decoder",
+    "View": "decoder",
+    "decode": "decoder",
+    "encode": "encoder",
+    "CorruptStreamError": "errors",
+    "FormatError": "errors",
+    "InputError": "errors",
+    "LodestreamError": "errors",
+    "NotFoundError": "errors",
+    "OptionError": "errors",
+    "ProtocolError": "errors",
+    "RemoteError": "errors",
+    "StreamError": "errors",
+    "TooLargeError": "errors",
+    "TruncatedStreamError": "errors",
+    "UnsupportedVersionError": "errors",
+    "read": "formats",
+    "write": "formats",
+    "coarsen": "hierarchy",
+    "hierarchy": "hierarchy",
+    "Surface": "surface",
+    "Target": "target",
+    "Tolerance": "target",
+}
+
+__all__ = [
+    "CorruptStreamError",
+    "Decoder",
+    "FormatError",
+    "InputError",
+    "LodestreamError",
+    "NotFoundError",
+    "OptionError",
+    "ProtocolError",
+    "RemoteError",
+    "StreamError",
+    "Surface",
+    "Target",
+    "Tolerance",
+    "TooLargeError",
+    "TruncatedStreamError",
+    "UnsupportedVersionError",
+    "View",
+    "coarsen",
+    "decode",
+    "encode",
+    "hierarchy",
+    "read",
+    "write",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,116 @@
+"""Everything that Lodestream raises on purpose.
+
+::
+
+    LodestreamError
+    ├── InputError (ValueError)          what you gave cannot be used
+    │   ├── FormatError                  a file is not what it says, is cut short, or holds no structured surface
+    │   ├── TooLargeError                more bytes or vertices than allowed
+    │   └── OptionError                  an option, level or format that does not exist; names those that do
+    ├── NotFoundError (LookupError)      no such surface
+    ├── StreamError                      the bytes of a container cannot be used
+    │   ├── CorruptStreamError           damaged, with the offset
+    │   ├── TruncatedStreamError         ends before what was asked for
+    │   └── UnsupportedVersionError      newer than this program, naming both versions
+    ├── ProtocolError                    a message out of turn or out of shape
+    │   ├── LocalProtocolError           by this side
+    │   └── RemoteProtocolError          by the other side
+    └── RemoteError                      the other side refused, with its code and reason
+
+One class for each reaction that a caller may have. Each message says what was expected, what came, and where.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CorruptStreamError",
+    "FormatError",
+    "InputError",
+    "LocalProtocolError",
+    "LodestreamError",
+    "NotFoundError",
+    "OptionError",
+    "ProtocolError",
+    "RemoteError",
+    "RemoteProtocolError",
+    "StreamError",
+    "TooLargeError",
+    "TruncatedStreamError",
+    "UnsupportedVersionError",
+]
+
+
+class LodestreamError(Exception):
+    """Base of everything that Lodestream raises on purpose."""
+
+
+class InputError(LodestreamError, ValueError):
+    """What the caller gave cannot be used."""
+
+
+class FormatError(InputError):
+    """A file is not what it says, is cut short, or holds no structured surface."""
+
+
+class TooLargeError(InputError):
+    """More bytes or vertices than allowed."""
+
+
+class OptionError(InputError):
+    """An option, level or format that does not exist, or a value that it does not take."""
+
+
+class NotFoundError(LodestreamError, LookupError):
+    """There is no such surface."""
+
+
+class StreamError(LodestreamError):
+    """The bytes of a container cannot be used."""
+
+
+class CorruptStreamError(StreamError):
+    """The bytes of a container are damaged.
+
+    Attributes
+    ----------
+    offset : int
+        Place in the container, in bytes from its start, of the part that failed its check.
+    """
+
+    def __init__(self, message: str, offset: int) -> None:
+        super().__init__(f"{message} (at byte {offset})")
+        self.offset = offset
+
+
+class TruncatedStreamError(StreamError):
+    """A container ends before what was asked for."""
+
+
+class UnsupportedVersionError(StreamError):
+    """A container or peer that is newer than this program."""
+
+
+class ProtocolError(LodestreamError):
+    """A message out of turn or out of shape."""
+
+
+class LocalProtocolError(ProtocolError):
+    """This side tried to send what the protocol does not allow now."""
+
+
+class RemoteProtocolError(ProtocolError):
+    """The other side sent what the protocol does not allow now."""
+
+
+class RemoteError(LodestreamError):
+    """The other side refused.
+
+    Attributes
+    ----------
+    code : str
+        Word from the table of error codes in ``docs/protocol.md``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code

@@ -1,0 +1,87 @@
+"""What a receiver wants of a surface: how far to refine it, and in which order."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from .errors import OptionError
+
+__all__ = ["Order", "Target", "Tolerance"]
+
+Order = Literal["quality", "level"]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """An error in the surface's unit, or relative to its extent.
+
+    The extent is the range of the values (heights) or the diagonal of the box (otherwise).
+    """
+
+    value: float
+    relative: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.value) and self.value >= 0):
+            raise OptionError(f"expected an error of 0 or more, got {self.value}")
+
+    @classmethod
+    def parse(cls, text: str) -> Tolerance:
+        """Read ``0.5`` (in the unit) or ``1e-3d`` (times the extent).
+
+        Raises
+        ------
+        OptionError
+            When the text is neither.
+        """
+        number, relative = (text[:-1], True) if text.endswith("d") else (text, False)
+        try:
+            return cls(float(number), relative)
+        except ValueError:
+            raise OptionError(f"expected a number such as 0.5, or 1e-3d for a fraction of the extent, got {text!r}") from None
+
+    def absolute(self, extent: float) -> float:
+        """The tolerance in the surface's unit, for a surface of this extent."""
+        return self.value * extent if self.relative else self.value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """Where to stop, and the order on the way there; without limits, the whole surface.
+
+    Parameters
+    ----------
+    level : int or None
+        Decode levels up to this one only and nothing finer; excludes the other limits.
+    until_rms, until_max : Tolerance or None
+        Stop at the first layer whose error is at most this.
+    max_bytes : int or None
+        Stop at the last layer that ends within so many bytes of the container.
+    seconds : float or None
+        Stop when so much time has passed; the receiver's business, `plan` does not look at it.
+    order : "quality" or "level"
+        Quality order sends bits in order of what they do to the error; level order sends level by level, and limits
+        then stop at a level's end.
+    """
+
+    level: int | None = None
+    until_rms: Tolerance | None = None
+    until_max: Tolerance | None = None
+    max_bytes: int | None = None
+    seconds: float | None = None
+    order: Order = "quality"
+
+    def __post_init__(self) -> None:
+        limits = (self.until_rms, self.until_max, self.max_bytes, self.seconds)
+        if self.level is not None and any(limit is not None for limit in limits):
+            raise OptionError("expected either a level or other limits, got both")
+        if self.level is not None and self.level < 0:
+            raise OptionError(f"expected a level of 0 or more, got {self.level}")
+        if self.max_bytes is not None and self.max_bytes < 1:
+            raise OptionError(f"expected a limit of at least one byte, got {self.max_bytes}")
+        if self.seconds is not None and not self.seconds > 0:
+            raise OptionError(f"expected a positive number of seconds, got {self.seconds}")
+        if self.order not in ("quality", "level"):
+            raise OptionError(f"expected order quality or level, got {self.order!r}")
