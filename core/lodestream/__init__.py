@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         UnsupportedVersionError,
     )
     from .formats import read, write
-    from .hierarchy import coarsen, hierarchy
+    from .levels import coarsen, hierarchy
     from .surface import Surface
     from .target import Target, Tolerance
 
@@ -52,8 +52,8 @@ _HOMES = {
     "UnsupportedVersionError": "errors",
     "read": "formats",
     "write": "formats",
-    "coarsen": "hierarchy",
-    "hierarchy": "hierarchy",
+    "coarsen": "levels",
+    "hierarchy": "levels",
     "Surface": "surface",
     "Target": "target",
     "Tolerance": "target",
