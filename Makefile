@@ -1,0 +1,55 @@
+# Everything happens in .venv, which the first target that needs it makes: Python 3.11 or newer and make are enough.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+# Compiled kernels are kept beside the environment, under a name that changes with the sources: numba itself looks only
+# at the file of a kernel, not at the files of the kernels that it calls.
+export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/*.py 2>/dev/null | cksum | cut -d ' ' -f 1)
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-lowest lint format bench wheel clean
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
+
+demo: $(STAMP) ## serve real surfaces to itself over a slow link, stop early, show what came
+	@$(BIN)/lodestream demo $(ARGS)
+
+test: $(STAMP) ## run the tests; ARGS="-k name" for some of them
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+
+test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
+	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
+
+lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
+	@$(BIN)/ruff check --quiet
+	@$(BIN)/ruff format --check --quiet || { echo "not formatted: run 'make format'" >&2; exit 1; }
+	@$(BIN)/mypy --no-error-summary
+	@$(BIN)/lint-imports --no-logo
+
+format: $(STAMP) ## let ruff lay out the code and sort its imports
+	@$(BIN)/ruff check --quiet --select I --fix
+	@$(BIN)/ruff format --quiet
+
+bench: $(STAMP) ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
+	@$(BIN)/python -m benchmarks $(ARGS)
+
+wheel: $(STAMP) ## build dist/*.whl
+	@$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
+
+clean: ## remove the environment and everything else that can be made again
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp is written last, so an installation that was interrupted is taken up again by the next make.
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Lodestream needs Python 3.11 or newer; name one with PYTHON=, e.g. make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@echo "Installing into $(VENV); this happens once and takes a minute or two" >&2
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	@$(BIN)/python -m pip install --quiet --editable '.[all]' --group dev
+	@touch $@
