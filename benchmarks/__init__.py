@@ -1,0 +1,1 @@
+"""Measurements of speed, memory and bytes: ``python -m benchmarks``, or ``make bench``."""

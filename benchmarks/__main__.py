@@ -1,0 +1,45 @@
+"""Run the benchmarks: all of them, or those named, in this order."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import platform
+import sys
+from importlib.metadata import version
+
+SECTIONS = ("transform", "solver", "rate", "coder", "memory")
+
+# Before numpy and numba are loaded: every figure is of one core.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+
+def processor() -> str:
+    """The processor's name where the system tells it."""
+    try:
+        with open("/proc/cpuinfo") as lines:
+            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def main() -> int:
+    """Print one table for each section."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("section", nargs="*", help=f"of {', '.join(SECTIONS)}; all when none is named")
+    chosen = parser.parse_args().section
+    unknown = sorted(set(chosen) - set(SECTIONS))
+    if unknown:
+        parser.error(f"expected sections of {', '.join(SECTIONS)}, got {', '.join(unknown)}")
+    packages = ", ".join(f"{name} {version(name)}" for name in ("lodestream", "numpy", "numba", "scipy", "pywavelets"))
+    print(f"Python {platform.python_version()}, {packages}; one core of {processor()}", flush=True)
+    for section in SECTIONS:
+        if not chosen or section in chosen:
+            importlib.import_module(f"benchmarks.{section}").main()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
