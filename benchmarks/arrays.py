@@ -65,7 +65,7 @@ def load() -> tuple[Array, ...]:
 
 @functools.cache
 def fractal(side: int = 4097) -> NDArray[np.float64]:
-    """Terrain-like heights of any size, whole numbers in 16 bits: octaves of smooth noise, halved in height each time."""
+    """Terrain-like heights of any size, whole numbers of 16 bits: octaves of noise, each of half the height."""
     rng = np.random.default_rng(2002)
     heights = np.zeros((2, 2))
     amplitude = 1.0
@@ -77,4 +77,5 @@ def fractal(side: int = 4097) -> NDArray[np.float64]:
         heights = finer + amplitude * rng.standard_normal(finer.shape)
         amplitude /= 2
     heights = heights[:side, :side] - heights[:side, :side].min()
-    return np.rint(heights * (65535 / heights.max()))
+    scaled: NDArray[np.float64] = np.rint(heights * (65535 / heights.max()))
+    return scaled

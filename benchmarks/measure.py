@@ -29,15 +29,10 @@ def medians(work: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[s
 def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a Markdown table: the first column to the left, the others to the right."""
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
     print(f"\n### {title}\n")
-    for row in (head, None, *rows):
-        if row is None:
-            cells = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-        else:
-            cells = [
-                row[0].ljust(widths[0]),
-                *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-            ]
+    for row in (head, rule, *rows):
+        cells = [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
         print(f"| {' | '.join(cells)} |", flush=True)
 
 
