@@ -25,10 +25,9 @@ test-lowest: ## run the tests with the oldest versions that pyproject.toml allow
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
 
 lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
-	@$(BIN)/ruff check --quiet
-	@$(BIN)/ruff format --check --quiet || { echo "not formatted: run 'make format'" >&2; exit 1; }
-	@$(BIN)/mypy --no-error-summary
-	@$(BIN)/lint-imports --no-logo
+	@status=0; \
+	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
+	exit $$status
 
 format: $(STAMP) ## let ruff lay out the code and sort its imports
 	@$(BIN)/ruff check --quiet --select I --fix
