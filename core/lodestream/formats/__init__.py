@@ -1,0 +1,252 @@
+"""Files in and out: one table of formats, chosen by content.
+
+The first bytes of a file decide what it is; its suffix only helps where the content is text. No reader follows a
+reference to another file, and every reader checks what a header promises before it takes memory. The readers' libraries
+are imported when a file needs them, not before.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ..errors import FormatError, InputError, OptionError
+from ..surface import Surface
+from . import geotiff, npy, npz, obj, ply
+from .source import DEFAULT_MAX_VERTICES, Source
+
+__all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
+
+#: Bytes at the start of a file that decide about its format.
+_HEAD = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """One row of the table of formats.
+
+    Attributes
+    ----------
+    name : str
+        As in ``?format=`` and in messages.
+    suffixes : tuple of str
+        Endings of file names, in lower case with their dot; the first is the usual one.
+    sniff : callable
+        ``sniff(head, suffix)`` says whether a file that begins with the bytes `head` is of this format. The suffix is
+        that of some format, or empty.
+    read : callable or None
+        Takes a `Source`, gives a `Surface`; None where the format is only written.
+    write : callable or None
+        Takes a `Surface` and a binary file that need not be seekable; None where the format is only read.
+    options : mapping of str to str
+        Options for reading, each with a line of help.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes, str], bool]
+    read: Callable[[Source], Surface] | None = None
+    write: Callable[[Surface, BinaryIO], None] | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+_FORMATS = (
+    Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
+    Format("npz", (".npz",), npz.sniff, npz.read, options={"array": "name of the array that is the surface"}),
+    Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options={"band": "number of the band, from 1"}),
+    Format("ply", (".ply",), ply.sniff, write=ply.write),
+    Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
+)
+
+
+def formats() -> tuple[Format, ...]:
+    """Every format that is read or written."""
+    return _FORMATS
+
+
+def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Format:
+    """Find the format of a file by its first bytes.
+
+    Parameters
+    ----------
+    path : str or path-like
+        An existing file.
+    filename : str, optional
+        The name that its owner gave it, where `path` has another one; only its suffix counts, and only for text.
+
+    Raises
+    ------
+    FormatError
+        When the file is empty, is no regular file, or is of no known format.
+    """
+    path = Path(path)
+    label = filename or os.fspath(path)
+    try:
+        return _sniff(path, Path(label).suffix.lower())
+    except InputError as error:
+        raise _named(error, label) from None
+
+
+def read(
+    path: str | os.PathLike[str],
+    *more: str | os.PathLike[str],
+    max_vertices: int = DEFAULT_MAX_VERTICES,
+    filename: str | None = None,
+    **options: Any,
+) -> Surface:
+    """Read a surface from a file, whose content decides about its format.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A file of one of the `formats`.
+    *more : str or path-like
+        Further files of the same surface. No format takes several files yet.
+    max_vertices : int
+        Larger surfaces are refused before memory is taken for them.
+    filename : str, optional
+        The name that its owner gave the file, where `path` has another one, as an upload does: it stands in messages
+        and in the metadata's ``name``, and its suffix helps where the content is text.
+    **options
+        What `Format.options` lists: ``array`` of NPZ, ``band`` of GeoTIFF.
+
+    Returns
+    -------
+    Surface
+        With its own copy of the values, in the file's type (float64 for text). Its metadata are ``name``, ``format``
+        and, where the file tells them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a
+        number, or the text of one that is not finite), ``unit``, ``scale`` and ``offset`` (of values kept as they are
+        stored), ``scalars`` (single numbers beside the array of an NPZ).
+
+    Raises
+    ------
+    FormatError
+        When the file is not what it says, is cut short, or holds no structured surface.
+    TooLargeError
+        When it promises more vertices than allowed or expands implausibly.
+    OptionError
+        When an option does not exist or does not take its value.
+    InputError
+        When the values cannot be a surface: NaN, infinities, nodata.
+    OSError
+        When the file cannot be opened.
+    """
+    path = Path(path)
+    label = filename or os.fspath(path)
+    name = Path(label)
+    try:
+        if more:
+            raise OptionError(f"expected one file, got {1 + len(more)} (several files of one surface come later)")
+        format_ = _sniff(path, name.suffix.lower())
+        if format_.read is None:
+            raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
+        _check_options(format_, options)
+        return format_.read(Source(path, name.stem, path.stat().st_size, max_vertices, options))
+    except InputError as error:
+        raise _named(error, label) from None
+
+
+def write(surface: Surface, path: str | os.PathLike[str]) -> None:
+    """Write a surface to a file, whose suffix names the format.
+
+    The file appears whole or not at all: a temporary file beside it takes its name at the end.
+
+    Raises
+    ------
+    OptionError
+        When no format that is written has this suffix; those that exist are named.
+    FormatError
+        When the format cannot hold this surface.
+    """
+    path = Path(path)
+    format_ = next((it for it in _FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
+    if format_ is None:
+        suffixes = ", ".join(suffix for it in _FORMATS if it.write for suffix in it.suffixes)
+        raise _named(OptionError(f"expected a name that ends in one of {suffixes}"), str(path))
+    if path.exists() and not path.is_file():
+        with path.open("wb") as file:  # a pipe or a device cannot be replaced by a file; a folder is refused here
+            write_stream(surface, format_.name, file)
+        return
+    target = path.resolve()  # a link stays a link
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            write_stream(surface, format_.name, file)
+        temporary.replace(target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = os.fspath(path)  # not the temporary name, which tells the user nothing
+        if isinstance(error, InputError):
+            raise _named(error, str(path)) from None
+        raise
+
+
+def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
+    """Write a surface to an open binary file, such as standard output or the body of a response.
+
+    Parameters
+    ----------
+    surface : Surface
+    format_name : str
+        Name of a format that is written, as in `formats`.
+    file : binary file
+        Only its ``write`` is used.
+
+    Raises
+    ------
+    OptionError
+        When there is no such format; those that exist are named.
+    FormatError
+        When the format cannot hold this surface. Nothing has been written then.
+    """
+    writers = {it.name: it.write for it in _FORMATS if it.write}
+    if format_name not in writers:
+        raise OptionError(f"expected a format that is written ({', '.join(writers)}), got {format_name!r}")
+    writers[format_name](surface, file)
+
+
+def _sniff(path: Path, suffix: str) -> Format:
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise FormatError("expected a regular file, got a folder, pipe or device")
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not any(suffix in it.suffixes for it in _FORMATS):
+        suffix = ""
+    if not head:
+        raise FormatError(f"expected {_readable()}, got an empty file")
+    for format_ in _FORMATS:
+        if format_.sniff(head, suffix):
+            return format_
+    raise FormatError(f"expected {_readable()}, got {_describe(head)}")
+
+
+def _readable() -> str:
+    names = [it.name for it in _FORMATS if it.read]
+    return f"a file of format {', '.join(names[:-1])} or {names[-1]}"
+
+
+def _describe(head: bytes) -> str:
+    """Say how a file begins, in characters that are safe to print."""
+    text = head[:40].decode("ascii", "replace")
+    if all(character.isprintable() or character.isspace() for character in text) and "\ufffd" not in text:
+        return f"text that begins with {' '.join(text.split())!r}"
+    return f"bytes that begin with {head[:8].hex(' ')}"
+
+
+def _check_options(format_: Format, options: Mapping[str, Any]) -> None:
+    for name in options:
+        if name not in format_.options:
+            known = ", ".join(format_.options) or "none"
+            raise OptionError(f"expected an option of format {format_.name} ({known}), got {name!r}")
+
+
+def _named(error: InputError, label: str) -> InputError:
+    """Put the file's name in front of a message, which stays one line whatever either holds."""
+    message = f"{label}: {error}"
+    return type(error)("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message))

@@ -1,0 +1,114 @@
+"""NPY: one array, checked against the size of its file before memory is taken."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from io import BytesIO
+from math import prod
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..surface import Surface
+from .source import Source, number
+
+__all__ = ["MAGIC", "Header", "read", "read_header", "read_values", "sniff", "write"]
+
+MAGIC = b"\x93NUMPY"
+
+#: Bytes moved at a time, so that a compressed member or a pipe needs no second copy of the array.
+_CHUNK = 1 << 22
+
+#: More than numpy's limit for the text of a header. Only so much is looked at, because a header of version 2.0 may
+#: claim to be 4 GiB long, and a compressed member may deliver them.
+_HEAD = 1 << 14
+
+_HEADER_READERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the header of an NPY file says of the array that follows."""
+
+    shape: tuple[int, ...]
+    fortran: bool
+    dtype: np.dtype[Any]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the array, in exact integers however large."""
+        return prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def words(self) -> str:
+        """Shape and type, as messages show them."""
+        return f"{' x '.join(map(str, self.shape))} {self.dtype}" if self.shape else f"one {self.dtype}"
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Whether a file begins like NPY."""
+    return head.startswith(MAGIC)
+
+
+def read_header(file: IO[bytes]) -> Header:
+    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled."""
+    head = BytesIO(file.read(_HEAD))
+    try:
+        version = npy_format.read_magic(head)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # headers of Python 2 ("10L") are read, with a warning
+            if version not in _HEADER_READERS:
+                raise ValueError(f"version {version[0]}.{version[1]}")
+            header = Header(*_HEADER_READERS[version](head))
+    except Exception as error:  # the header is a Python literal: numpy does not say what its parser may raise
+        reason = str(error) or type(error).__name__
+        raise FormatError(f"expected an NPY header of version 1.0 or 2.0, got one not readable: {reason}") from None
+    if any(length < 0 for length in header.shape):
+        raise FormatError(f"expected an NPY header with lengths of 0 or more, got shape {header.shape}")
+    file.seek(head.tell())
+    return header
+
+
+def read_values(file: IO[bytes], header: Header) -> NDArray[Any]:
+    """Read the array that follows its header, whose size has been checked."""
+    shape = header.shape[::-1] if header.fortran else header.shape
+    values = np.empty(shape, header.dtype)
+    rest = values.reshape(-1).view(np.uint8).data
+    done = 0
+    while done < len(rest):
+        chunk = file.read(min(_CHUNK, len(rest) - done))
+        if not chunk:
+            raise FormatError(f"expected {number(len(rest))} bytes of values ({header.words}), got {number(done)}")
+        rest[done : done + len(chunk)] = chunk
+        done += len(chunk)
+    return values.T if header.fortran else values
+
+
+def read(source: Source) -> Surface:
+    """Read the one array of an NPY file."""
+    with source.path.open("rb") as file:
+        header = read_header(file)
+        source.check_array(header.shape, header.dtype)
+        follows = source.size - file.tell()
+        if follows != header.nbytes:
+            words = "the file is cut short" if follows < header.nbytes else "something follows the array"
+            raise FormatError(
+                f"expected {number(header.nbytes)} bytes of values ({header.words}), got {number(follows)}: {words}"
+            )
+        return Surface(read_values(file, header), metadata=source.metadata("npy"))
+
+
+def write(surface: Surface, file: BinaryIO) -> None:
+    """Write the points as they are.
+
+    `numpy.save` is not used because it asks a real file for its position, which a pipe has not.
+    """
+    points = surface.points
+    npy_format.write_array_header_1_0(file, npy_format.header_data_from_array_1_0(points))
+    values = points.reshape(-1).view(np.uint8).data
+    for start in range(0, len(values), _CHUNK):
+        file.write(values[start : start + _CHUNK])

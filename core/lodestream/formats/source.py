@@ -1,0 +1,123 @@
+"""What a reader is given, and the limits that it checks before it takes memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FormatError, OptionError, TooLargeError
+
+__all__ = ["DEFAULT_MAX_VERTICES", "Source", "number"]
+
+#: What `read` accepts unless told otherwise: 2 GiB of float64 heights.
+DEFAULT_MAX_VERTICES = 1 << 28
+
+#: Values per allowed vertex, so that a grid of few vertices and millions of channels is no way around the limit.
+_MAX_CHANNELS = 64
+
+#: Deflate expands at most 1032 times; what claims much more is made to do harm, or holds nothing.
+_MAX_EXPANSION = 2048
+_HARMLESS_BYTES = 64 << 20
+
+_KINDS = {
+    "O": "Python objects, which are never unpickled",
+    "S": "byte strings",
+    "U": "strings",
+    "c": "complex numbers",
+    "b": "booleans",
+    "V": "records",
+    "M": "dates",
+    "m": "time spans",
+}
+_FLOAT_SIZES = (4, 8)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One file to read a surface from.
+
+    Messages of errors raised by readers do not name the file: `lodestream.formats.read` puts its name in front.
+
+    Attributes
+    ----------
+    path : Path
+        An existing regular file.
+    stem : str
+        Name of the file as its owner knows it, without the suffix.
+    size : int
+        Bytes of the file.
+    max_vertices : int
+        Larger surfaces are refused.
+    options : mapping of str to str
+        Options of the format, checked to exist; their values are not checked.
+    """
+
+    path: Path
+    stem: str
+    size: int
+    max_vertices: int
+    options: Mapping[str, Any]
+
+    def check_vertices(self, count: int, shape: str) -> None:
+        """Refuse a surface of too many vertices; `shape` says in words where the count comes from."""
+        if count > self.max_vertices:
+            raise TooLargeError(f"expected at most {number(self.max_vertices)} vertices, got {shape}")
+
+    def check_array(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        """Refuse, by its header alone, an array that is no surface or is larger than allowed."""
+        refusal = refuse_array(shape, dtype)
+        if refusal:
+            raise FormatError(refusal)
+        vertices = shape[0] * shape[1]
+        words = " x ".join(map(str, shape))
+        self.check_vertices(vertices, f"an array of {words}")
+        if prod(shape) > self.max_vertices * _MAX_CHANNELS:
+            raise TooLargeError(f"expected at most {_MAX_CHANNELS} values for each vertex allowed, got {words}")
+
+    def check_expansion(self, promised: int) -> None:
+        """Refuse a compressed file that promises implausibly more bytes than it has."""
+        if promised > max(_HARMLESS_BYTES, self.size * _MAX_EXPANSION):
+            raise TooLargeError(
+                f"expected a file that expands at most {_MAX_EXPANSION} times, got {number(self.size)} bytes that "
+                f"promise {number(promised)}"
+            )
+
+    def metadata(self, format_name: str) -> dict[str, Any]:
+        """Metadata that every reader gives."""
+        return {"name": self.stem, "format": format_name}
+
+    def integer_option(self, name: str, low: int, high: int) -> int | None:
+        """Value of the option `name` as an integer from `low` to `high`; None when it was not given."""
+        value = self.options.get(name)
+        if value is None:
+            return None
+        try:
+            result = int(str(value))
+        except ValueError:
+            raise OptionError(f"expected {name}= a whole number, got {str(value)!r}") from None
+        if not low <= result <= high:
+            raise OptionError(f"expected {name}= from {low} to {high}, got {result}")
+        return result
+
+
+def refuse_array(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str | None:
+    """Say why an array of this shape and type is no surface; None when it is one."""
+    if dtype.kind in _KINDS:
+        return f"expected integers or floating-point numbers, got {_KINDS[dtype.kind]} ({dtype})"
+    if dtype.kind == "f" and dtype.itemsize not in _FLOAT_SIZES:
+        return f"expected integers or float32 or float64, got {dtype}"
+    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] < 2):
+        return f"expected an array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3), got shape {shape}"
+    if min(shape) < 1 or shape[0] * shape[1] < 2:
+        return f"expected a grid of at least two points, got shape {shape}"
+    return None
+
+
+def number(value: int) -> str:
+    """Write a count with separators, as messages show it."""
+    return f"{value:,}"
