@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "fractal", "load"]
+__all__ = ["ROOT", "Array", "fractal", "load"]
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPT = ROOT.parent / "shared" / "bench" / "surfaces.py"

@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 import lodestream
-from lodestream.container import LayerRecord, read_index
+from lodestream.container import read_index
+from lodestream.plan import Mark, plan
 
 from .arrays import Array, load
 from .measure import note, table
@@ -56,13 +57,12 @@ def precision_of(array: Array) -> float:
     return array.step / 2 * math.sqrt(3 if array.xyz else 1)
 
 
-def layers_of(container: bytes) -> Sequence[LayerRecord]:
-    """The layers of a container in file order."""
-    index = read_index(lambda offset, length: container[offset : offset + length], len(container))
-    return index.layers
+def layers_of(container: bytes) -> Sequence[Mark]:
+    """States on the way through a container: after each layer and, if there is such a section, the exactness."""
+    return plan(read_index(lambda offset, length: container[offset : offset + length], len(container))).marks
 
 
-def bytes_to(layers: Sequence[LayerRecord], rms: float) -> float | None:
+def bytes_to(layers: Sequence[Mark], rms: float) -> float | None:
     """Bytes at which the error falls to ``rms``, interpolated between layers; None where it never does.
 
     Between the last lossy layer and the exact one nothing can be interpolated: the whole of it is counted.
@@ -72,15 +72,13 @@ def bytes_to(layers: Sequence[LayerRecord], rms: float) -> float | None:
         return None
     after = layers[reached]
     if reached == 0 or after.rms == 0:
-        return after.end
+        return float(after.bytes)
     before = layers[reached - 1]
     part = math.log(before.rms / rms) / math.log(before.rms / after.rms)
-    return math.exp(math.log(before.end) + part * math.log(after.end / before.end))
+    return math.exp(math.log(before.bytes) + part * math.log(after.bytes / before.bytes))
 
 
-def row(
-    array: Array, target: float, prototype: int | None, lossy: Sequence[LayerRecord], exact: Sequence[LayerRecord]
-) -> list[str]:
+def row(array: Array, target: float, prototype: int | None, lossy: Sequence[Mark], exact: Sequence[Mark]) -> list[str]:
     """One line of the table."""
     count, full = (bytes_to(layers, target * array.extent) for layers in (lossy, exact))
     ratio = verdict = ""

@@ -1,0 +1,135 @@
+"""Memory of a decoder, and of a server with clients that do not read."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+import lodestream
+from lodestream_client import sync
+
+from .arrays import ROOT, fractal
+from .measure import memory, note, table
+
+CHUNK = 1 << 16
+STREAMS = (0, 16, 64)
+STATUS = Path("/proc/self/status")
+
+
+def main() -> None:
+    """Print both tables."""
+    sizes: dict[str, NDArray[Any]] = {"2049 x 2049 heights": fractal(2049), "1025 x 1025 xyz": _sphere(1025)}
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {name: Path(folder, f"{number}.lode") for number, name in enumerate(sizes)}
+        for name, points in sizes.items():
+            paths[name].write_bytes(lodestream.encode(points))
+        if STATUS.exists():
+            rows = [_decoder_row(name, sizes[name], path) for name, path in paths.items()]
+            head = ["surface", "as float32", "container", "fed, no picture", "with the last picture", "x float32"]
+            table("Memory of a Decoder", head, rows)
+            note("Peak above what the process held before, in a process of its own, fed 64 KiB at a time.")
+        else:
+            print("\nskipped: memory of a Decoder (this system does not tell a process its peak)")
+        rows = list(_server_rows(Path(folder), fractal(2049)))
+    table("Memory of a server", ["streams opened, then not read", "resident", "more than idle", "a stream"], rows)
+    note("The server's own process, after each client took one layer of a 2049 x 2049 surface and then read no more.")
+
+
+def _sphere(side: int) -> NDArray[np.float32]:
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, side), np.linspace(0.1, 3.0, side), indexing="ij")
+    radius = 1 + 0.1 * np.sin(5 * u) * np.sin(4 * v)
+    return np.stack([radius * np.cos(u) * np.sin(v), radius * np.sin(u) * np.sin(v), radius * np.cos(v)], -1).astype(
+        "f4"
+    )
+
+
+def _decoder_row(name: str, points: NDArray[Any], container: Path) -> list[str]:
+    command = [sys.executable, "-m", "benchmarks.memory", str(container)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    fed, drawn = (int(word) for word in output.split())
+    raw = 4 * points.size
+    cells = [memory(count) for count in (raw, container.stat().st_size, fed, drawn)]
+    return [name, *cells, f"{drawn / raw:.1f}"]
+
+
+def decode(container: Path) -> None:
+    """Print the peak memory of feeding a container, and of making its surface; runs in a process of its own."""
+    lodestream.decode(lodestream.encode(np.arange(289.0).reshape(17, 17) % 7))  # loads the kernels
+    before = psutil.Process().memory_info().rss
+    decoder = lodestream.Decoder()
+    with container.open("rb") as file:
+        _forget_peak()
+        while chunk := file.read(CHUNK):
+            decoder.feed(chunk)
+        decoder.finish()
+    print(_peak() - before)
+    surface = decoder.surface()
+    print(_peak() - before)
+    assert surface.points.size
+
+
+def _forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak() -> int:
+    line = next(line for line in STATUS.read_text().splitlines() if line.startswith("VmHWM"))
+    return 1024 * int(line.split()[1])
+
+
+def _server_rows(folder: Path, points: NDArray[Any]) -> Iterator[list[str]]:
+    with _server(folder / "data") as (process, address), contextlib.ExitStack() as streams:
+        np.save(folder / "surface.npy", points)
+        url = sync.upload(address, folder / "surface.npy").url
+        opened, idle = 0, 0
+        for count in STREAMS:
+            for _ in range(count - opened):
+                next(iter(streams.enter_context(sync.connect(url))))
+            opened = count
+            time.sleep(2)  # what is under way arrives in the buffers of both ends
+            resident = process.memory_info().rss
+            idle = idle or resident
+            each = memory((resident - idle) / count) if count else ""
+            yield [str(count), memory(resident), memory(resident - idle), each]
+
+
+@contextlib.contextmanager
+def _server(data: Path) -> Iterator[tuple[psutil.Process, str]]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "lodestream_client", "serve", "--port", str(port), "--data", str(data)]
+    address = f"http://127.0.0.1:{port}"
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        try:
+            _wait(f"{address}/readyz", server)
+            yield psutil.Process(server.pid), address
+        finally:
+            server.terminate()
+
+
+def _wait(url: str, server: subprocess.Popen[bytes]) -> None:
+    for _ in range(600):
+        if server.poll() is not None:
+            raise RuntimeError(f"the server ended with exit code {server.returncode} before it was ready")
+        with contextlib.suppress(httpx.TransportError):
+            if httpx.get(url).status_code == 200:
+                return
+        time.sleep(0.1)
+    raise RuntimeError("the server was not ready within a minute")
+
+
+if __name__ == "__main__":
+    decode(Path(sys.argv[1]))
