@@ -1,0 +1,58 @@
+"""Clients of a Lodestream server: streams, uploads, and the command line.
+
+The functions are asynchronous; `lodestream_client.sync` has the same names for programs without an event loop. Names
+are loaded when they are first used, so that the command line starts quickly, and the compiler of the kernels comes in
+with the first stream.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .aio import Stream, connect, delete, describe, fetch_range, list_surfaces, upload
+    from .aio import list_surfaces as list
+    from .errors import SilenceError, UnreachableError
+    from .requests import Description
+
+_HOMES = {
+    "Description": ("requests", "Description"),
+    "SilenceError": ("errors", "SilenceError"),
+    "Stream": ("aio", "Stream"),
+    "UnreachableError": ("errors", "UnreachableError"),
+    "connect": ("aio", "connect"),
+    "delete": ("aio", "delete"),
+    "describe": ("aio", "describe"),
+    "fetch_range": ("aio", "fetch_range"),
+    "list": ("aio", "list_surfaces"),
+    "list_surfaces": ("aio", "list_surfaces"),
+    "upload": ("aio", "upload"),
+}
+
+__all__ = [
+    "Description",
+    "SilenceError",
+    "Stream",
+    "UnreachableError",
+    "connect",
+    "delete",
+    "describe",
+    "fetch_range",
+    "list",
+    "list_surfaces",
+    "upload",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _HOMES[name]
+    value = getattr(importlib.import_module(f".{module}", __name__), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> tuple[str, ...]:
+    return (*globals(), *__all__)

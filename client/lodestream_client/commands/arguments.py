@@ -1,0 +1,229 @@
+"""Options that several sub-commands share, and the types of their values."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from lodestream.errors import OptionError
+from lodestream.target import Target, Tolerance
+
+from .. import addresses
+
+if TYPE_CHECKING:
+    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
+else:
+    Subparsers = Any
+
+__all__ = [
+    "Subparsers",
+    "add_command",
+    "add_json_option",
+    "add_rate_option",
+    "add_surface_options",
+    "add_target_options",
+    "add_token_option",
+    "parse_pair",
+    "parse_rate",
+    "parse_server",
+    "parse_size",
+    "parse_surface",
+    "parse_tolerance",
+    "surface_options",
+    "target_of",
+    "token_of",
+]
+
+T = TypeVar("T")
+
+_AMOUNT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-zA-Z]*)(/s)?\s*")
+_PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+
+
+def parse_size(text: str) -> int:
+    """Read a number of bytes, such as ``20000``, ``20kB`` or ``1MiB``."""
+    number, unit = _amount(text)
+    factor = _PREFIXES.get(unit.lower().removesuffix("b"))
+    if factor is None:
+        raise argparse.ArgumentTypeError(f"expected a number of bytes such as 20000, 20kB or 1MiB, got {text!r}")
+    size = round(number * factor)
+    if size < 1:
+        raise argparse.ArgumentTypeError(f"expected at least one byte, got {text!r}")
+    return size
+
+
+def parse_rate(text: str) -> float:
+    """Read a rate such as ``64kbit``, ``1mbit/s`` or ``200kB``; bytes per second."""
+    number, unit = _amount(text)
+    bits = unit.lower().endswith("bit")
+    prefix = unit.lower().removesuffix("bit") if bits else unit.removesuffix("B").lower()
+    if not (bits or unit.endswith("B")) or prefix not in _PREFIXES or not number > 0:
+        raise argparse.ArgumentTypeError(f"expected a rate such as 64kbit, 1mbit or 200kB (per second), got {text!r}")
+    return number * _PREFIXES[prefix] / (8 if bits else 1)
+
+
+def _amount(text: str) -> tuple[float, str]:
+    match = _AMOUNT.fullmatch(text)
+    if match is None or not math.isfinite(float(match[1])):
+        return 0.0, "?"
+    return float(match[1]), match[2]
+
+
+def parse_pair(text: str) -> tuple[str, str]:
+    """Read ``KEY=VALUE``."""
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE, got {text!r}")
+    return key, value
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got {text!r}")
+    return value
+
+
+def _level(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a level of 0 or more, got {text!r}")
+    return int(text)
+
+
+def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
+    # argparse hides the message of any other exception behind "invalid value".
+    def checked(text: str) -> T:
+        try:
+            return parse(text)
+        except OptionError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return checked
+
+
+parse_tolerance = _checked(Tolerance.parse)
+parse_server = _checked(addresses.surfaces_url)
+parse_surface = _checked(addresses.surface_url)
+
+
+def add_command(
+    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], summary: str, details: str = ""
+) -> argparse.ArgumentParser:
+    """Add the sub-command `name` and return its parser."""
+    parser = subparsers.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.\n\n{details}".strip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=run, parser=parser)
+    return parser
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object on standard output")
+
+
+def add_token_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--token``."""
+    parser.add_argument("--token", metavar="T", help="token for the server (default: LODESTREAM_TOKEN)")
+
+
+def token_of(args: argparse.Namespace) -> str | None:
+    """The token given, or the environment's."""
+    token: str | None = args.token or os.environ.get("LODESTREAM_TOKEN")
+    return token or None
+
+
+def add_rate_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--limit-rate``."""
+    parser.add_argument(
+        "--limit-rate",
+        type=parse_rate,
+        metavar="RATE",
+        help="receive at most this much a second, such as 1mbit or 200kB",
+    )
+
+
+def add_surface_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says how a file becomes a surface."""
+    group = parser.add_argument_group("surface options")
+    group.add_argument(
+        "--precision",
+        type=parse_tolerance,
+        metavar="P",
+        help="greatest error of the complete surface, in its unit or as <x>d times its extent (default: lossless)",
+    )
+    group.add_argument(
+        "--closed",
+        choices=("auto", "none", "rows", "cols", "both"),
+        default="auto",
+        help="which axes of the grid wrap: rows means that the last row is followed by the first (default: auto)",
+    )
+    group.add_argument("--name", metavar="N", help="name of the surface")
+    group.add_argument(
+        "-o",
+        dest="options",
+        action="append",
+        default=[],
+        type=parse_pair,
+        metavar="KEY=VALUE",
+        help="option of the file's format; may be repeated",
+    )
+
+
+def surface_options(args: argparse.Namespace) -> dict[str, str]:
+    """The ``-o`` options given.
+
+    A key that is given twice ends the program: the command line alone shows it to be wrong.
+    """
+    options: dict[str, str] = {}
+    for key, value in args.options:
+        if key in options:
+            args.parser.error(f"argument -o: {key} given twice")
+        options[key] = value
+    return options
+
+
+def add_target_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says where to stop and in which order."""
+    group = parser.add_argument_group(
+        "target",
+        "where to stop; of several limits the first one met. E is in the surface's unit, or <x>d times its extent",
+    )
+    group.add_argument("--level", type=_level, metavar="K", help="levels 0 to K only; OUT is the grid of that level")
+    group.add_argument("--until-rms", type=parse_tolerance, metavar="E", help="stop at a root mean square error of E")
+    group.add_argument("--until-max", type=parse_tolerance, metavar="E", help="stop at a maximum error of E")
+    group.add_argument("--max-bytes", type=parse_size, metavar="N", help="stop before more than N bytes of the surface")
+    group.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds")
+    group.add_argument(
+        "--order",
+        choices=("quality", "level"),
+        default="quality",
+        help="bits in order of what they do to the error, or level by level (default: quality)",
+    )
+
+
+def target_of(args: argparse.Namespace) -> Target:
+    """The target given; ends the program when its limits exclude each other."""
+    try:
+        target = Target(
+            level=args.level,
+            until_rms=args.until_rms,
+            until_max=args.until_max,
+            max_bytes=args.max_bytes,
+            seconds=args.seconds,
+            order=args.order,
+        )
+    except OptionError as error:
+        args.parser.error(str(error))
+    return target

@@ -1,0 +1,177 @@
+"""``lodestream decode``: a container, or as much of it as is wanted, into a file."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import TYPE_CHECKING, BinaryIO
+
+from lodestream.errors import (
+    CorruptStreamError,
+    OptionError,
+    StreamError,
+    TruncatedStreamError,
+    UnsupportedVersionError,
+)
+from lodestream.target import Target
+
+from .arguments import Subparsers, add_command, add_json_option, add_target_options, target_of
+from .inputs import input_files
+from .outcome import Outcome, check_out, note_unmet, surface_of
+from .output import note, progress_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from lodestream.container import Index
+    from lodestream.decoder import Decoder, View
+
+__all__ = ["register", "run"]
+
+_CHUNK = 256 * 1024
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-command."""
+    parser = add_command(
+        subparsers,
+        "decode",
+        run,
+        "turn a container, or as much of it as is wanted, into a file",
+        "The suffix of OUT names its format; standard output gets NPY.",
+    )
+    parser.add_argument("container", metavar="IN.lode", help="container to read; - for standard input")
+    parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
+    add_target_options(parser)
+    parser.add_argument(
+        "--partial",
+        action="store_true",
+        help="of a cut or damaged container, write the last whole layer before the cut",
+    )
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Decode, write, report."""
+    target = target_of(args)
+    check_out(args)
+    started = time.monotonic()
+    with input_files(args.parser, [args.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
+        task = bar.add_task("decoding", total=1.0, figures="")
+        job = _Job(file, target, started, lambda done: bar.update(task, completed=done))
+        try:
+            job.decode()
+        except StreamError as error:
+            if not args.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
+                raise
+            note(f"the container is cut or damaged: {error}")
+            job.ended = "truncated"
+    view = job.view or job.decoder.view()
+    assert job.decoder.header is not None, "there is a view, so there is a header"
+    note_unmet(target, job.ended, view.rms, view.max_error, job.decoder.header.extent)
+    outcome = Outcome(
+        surface_of(job.decoder, view, target.level, job.metadata),
+        view.bytes,
+        job.read_bytes,
+        view.level,
+        view.rms,
+        view.max_error,
+        time.monotonic() - started,
+        job.ended,
+    )
+    outcome.write(args.out)
+    outcome.report(args.json)
+    return 0
+
+
+class _Job:
+    """One container on its way through a decoder."""
+
+    def __init__(self, file: BinaryIO, target: Target, started: float, progress: Callable[[float], None]) -> None:
+        from lodestream.decoder import Decoder
+
+        self.decoder: Decoder = Decoder()
+        self.ended = "complete"
+        self.view: View | None = None  # where it ended, if more has been fed
+        self.read_bytes = 0
+        self.metadata: dict[str, object] | None = None
+        self._file = file
+        self._size = file.seek(0, 2)
+        self._target = target
+        self._started = started
+        self._progress = progress
+
+    def decode(self) -> None:
+        """Decode as far as the target says; `ended` says why it ends there."""
+        from lodestream.container import read_index
+
+        try:
+            index = read_index(self._read, self._size)
+        except (CorruptStreamError, TruncatedStreamError):
+            # Without its index a container still has its prefix, which is all that quality order needs.
+            if self._target.level is not None or self._target.order == "level":
+                raise
+            self._decode_prefix()
+        else:
+            self.metadata = dict(index.metadata_values)
+            self._decode_planned(index)
+
+    def _read(self, offset: int, length: int) -> bytes:
+        self._file.seek(offset)
+        data = self._file.read(length)
+        self.read_bytes += len(data)
+        return data
+
+    def _late(self) -> bool:
+        limit = self._target.seconds
+        return limit is not None and time.monotonic() - self._started >= limit and bool(self.decoder.layers)
+
+    def _decode_planned(self, index: Index) -> None:
+        from lodestream.plan import plan
+
+        chosen = plan(index, self._target)
+        self.ended = chosen.ended
+        done = 0
+        for place in (*chosen.before, *chosen.ranges, *chosen.after):
+            for offset in range(place.offset, place.end, _CHUNK):
+                if self._late():
+                    self.ended = "seconds"
+                    return
+                data = self._read(offset, min(_CHUNK, place.end - offset))
+                self.decoder.feed_at(offset, data)
+                done += len(data)
+                self._progress(min(done / max(chosen.bytes, 1), 1.0))
+
+    def _decode_prefix(self) -> None:
+        most = self._target.max_bytes
+        end = self._size if most is None else min(self._size, most)
+        offset = 0
+        while offset < end:
+            data = self._read(offset, min(_CHUNK, end - offset))
+            offset += len(data)
+            for view in self.decoder.feed(data):
+                self.ended = self._met(view)
+                if self.ended != "complete":
+                    self.view = view
+                    return
+            self._progress(offset / end)
+            if self._late():
+                self.ended = "seconds"
+                return
+        if most is not None and self._size >= most and not self.decoder.complete:
+            if not self.decoder.layers:
+                raise OptionError(f"expected at least the bytes of the first layer, got {most}")
+            self.ended = "bytes"
+            return
+        self.decoder.finish()
+
+    def _met(self, view: View) -> str:
+        header = self.decoder.header
+        assert header is not None, "there is a view, so there is a header"
+        if view.complete:
+            return "complete"
+        if self._target.until_rms is not None and view.rms <= self._target.until_rms.absolute(header.extent):
+            return "rms"
+        if self._target.until_max is not None and view.max_error <= self._target.until_max.absolute(header.extent):
+            return "max"
+        return "complete"

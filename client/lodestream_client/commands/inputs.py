@@ -1,0 +1,39 @@
+"""Files named on the command line, standard input among them."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Inputs", "input_files"]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files to read; `filename` stands for what has no name of its own."""
+
+    paths: tuple[Path, ...]
+    filename: str | None
+
+
+@contextmanager
+def input_files(parser: argparse.ArgumentParser, names: Sequence[str]) -> Iterator[Inputs]:
+    """The files of these names; standard input, where named ``-``, as a temporary file.
+
+    Readers and uploads want to know the length before they begin, and the end of a container before its middle.
+    """
+    if names.count("-") > 1:
+        parser.error("standard input (-) is named twice")
+    if "-" not in names:
+        yield Inputs(tuple(map(Path, names)), None)
+        return
+    with tempfile.NamedTemporaryFile(prefix="lodestream-") as file:
+        shutil.copyfileobj(sys.stdin.buffer, file)
+        file.flush()
+        yield Inputs(tuple(Path(file.name if name == "-" else name) for name in names), "standard input")

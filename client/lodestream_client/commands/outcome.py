@@ -1,0 +1,134 @@
+"""What ``decode`` and ``pull`` end with: a surface at some state, written and reported."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import OptionError
+from lodestream.target import Target
+
+from .output import human_size, note, print_json, require_folder
+
+if TYPE_CHECKING:
+    from lodestream.decoder import Decoder, View
+    from lodestream.surface import Surface
+
+__all__ = ["Outcome", "check_out", "note_unmet", "surface_of"]
+
+
+def check_out(args: argparse.Namespace) -> None:
+    """Refuse early what cannot be written; ends the program where the command line alone shows it.
+
+    Raises
+    ------
+    InputError
+        When the folder is not there or no format has this suffix.
+    """
+    if args.out == "-":
+        if args.json:
+            args.parser.error("argument --json: standard output is taken by the surface")
+        return
+    path = Path(args.out)
+    require_folder(path)
+
+    from lodestream.formats import formats
+
+    known = [suffix for format_ in formats() if format_.write for suffix in format_.suffixes]
+    if path.suffix.lower() not in known:
+        raise OptionError(
+            f"{path}: expected a name that ends in one of {', '.join(known)}, got {path.suffix or 'none'!r}"
+        )
+
+
+def surface_of(decoder: Decoder, view: View, level: int | None, metadata: dict[str, Any] | None = None) -> Surface:
+    """The surface as a view shows it, or the grid of one level's shape.
+
+    Parameters
+    ----------
+    decoder : Decoder
+    view : View
+    level : int or None
+        None for the full resolution.
+    metadata : dict or None
+        In place of the decoder's own, which comes last and may not have come.
+    """
+    from lodestream.surface import Surface
+
+    header = decoder.header
+    assert header is not None, "there is a view, so there is a header"
+    values = dict(decoder.metadata or metadata or {})
+    if level is None or level == header.levels:
+        return Surface(view.points, header.closed, metadata=values)
+    points = view.points_at(level)
+    if header.channels == 1:
+        values["geotransform"] = _spread(values.get("geotransform"), header.shape, points.shape, header.closed)
+    return Surface(points, header.closed, metadata=values)
+
+
+def _spread(transform: Any, full: tuple[int, int], coarse: tuple[int, ...], closed: tuple[bool, bool]) -> list[float]:
+    # Node j of an axis stands where the full grid has (N - 1) / (n - 1) j: exactly so without a gap, and within one
+    # cell of the full grid with one. Heights without a place of their own are drawn over their indices.
+    x0, xc, xr, y0, yc, yr = transform or (-0.5, 1.0, 0.0, -0.5, 0.0, 1.0)
+    down, across = (
+        n_full / n if wraps else (n_full - 1) / max(n - 1, 1)
+        for n_full, n, wraps in zip(full, coarse[:2], closed, strict=True)
+    )
+    x0 += 0.5 * xc * (1 - across) + 0.5 * xr * (1 - down)
+    y0 += 0.5 * yc * (1 - across) + 0.5 * yr * (1 - down)
+    return [x0, xc * across, xr * down, y0, yc * across, yr * down]
+
+
+def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent: float) -> None:
+    """Say that a limit was out of reach, when the whole surface came and is not as near as was asked for."""
+    if ended != "complete":
+        return
+    for limit, found, name in ((target.until_rms, rms, "RMS"), (target.until_max, max_error, "maximum")):
+        if limit is not None and found > limit.absolute(extent):
+            note(f"the {name} error asked for is out of reach: this is the complete surface, with {found:.6g}")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A surface at the state where receiving it ended, with the figures of that state."""
+
+    surface: Surface
+    bytes: int
+    wire_bytes: int
+    level: int
+    rms: float
+    max_error: float
+    seconds: float
+    ended: str
+
+    def write(self, out: str) -> None:
+        """Write the surface, to standard output as NPY."""
+        from lodestream import formats
+
+        if out == "-":
+            formats.write_stream(self.surface, "npy", sys.stdout.buffer)
+        else:
+            formats.write(self.surface, out)
+
+    def report(self, as_json: bool) -> None:
+        """Print the figures: for programs on standard output, for people on standard error."""
+        if as_json:
+            print_json(
+                {
+                    "bytes": self.bytes,
+                    "wire_bytes": self.wire_bytes,
+                    "level": self.level,
+                    "rms": self.rms,
+                    "max": self.max_error,
+                    "seconds": round(self.seconds, 6),
+                    "ended": self.ended,
+                }
+            )
+            return
+        note(
+            f"{self.ended}: level {self.level}, RMS error {self.rms:.6g}, maximum {self.max_error:.6g}, "
+            f"{human_size(self.bytes)} of the surface ({human_size(self.wire_bytes)} read) in {self.seconds:.1f} s"
+        )

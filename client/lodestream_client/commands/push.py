@@ -1,0 +1,69 @@
+"""``lodestream push``: upload a surface."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .arguments import (
+    Subparsers,
+    add_command,
+    add_json_option,
+    add_surface_options,
+    add_token_option,
+    parse_server,
+    surface_options,
+    token_of,
+)
+from .inputs import input_files
+from .output import human_size, print_json, progress_bar
+
+__all__ = ["register", "run"]
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-command."""
+    parser = add_command(
+        subparsers,
+        "push",
+        run,
+        "upload a file, or several of one surface, to a server",
+        "Waits until the surface is ready; the last line of standard output is its address.",
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE", help="what to upload; - for standard input")
+    parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")
+    add_surface_options(parser)
+    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has the bytes")
+    add_token_option(parser)
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Upload, wait, print the address."""
+    options = surface_options(args)
+
+    from .. import sync
+
+    with input_files(args.parser, args.files) as files, progress_bar() as bar:
+        total = human_size(sum(Path(path).stat().st_size for path in files.paths))
+        task = bar.add_task("sending", total=1.0, figures=total)
+
+        def progress(stage: str, fraction: float) -> None:
+            bar.update(task, description=stage, completed=fraction, figures=total if stage == "sending" else "")
+
+        surface = sync.upload(
+            args.url,
+            *files.paths,
+            precision=args.precision,
+            closed=args.closed,
+            name=args.name,
+            options=options,
+            wait=not args.no_wait,
+            progress=progress,
+            token=token_of(args),
+        )
+    if args.json:
+        print_json({**surface.details, "url": surface.url})
+    else:
+        print(surface.url)
+    return 0

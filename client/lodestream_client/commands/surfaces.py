@@ -1,0 +1,66 @@
+"""``lodestream list`` and ``lodestream rm``: the surfaces of a server."""
+
+from __future__ import annotations
+
+import argparse
+
+from .arguments import (
+    Subparsers,
+    add_command,
+    add_json_option,
+    add_token_option,
+    parse_server,
+    parse_surface,
+    token_of,
+)
+from .output import console, human_size, note, print_json
+
+__all__ = ["register", "run_list", "run_rm"]
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-commands."""
+    parser = add_command(subparsers, "list", run_list, "list the surfaces of a server")
+    parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")
+    add_token_option(parser)
+    add_json_option(parser)
+    parser = add_command(subparsers, "rm", run_rm, "remove a surface from a server")
+    parser.add_argument("url", type=parse_surface, metavar="URL", help="the surface's address")
+    add_token_option(parser)
+    add_json_option(parser)
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Ask, print one line for each."""
+    from .. import sync
+
+    surfaces = sync.list_surfaces(args.url, token=token_of(args))
+    if args.json:
+        print_json({"surfaces": [{**surface.details, "url": surface.url} for surface in surfaces]})
+        return 0
+
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for surface in surfaces:
+        details = surface.details
+        shape = " x ".join(map(str, details.get("shape") or ())) or "-"
+        size = human_size(details["bytes"]) if isinstance(details.get("bytes"), int) else "-"
+        table.add_row(surface.url, surface.state, shape, size, str(details.get("name") or ""))
+    if surfaces:
+        console().print(table)
+    else:
+        note("no surfaces")
+    return 0
+
+
+def run_rm(args: argparse.Namespace) -> int:
+    """Remove."""
+    from .. import sync
+
+    sync.delete(args.url, token=token_of(args))
+    if args.json:
+        print_json({"removed": args.url})
+    else:
+        note(f"removed {args.url}")
+    return 0

@@ -1,0 +1,22 @@
+"""What can go wrong on the way to a server, beside the errors of `lodestream.errors`.
+
+::
+
+    LodestreamError
+    ├── UnreachableError (ConnectionError)    no connection, or it broke before the end
+    └── SilenceError (TimeoutError)           nothing came for longer than allowed
+"""
+
+from __future__ import annotations
+
+from lodestream.errors import LodestreamError
+
+__all__ = ["SilenceError", "UnreachableError"]
+
+
+class UnreachableError(LodestreamError, ConnectionError):
+    """There is no connection to the server, or it broke before the end."""
+
+
+class SilenceError(LodestreamError, TimeoutError):
+    """The server sent nothing for longer than allowed."""

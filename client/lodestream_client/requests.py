@@ -1,0 +1,245 @@
+"""What is asked of a server over HTTP, without I/O.
+
+Each function here is a generator: it yields a `Call` and is sent the answer, or yields a `Pause` and is resumed after
+it; what it returns is the result. `lodestream_client.sync` and `lodestream_client.aio` run the same generators.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from urllib.parse import urljoin, urlsplit
+
+from lodestream.errors import CorruptStreamError, RemoteError, RemoteProtocolError
+
+from . import addresses, problems
+from .bodies import Body
+
+if TYPE_CHECKING:
+    import httpx
+
+__all__ = [
+    "Call",
+    "Description",
+    "Flow",
+    "Pause",
+    "Progress",
+    "client_options",
+    "delete",
+    "describe",
+    "fetch_range",
+    "list_surfaces",
+    "request_options",
+    "upload",
+]
+
+T = TypeVar("T")
+
+#: Called as ``progress(stage, fraction)``; the stages are ``sending`` and ``building``.
+Progress: TypeAlias = Callable[[str, float], None]
+
+# Seconds between looks at a surface that is being built: soon at first, since most builds are short, then rarely.
+_LOOKS = (0.05, 0.1, 0.2, 0.4, 0.8)
+_LOOKS_AFTER = 1.5
+
+# Seconds for each step of a request: connecting, one piece sent, one piece received.
+_TIMEOUT = 30.0
+
+
+@dataclass(frozen=True)
+class Call:
+    """Ask this of a server; the answer, read whole, is sent back."""
+
+    method: str
+    url: str
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    body: Body | None = None
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Wait so many seconds."""
+
+    seconds: float
+
+
+Flow: TypeAlias = "Generator[Call | Pause, httpx.Response | None, T]"
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a server says of one surface.
+
+    Attributes
+    ----------
+    url : str
+        The surface's address: what `connect` and `delete` take.
+    id : str
+        Name of the surface on its server.
+    state : str
+        ``queued``, ``building``, ``ready`` or ``failed``.
+    details : mapping
+        Everything that the server says, by its own keys: build progress, or what ``info --json`` tells.
+    """
+
+    url: str
+    id: str
+    state: str
+    details: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the surface can be streamed."""
+        return self.state == "ready"
+
+
+def client_options(url: str) -> dict[str, Any]:
+    """What an httpx client for the server at `url` is made with."""
+    return {
+        "follow_redirects": True,
+        "timeout": _TIMEOUT,
+        # No proxy of the environment comes between two programs on one machine.
+        "trust_env": not addresses.is_loopback(url),
+    }
+
+
+def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
+    """The arguments of an httpx client's ``request`` but the body of one file.
+
+    The token is only for the server at `url`, wherever an answer may point.
+    """
+    headers = dict(call.headers)
+    if token is not None and urlsplit(call.url)[:2] == urlsplit(url)[:2]:
+        headers["Authorization"] = f"Bearer {token}"
+    options: dict[str, Any] = {"method": call.method, "url": call.url, "headers": headers}
+    if call.parameters:
+        options["params"] = dict(call.parameters)
+    if call.body is not None and len(call.body.files) > 1:
+        options["files"] = call.body.parts()
+    elif call.body is not None:
+        headers["Content-Length"] = str(call.body.size)
+        headers["Content-Type"] = "application/octet-stream"
+    return options
+
+
+def upload(
+    url: str, parameters: Mapping[str, str], body: Body, wait: bool, progress: Progress | None
+) -> Flow[Description]:
+    """Send files, and wait until their surface is ready."""
+    collection = addresses.surfaces_url(url)
+    answer = yield Call("POST", collection, _named(parameters, body), body=body)
+    surface = _described(_checked(answer, collection), _location(answer, collection))
+    looks = itertools.chain(_LOOKS, itertools.repeat(_LOOKS_AFTER))
+    while wait and not surface.ready:
+        if surface.state == "failed":
+            raise RemoteError("failed", str(_reason(surface.details)))
+        if progress is not None:
+            progress("building", _fraction(surface.details))
+        yield Pause(next(looks))
+        answer = yield Call("GET", surface.url)
+        surface = _described(_checked(answer, surface.url), surface.url)
+    return surface
+
+
+def _named(parameters: Mapping[str, str], body: Body) -> Mapping[str, str]:
+    # A form names its files itself; a raw body has no other place for the name than the query.
+    name = body.files[0][0] if len(body.files) == 1 else ""
+    return {**parameters, "filename": name} if name else parameters
+
+
+def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
+    """Everything that a server has, page by page."""
+    page: str | None = addresses.surfaces_url(url)
+    surfaces: list[Description] = []
+    seen = set[str]()
+    while page is not None and page not in seen:
+        seen.add(page)
+        answer = yield Call("GET", page)
+        document = _checked(answer, page)
+        entries = document.get("surfaces")
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise RemoteProtocolError(f"expected a list of surfaces from {page}, got something else")
+        surfaces += [_described(entry, _own_address(entry, page)) for entry in entries]
+        following = document.get("next")
+        page = urljoin(page, following) if isinstance(following, str) and following else None
+    return tuple(surfaces)
+
+
+def describe(url: str) -> Flow[Description]:
+    """One surface's state and figures."""
+    address = addresses.surface_url(url)
+    answer = yield Call("GET", address)
+    return _described(_checked(answer, address), address)
+
+
+def delete(url: str) -> Flow[None]:
+    """Remove one surface from its server."""
+    address = addresses.surface_url(url)
+    answer = yield Call("DELETE", address)
+    _refuse(answer, address)
+
+
+def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
+    """The bytes ``offset`` to ``offset + length`` of a surface's container."""
+    address = f"{addresses.surface_url(url)}/container"
+    answer = yield Call("GET", address, headers={"Range": f"bytes={offset}-{offset + length - 1}"})
+    response = _refuse(answer, address)
+    if response.status_code != 206:
+        raise RemoteProtocolError(
+            f"expected part of the container from {address}, got all of it: Range is not supported"
+        )
+    if len(response.content) != length:
+        raise CorruptStreamError(f"expected {length} bytes of the container, got {len(response.content)}", offset)
+    return response.content
+
+
+def _refuse(answer: httpx.Response | None, url: str) -> httpx.Response:
+    if answer is None:
+        raise AssertionError("a call was resumed without its answer")
+    if not answer.is_success:
+        raise problems.from_response(answer.status_code, answer.reason_phrase, answer.content, url)
+    return answer
+
+
+def _checked(answer: httpx.Response | None, url: str) -> Mapping[str, Any]:
+    response = _refuse(answer, url)
+    try:
+        document = response.json()
+    except ValueError:
+        document = None
+    if not isinstance(document, dict):
+        kind = response.headers.get("content-type", "nothing")
+        raise RemoteProtocolError(f"expected a JSON object from {url}, got {kind}: is this a Lodestream server?")
+    return document
+
+
+def _location(answer: httpx.Response | None, collection: str) -> str:
+    response = _refuse(answer, collection)
+    location = response.headers.get("location", "")
+    if not location:
+        raise RemoteProtocolError(f"expected the new surface's Location from {collection}, got none")
+    return urljoin(collection, str(location))
+
+
+def _own_address(entry: Mapping[str, Any], page: str) -> str:
+    location = entry.get("url") or f"{page.partition('?')[0]}/{entry.get('id')}"
+    return urljoin(page, str(location))
+
+
+def _described(document: Mapping[str, Any], url: str) -> Description:
+    state, name = document.get("state"), document.get("id")
+    if state not in ("queued", "building", "ready", "failed") or not isinstance(name, str):
+        raise RemoteProtocolError(f"expected a surface's id and state from {url}, got id {name!r} and state {state!r}")
+    return Description(url, name, state, document)
+
+
+def _reason(details: Mapping[str, Any]) -> object:
+    return details.get("reason") or "the surface could not be built, and the server does not say why"
+
+
+def _fraction(details: Mapping[str, Any]) -> float:
+    progress = details.get("progress")
+    return float(progress) if isinstance(progress, int | float) else 0.0
