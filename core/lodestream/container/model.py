@@ -50,6 +50,10 @@ class Header:
         Exponents of two: rows and columns of a tile, in coefficients of one band.
     exact : bool
         The complete stream restores every value bit for bit.
+    corrected : bool
+        An exactness section follows the layers.
+    layer_count : int
+        Layers of the complete stream.
     length : int
         Bytes from the start of the container to the end of the header.
     """
@@ -63,6 +67,8 @@ class Header:
     extent: float
     tile: tuple[int, int]
     exact: bool
+    corrected: bool
+    layer_count: int
     length: int = 0
 
     @property

@@ -1,0 +1,137 @@
+"""A container as it arrives: sections out of any chunking of its bytes, each checked before it is handed on."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ..errors import CorruptStreamError, UnsupportedVersionError
+from . import sections
+
+__all__ = ["Frame", "FrameReader", "section_extent", "whole_section"]
+
+_START = len(sections.MAGIC) + 1
+_KNOWN = {sections.HEADER, sections.LAYER, sections.EXACTNESS, sections.METADATA, sections.INDEX}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A section whose CRC holds: ``payload`` stands at ``payload_offset``, the whole section at ``offset`` to ``end``."""
+
+    kind: int
+    offset: int
+    payload_offset: int
+    payload: memoryview
+    end: int
+
+
+class FrameReader:
+    """Sections in file order.
+
+    Memory grows with what has arrived, never with what a length promises.
+    """
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._offset = 0  # of _data in the container
+        self._started = False
+        self.ended = False  # the index was read: nothing but the footer follows
+
+    @property
+    def position(self) -> int:
+        """Bytes of the container taken so far, partial sections not counted."""
+        return self._offset
+
+    @property
+    def pending(self) -> int:
+        """Bytes that wait for the rest of their section."""
+        return len(self._data)
+
+    def feed(self, chunk: bytes | memoryview) -> Iterator[Frame]:
+        """Take bytes, yield the sections that are now complete.
+
+        Raises
+        ------
+        CorruptStreamError
+            Where the bytes are no container, or a section fails its CRC.
+        UnsupportedVersionError
+            Where the container is newer than this program, or a section that must be understood is not known.
+        """
+        self._data += chunk
+        while not self.ended and (frame := self._next()) is not None:
+            if frame.kind in _KNOWN:
+                self.ended = frame.kind == sections.INDEX
+                yield frame
+
+    def rest(self) -> bytes:
+        """Take the bytes after the index, once it was read."""
+        rest, self._data = bytes(self._data), bytearray()
+        return rest
+
+    def _next(self) -> Frame | None:
+        if not self._started and not self._start():
+            return None
+        extent = section_extent(self._data)
+        if extent is None or len(self._data) < extent[1]:
+            return None
+        start, length = extent
+        kind, offset = self._data[0], self._offset
+        frame, self._data = self._data[:length], self._data[length:]
+        self._offset += length
+        return checked(bytes(frame), kind, offset, start)
+
+    def _start(self) -> bool:
+        seen = self._data[:_START]
+        if not sections.MAGIC.startswith(bytes(seen[: len(sections.MAGIC)])):
+            raise CorruptStreamError(f"expected a Lodestream container, got {bytes(seen)!r}", 0)
+        if len(seen) < _START:
+            return False
+        sections.check_version(seen[-1])
+        if len(self._data) > _START and self._data[_START] != sections.HEADER:
+            raise CorruptStreamError(f"expected the header section first, got kind {self._data[_START]}", _START)
+        del self._data[:_START]
+        self._offset = _START
+        self._started = True
+        return True
+
+
+def section_extent(data: bytes | bytearray) -> tuple[int, int] | None:
+    """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told."""
+    length, shift = 0, 0
+    for place in range(1, min(len(data), 10)):
+        length |= (data[place] & 127) << shift
+        shift += 7
+        if data[place] < 128:
+            return place + 1, place + 1 + length + 4
+    if len(data) >= 10:
+        raise CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", 0)
+    return None
+
+
+def checked(frame: bytes, kind: int, offset: int, start: int) -> Frame:
+    """A whole section, whose payload starts at ``start`` of it, after its CRC was checked."""
+    payload, crc = memoryview(frame)[start:-4], int.from_bytes(frame[-4:], "little")
+    if zlib.crc32(frame[:-4]) != crc:
+        raise CorruptStreamError(f"expected a section of kind {kind} to match its CRC, got other bytes", offset)
+    if kind not in _KNOWN and kind < sections.OPTIONAL:
+        raise UnsupportedVersionError(
+            f"expected sections of version {sections.VERSION}, got one of kind {kind} that must be understood"
+        )
+    return Frame(kind, offset, offset + start, payload, offset + len(frame))
+
+
+def whole_section(data: bytes, offset: int, kind: int) -> Frame:
+    """A section that was fetched by itself.
+
+    Raises
+    ------
+    CorruptStreamError
+        When it is not one whole section of that kind.
+    """
+    extent = section_extent(data[:10])
+    if extent is None or extent[1] != len(data) or data[0] != kind:
+        raise CorruptStreamError(f"expected one whole section of kind {kind}, got other bytes", offset)
+    return checked(data, kind, offset, extent[0])
+
+

@@ -1,0 +1,114 @@
+"""A complete container with random access: its index, and what `lodestream info` tells of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from ..errors import CorruptStreamError, TruncatedStreamError
+from . import sections
+from .frames import FrameReader, whole_section
+from .model import ByteRange, Index
+
+__all__ = ["describe", "index_from", "read_index", "read_metadata"]
+
+_FIRST_READ = 512
+
+
+def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
+    """Index of a complete container.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+        Fewer bytes only where the container ends.
+    size : int
+        Bytes of the container.
+
+    Raises
+    ------
+    CorruptStreamError, UnsupportedVersionError
+    TruncatedStreamError
+        When the container does not end with a footer, but is otherwise one.
+    """
+    header = _read_header(read, size)
+    tail = size - sections.FOOTER_LENGTH
+    try:
+        place = sections.parse_footer(read(max(tail, 0), sections.FOOTER_LENGTH), tail)
+    except CorruptStreamError:
+        raise TruncatedStreamError(f"expected a container that ends with a footer, got {size} bytes without") from None
+    index = index_from(read(place.offset, place.length), place, header)
+    if index.size != size:
+        raise CorruptStreamError(f"expected a container of {index.size} bytes, got {size}", tail)
+    metadata = index.metadata
+    return replace(index, metadata_values=read_metadata(read(metadata.offset, metadata.length), metadata))
+
+
+def _read_header(read: Callable[[int, int], bytes], size: int) -> sections.Header:
+    reader, wanted = FrameReader(), _FIRST_READ
+    position = 0
+    while position < size:
+        chunk = read(position, min(wanted, size - position))
+        for frame in reader.feed(chunk):
+            return sections.parse_header(frame.payload, frame.payload_offset, frame.end)
+        if not chunk:
+            break
+        position += len(chunk)
+        wanted *= 2
+    raise TruncatedStreamError(f"expected a container with a whole header, got {size} bytes without")
+
+
+def index_from(data: bytes, place: ByteRange, header: sections.Header) -> Index:
+    """Index from the bytes of its section, with what `plan` sends for each level."""
+    frame = whole_section(data, place.offset, sections.INDEX)
+    index = sections.parse_index(frame.payload, frame.payload_offset, place, header)
+    return with_level_bytes(index)
+
+
+def with_level_bytes(index: Index) -> Index:
+    """The index with each level's bytes: header and segments up to it; for the last level the complete stream."""
+    sizes = [0] * len(index.levels)
+    for segment in index.segments:
+        sizes[index.header.layout.tiles[segment.tile].level] += segment.range.length
+    total, levels = index.header.length, []
+    for level, size in zip(index.levels, sizes, strict=True):
+        total += size
+        last = level.level == index.header.levels
+        levels.append(replace(level, bytes=index.surface_end if last else total))
+    return replace(index, levels=tuple(levels))
+
+
+def read_metadata(data: bytes, place: ByteRange) -> dict[str, Any]:
+    """The values of a metadata section that stands at ``place``."""
+    frame = whole_section(data, place.offset, sections.METADATA)
+    return sections.parse_metadata(frame.payload, frame.payload_offset)
+
+
+def describe(index: Index) -> dict[str, Any]:
+    """What is known of a surface, in plain values: the keys of ``lodestream info --json``.
+
+    ``levels`` are the states that hold all of the levels up to one and nothing finer, ``layers`` the steps of quality
+    in file order; ``bytes`` are lengths of the container's prefix (layers), of what `plan` sends (levels), and of the
+    whole file.
+    """
+    header = index.header
+    shape, closed = list(header.shape), list(header.closed)
+    return {
+        "shape": shape,
+        "closed": closed,
+        "blocks": [{"shape": shape, "closed": closed}],
+        "channels": header.channels,
+        "dtype": header.dtype.name,
+        "extent": header.extent,
+        "levels": [
+            {"level": r.level, "shape": list(r.shape), "bytes": r.bytes, "rms": r.rms, "max": r.max_error}
+            for r in index.levels
+        ],
+        "layers": [
+            {"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers
+        ],
+        "bytes": index.size,
+        "exact": header.exact,
+        "metadata": dict(index.metadata_values),
+    }

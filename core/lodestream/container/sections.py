@@ -1,0 +1,323 @@
+"""The bytes of each section: one pair of functions a section, writing and reading. `docs/format.md` is their specification."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+
+from ..errors import CorruptStreamError, UnsupportedVersionError
+from ..lattice import Lattice
+from ..layout import Layout
+from ..transform import COEFFICIENT_BITS, default_predictors, fitted_steps
+from .fields import FieldReader, FieldWriter
+from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
+
+__all__ = [
+    "EXACTNESS",
+    "FOOTER_LENGTH",
+    "HEADER",
+    "INDEX",
+    "LAYER",
+    "LARGEST_SURFACE",
+    "TILE_BITS",
+    "MAGIC",
+    "METADATA",
+    "OPTIONAL",
+    "VERSION",
+    "Entry",
+    "check_version",
+    "parse_footer",
+    "parse_header",
+    "parse_index",
+    "parse_layer",
+    "parse_metadata",
+    "section",
+    "serialize_footer",
+    "serialize_header",
+    "serialize_index",
+    "serialize_layer",
+    "serialize_metadata",
+]
+
+VERSION = 1
+MAGIC = b"\x89LODE\r\n"  # a byte that is no text, the name, a line end that text transfer would damage
+HEADER, LAYER, EXACTNESS, METADATA, INDEX = 1, 2, 3, 4, 5
+#: Kinds from here on may be skipped by a reader that does not know them.
+OPTIONAL = 128
+FOOTER_LENGTH = 24
+_FOOTER_MAGIC = b"LODEEND\n"
+
+#: Most points that a header may promise.
+LARGEST_SURFACE = 2**31
+#: Rows of a tile times columns, as an exponent of two.
+TILE_BITS = 14
+_LARGEST_FILE = 2**62
+_DTYPES = [np.dtype(name) for name in "i1 i2 i4 i8 u1 u2 u4 u8 f4 f8".split()]
+_RULES = ("affine", "decimal")
+
+
+class Entry(NamedTuple):
+    """A segment as a layer's table tells it; ``length`` bytes."""
+
+    tile: int
+    channel: int
+    top: int
+    planes: int
+    length: int
+
+
+def section(kind: int, payload: bytes) -> bytes:
+    """Frame a payload: kind, length, payload, CRC-32 over all of these."""
+    frame = FieldWriter()
+    frame.byte(kind)
+    frame.varint(len(payload))
+    frame.data += payload
+    frame.pack("I", zlib.crc32(frame.data))
+    return bytes(frame.data)
+
+
+def serialize_header(header: Header) -> bytes:
+    """Magic, version and header section."""
+    out = FieldWriter()
+    out.byte(header.closed[0] | header.closed[1] << 1 | header.flat << 2 | header.exact << 3 | header.corrected << 4)
+    out.byte(_DTYPES.index(header.dtype))
+    for number in (*header.shape, header.channels, header.layer_count):
+        out.varint(number)
+    out.byte(header.tile[0] | header.tile[1] << 4)
+    out.pack("d", header.extent)
+    for lattice in header.lattices:
+        out.byte(_RULES.index(lattice.rule))
+        out.pack("dd", lattice.origin, lattice.step)
+    fitted = fitted_steps(header.layout)
+    for predictors in header.predictors:
+        for level, axis in fitted:
+            out.pack("bb", *(int(x) for x in predictors[level, axis]))
+    return MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+
+
+def parse_header(payload: memoryview, offset: int, length: int) -> Header:
+    """Header section's payload, which stands at ``offset``; the header ends at ``length``."""
+    fields = FieldReader(payload, offset)
+    flags, code = fields.byte(), fields.byte()
+    if flags > 31 or code >= len(_DTYPES):
+        raise CorruptStreamError(f"expected flags below 32 and a type below {len(_DTYPES)}, got {flags} and {code}", offset)
+    shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+    channels, layer_count = fields.varint(2**16), fields.varint(2**16)
+    few = channels == 0 or layer_count == 0 or (flags & 4 and channels != 1)
+    if few or not 2 <= shape[0] * shape[1] <= LARGEST_SURFACE:
+        raise CorruptStreamError(
+            f"expected points, channels and layers, got {shape[0]} x {shape[1]} x {channels}, {layer_count}", offset
+        )
+    exponents = fields.byte()
+    tile = exponents & 15, exponents >> 4
+    if sum(tile) != TILE_BITS or min(tile) < 1:
+        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
+    (extent,) = fields.unpack("d")
+    lattices = []
+    for _ in range(channels):
+        start, rule = fields.at, fields.byte()
+        origin, step = fields.unpack("dd")
+        if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
+            raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
+        lattices.append(Lattice(_RULES[rule], origin, step))
+    if not (math.isfinite(extent) and extent >= 0):
+        raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
+    closed = bool(flags & 1), bool(flags & 2)
+    layout = Layout(shape, closed, tile)
+    fitted = fitted_steps(layout)
+    predictors = np.stack([default_predictors(layout)] * channels)
+    for channel in range(channels):
+        for level, axis in fitted:
+            predictors[channel, level, axis] = fields.unpack("bb")
+    if (predictors == -128).any():
+        raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
+    fields.end()
+    return Header(
+        dtype=_DTYPES[code],
+        shape=shape,
+        closed=closed,
+        flat=bool(flags & 4),
+        lattices=tuple(lattices),
+        predictors=predictors,
+        extent=extent,
+        tile=tile,
+        exact=bool(flags & 8),
+        corrected=bool(flags & 16),
+        layer_count=layer_count,
+        length=length,
+    )
+
+
+def serialize_layer(rms: float, max_error: float, entries: Sequence[Entry], channels: int) -> bytes:
+    """A layer's errors and table; the segments follow it in the section's payload.
+
+    Each entry starts with a byte: planes - 1 in the low three bits (7: a varint of planes - 8 follows), and in the
+    high five the tiles passed over since the last (31: a varint of the number - 31 follows).
+    """
+    out = FieldWriter()
+    out.pack("dd", rms, max_error)
+    out.varint(len(entries))
+    unit = 0
+    for entry in entries:
+        place = entry.tile * channels + entry.channel
+        skip, planes = place - unit, entry.planes - 1
+        out.byte(min(planes, 7) | min(skip, 31) << 3)
+        if planes >= 7:
+            out.varint(planes - 7)
+        if skip >= 31:
+            out.varint(skip - 31)
+        # The top is told once: with the run of planes that starts at it.
+        out.varint(entry.length << 1 | (entry.top > 0))
+        if entry.top:
+            out.byte(entry.top)
+        unit = place + 1
+    return bytes(out.data)
+
+
+def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[float, float, list[Entry], int]:
+    """Errors, entries (``top`` is 0 where an earlier layer told it) and where in the payload the segments start."""
+    fields = FieldReader(payload, offset)
+    rms, max_error = fields.unpack("dd")
+    units = len(header.layout.tiles) * header.channels
+    entries, unit = [], 0
+    for _ in range(fields.varint(units)):
+        start, first = fields.at, fields.byte()
+        planes = (first & 7) + 1
+        if planes == 8:
+            planes += fields.varint(COEFFICIENT_BITS)
+        skip = first >> 3
+        if skip == 31:
+            skip += fields.varint(units)
+        length = fields.varint(_LARGEST_FILE)
+        top = fields.byte() if length & 1 else 0
+        unit += skip
+        if unit >= units or max(top, planes) > COEFFICIENT_BITS or length < 2:
+            raise CorruptStreamError(f"expected one of {units} tiles and at most 28 planes, got {unit}, {top}", start)
+        entries.append(Entry(*divmod(unit, header.channels), top, planes, length >> 1))
+        unit += 1
+    if sum(entry.length for entry in entries) != len(payload) - fields.place:
+        raise CorruptStreamError("expected segments as long as the layer's table says, got another length", offset)
+    return rms, max_error, entries, fields.place
+
+
+def serialize_metadata(values: dict[str, Any]) -> bytes:
+    """A MessagePack map."""
+    return bytes(msgpack.packb(values, use_bin_type=True))
+
+
+def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
+    """The map of a metadata section."""
+    try:
+        values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise CorruptStreamError(f"expected a MessagePack map of metadata: {error}", offset) from None
+    if not isinstance(values, dict):
+        raise CorruptStreamError(f"expected a map of metadata, got {type(values).__name__}", offset)
+    return values
+
+
+def serialize_index(index: Index) -> bytes:
+    """Payload of the index section; levels' byte counts and shapes follow from the rest."""
+    out = FieldWriter()
+    out.varint(len(index.layers))
+    segments: list[list[Segment]] = [[] for _ in index.layers]
+    for segment in index.segments:
+        segments[segment.layer].append(segment)
+    for layer, members in zip(index.layers, segments, strict=True):
+        out.varint(layer.end - layer.offset)
+        out.pack("dd", layer.rms, layer.max_error)
+        out.varint(len(members))
+        unit = 0
+        for segment in members:
+            place = segment.tile * index.header.channels + segment.channel
+            out.varint(place - unit)
+            out.byte(segment.planes)
+            out.byte(segment.top)
+            out.varint(segment.range.length)
+            out.pack("I", segment.crc)
+            unit = place + 1
+    for level in index.levels:
+        out.pack("dd", level.rms, level.max_error)
+    out.varint(index.exactness.length if index.exactness else 0)
+    out.varint(index.metadata.length)
+    return bytes(out.data)
+
+
+def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header: Header) -> Index:
+    """Index section's payload, which stands at ``offset``; ``index_range`` is the whole section."""
+    fields = FieldReader(payload, offset)
+    units = len(header.layout.tiles) * header.channels
+    layers, segments = [], []
+    place, level = header.length, 0
+    for number in range(fields.varint(len(payload))):
+        length = fields.varint(_LARGEST_FILE)
+        rms, max_error = fields.unpack("dd")
+        members, unit = [], 0
+        for _ in range(fields.varint(units)):
+            unit += fields.varint(units)
+            planes, top = fields.byte(), fields.byte()
+            size = fields.varint(length)
+            (crc,) = fields.unpack("I")
+            if unit >= units or not 1 <= planes <= top <= COEFFICIENT_BITS or size == 0:
+                raise CorruptStreamError(f"expected one of {units} tiles and its planes, got {unit}, {planes}", fields.at)
+            members.append((*divmod(unit, header.channels), top, planes, size, int(crc)))
+            unit += 1
+        # Segments fill the end of a layer's payload, before its CRC.
+        at = place + length - 4 - sum(member[4] for member in members)
+        for tile, channel, top, planes, size, crc in members:
+            segments.append(Segment(number, tile, channel, top, planes, ByteRange(at, size), crc))
+            at += size
+            level = max(level, header.layout.tiles[tile].level)
+        layers.append(LayerRecord(number, place, place + length, level, rms, max_error))
+        place += length
+    figures = [fields.unpack("dd") for _ in range(header.levels + 1)]
+    exactness, metadata = fields.varint(_LARGEST_FILE), fields.varint(_LARGEST_FILE)
+    fields.end()
+    filled = place + exactness + metadata == index_range.offset
+    if len(layers) != header.layer_count or bool(exactness) != header.corrected or not filled:
+        raise CorruptStreamError("expected layers that fill the container up to the index, got others", offset)
+    levels = tuple(
+        LevelRecord(level, header.layout.shapes[level], 0, rms, max_error)
+        for level, (rms, max_error) in enumerate(figures)
+    )
+    return Index(
+        header,
+        tuple(layers),
+        levels,
+        tuple(segments),
+        ByteRange(place, exactness) if exactness else None,
+        ByteRange(place + exactness, metadata),
+        index_range,
+        index_range.end + FOOTER_LENGTH,
+    )
+
+
+def serialize_footer(index: ByteRange) -> bytes:
+    """Where the index section stands: the last 24 bytes of a container."""
+    out = FieldWriter()
+    out.pack("QI", index.offset, index.length)
+    out.pack("I", zlib.crc32(out.data))
+    return bytes(out.data) + _FOOTER_MAGIC
+
+
+def parse_footer(data: bytes, offset: int) -> ByteRange:
+    """The index section's place, from the last bytes of a container, which stand at ``offset``."""
+    if len(data) != FOOTER_LENGTH or data[16:] != _FOOTER_MAGIC:
+        raise CorruptStreamError("expected the footer of a container, got other bytes", offset)
+    place, length, crc = FieldReader(data[:16], offset).unpack("QII")
+    if zlib.crc32(data[:12]) != crc or place + length != offset:
+        raise CorruptStreamError("expected a footer that points at the index before it, got another place", offset)
+    return ByteRange(int(place), int(length))
+
+
+def check_version(version: int) -> None:
+    """Refuse what is newer than this program."""
+    if version != VERSION:
+        raise UnsupportedVersionError(
+            f"expected a container of version {VERSION}, the one this program reads, got version {version}"
+        )

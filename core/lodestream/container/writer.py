@@ -1,0 +1,100 @@
+"""Coded layers into a container."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from . import sections
+from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
+
+__all__ = ["CodedLayer", "CodedSegment", "write_container"]
+
+
+@dataclass(frozen=True)
+class CodedSegment:
+    """A run of planes of a tile with its bytes; ``top`` planes in all, ``begins`` with the highest of them."""
+
+    tile: int
+    channel: int
+    top: int
+    planes: int
+    begins: bool
+    data: bytes
+
+
+@dataclass(frozen=True)
+class CodedLayer:
+    """Segments sorted by tile and channel, and the errors measured with them."""
+
+    rms: float
+    max_error: float
+    segments: Sequence[CodedSegment]
+
+
+def write_container(
+    header: Header,
+    layers: Sequence[CodedLayer],
+    levels: Sequence[tuple[float, float]],
+    correction: bytes,
+    metadata: Mapping[str, Any],
+    *,
+    exact: bool,
+) -> bytes:
+    """Put a container together.
+
+    Parameters
+    ----------
+    header : Header
+        Its ``exact``, ``corrected``, ``layer_count`` and ``length`` are filled in here.
+    layers : sequence of CodedLayer
+    levels : sequence of (rms, max_error)
+        One for each level.
+    correction : bytes
+        Payload of the exactness section, empty where there is none.
+    metadata : mapping
+    exact : bool
+        The complete stream restores every value bit for bit.
+    """
+    header = replace(header, exact=exact, corrected=bool(correction), layer_count=len(layers))
+    out = bytearray(sections.serialize_header(header))
+    header = replace(header, length=len(out))
+    records, segments, finest = [], [], 0
+    for number, layer in enumerate(layers):
+        entries = [
+            sections.Entry(s.tile, s.channel, s.top if s.begins else 0, s.planes, len(s.data)) for s in layer.segments
+        ]
+        table = sections.serialize_layer(layer.rms, layer.max_error, entries, header.channels)
+        body = b"".join(s.data for s in layer.segments)
+        start = len(out)
+        out += sections.section(sections.LAYER, table + body)
+        place = len(out) - 4 - len(body)
+        for s in layer.segments:
+            where = ByteRange(place, len(s.data))
+            segments.append(Segment(number, s.tile, s.channel, s.top, s.planes, where, zlib.crc32(s.data)))
+            place += len(s.data)
+            finest = max(finest, header.layout.tiles[s.tile].level)
+        records.append(LayerRecord(number, start, len(out), finest, layer.rms, layer.max_error))
+    exactness = _append(out, sections.EXACTNESS, correction) if correction else None
+    where_metadata = _append(out, sections.METADATA, sections.serialize_metadata(dict(metadata)))
+    index = Index(
+        header,
+        tuple(records),
+        tuple(LevelRecord(level, header.layout.shapes[level], 0, *figures) for level, figures in enumerate(levels)),
+        tuple(segments),
+        exactness,
+        where_metadata,
+        ByteRange(len(out), 0),
+        0,
+    )
+    where_index = _append(out, sections.INDEX, sections.serialize_index(index))
+    out += sections.serialize_footer(where_index)
+    return bytes(out)
+
+
+def _append(out: bytearray, kind: int, payload: bytes) -> ByteRange:
+    start = len(out)
+    out += sections.section(kind, payload)
+    return ByteRange(start, len(out) - start)

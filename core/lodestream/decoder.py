@@ -1,0 +1,323 @@
+"""A surface out of the bytes of a container as they arrive."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .container import sections
+from .container.frames import Frame, FrameReader, section_extent
+from .container.model import ByteRange, Header, Index
+from .container.reader import index_from, read_metadata
+from .container.slices import Slices
+from .errors import CorruptStreamError, OptionError, TruncatedStreamError
+from .reconstruction import Coded, Progress, Reconstruction
+from .surface import Surface
+
+__all__ = ["Decoder", "View", "decode"]
+
+
+@dataclass(frozen=True)
+class View:
+    """A state of the surface; its points are decoded when they are asked for, also when finer states have come since.
+
+    Attributes
+    ----------
+    number : int
+        Of the layer (of the level, where levels come one after another); the exact end has the next number.
+    level : int
+        Finest level with a decoded segment.
+    bytes : int
+        Bytes held of header, layers and exactness.
+    rms, max_error : float
+        Measured errors of the full-resolution picture, in the surface's unit.
+    complete : bool
+        Nothing more comes.
+    """
+
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+    complete: bool
+    _reconstruction: Reconstruction = field(repr=False, compare=False)
+    _length: int = field(repr=False, compare=False)
+    _state: NDArray[np.int8] = field(repr=False, compare=False)
+    _corrected: bool = field(repr=False, compare=False)
+    _metadata: dict[str, Any] = field(repr=False, compare=False)
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """The full-resolution picture, with the dtype and axes of the original."""
+        header = self._reconstruction.header
+        return self._reconstruction.points(self._length, self._state, header.levels, self._corrected)
+
+    def points_at(self, level: int) -> NDArray[Any]:
+        """The grid of a coarser level, of that level's shape.
+
+        Raises
+        ------
+        OptionError
+            When there is no such level.
+        """
+        header = self._reconstruction.header
+        if not 0 <= level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
+        corrected = self._corrected and level == header.levels
+        return self._reconstruction.points(self._length, self._state, level, corrected)
+
+    def surface(self) -> Surface:
+        """The full-resolution picture as a surface, with its metadata as far as they have come."""
+        return Surface(self.points, self._reconstruction.header.closed, metadata=self._metadata)
+
+
+class Decoder:
+    """Takes the bytes of a container in any chunks, gives a `View` for each state with known errors.
+
+    `feed` takes them in file order, `feed_at` takes the slices that `plan` names. Damage raises `CorruptStreamError`
+    with its offset, and what came before stays usable.
+    """
+
+    def __init__(self) -> None:
+        self.header: Header | None = None
+        self.index: Index | None = None
+        self.metadata: dict[str, Any] | None = None
+        self.layers: list[View] = []
+        self._values: dict[str, Any] = {}
+        self._frames = FrameReader()
+        self._slices: Slices | None = None
+        self._early: list[tuple[int, bytes]] = []
+        self._loose: tuple[int, bytearray] | None = None
+        self._footer = bytearray()
+
+    def feed(self, chunk: bytes | bytearray | memoryview) -> list[View]:
+        """Take the next bytes of the file; returns the views that they complete.
+
+        Raises
+        ------
+        CorruptStreamError, UnsupportedVersionError
+            The layers before the damage stay decodable.
+        """
+        if self._frames.ended:
+            self._footer += chunk
+            return []
+        before = len(self.layers)
+        for frame in self._frames.feed(bytes(chunk)):
+            self._take(frame)
+        if self._frames.ended:
+            self._footer += self._frames.rest()
+        return self.layers[before:]
+
+    def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
+        """Take a slice of the container that starts at ``offset``; returns the views that it completes.
+
+        Slices come in the order of a `plan`, cut into any pieces.
+        """
+        before = len(self.layers)
+        if self._slices is not None:
+            self._take_slice(offset, bytes(chunk))
+        elif offset == self._frames.position + self._frames.pending:
+            self.feed(chunk)
+            if self.header is not None:
+                early, self._early = self._early, []
+                for place, data in early:
+                    self._take_loose(place, data)
+        elif self.header is None:
+            self._early.append((offset, bytes(chunk)))
+        else:
+            self._take_loose(offset, bytes(chunk))
+        return self.layers[before:]
+
+    def finish(self) -> None:
+        """Say that no more bytes come.
+
+        Raises
+        ------
+        TruncatedStreamError
+            When the surface did not come whole; what came stays decodable.
+        """
+        if not self.complete:
+            raise TruncatedStreamError(
+                f"expected {self.header.layer_count if self.header else 'some'} layers, "
+                f"got {len(self.layers)} in {self._frames.position + self._frames.pending} bytes"
+            )
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole surface has come; metadata and index may still be missing."""
+        return bool(self.layers) and self.layers[-1].complete
+
+    def view(self) -> View:
+        """The current state.
+
+        Raises
+        ------
+        TruncatedStreamError
+            Before the first layer.
+        """
+        if not self.layers:
+            raise TruncatedStreamError("expected at least one whole layer, got less")
+        return self.layers[-1]
+
+    def surface(self) -> Surface:
+        """The current state as a surface, see `view`."""
+        return self.view().surface()
+
+    def points_at(self, level: int) -> NDArray[Any]:
+        """The current grid of a level, see `View.points_at`."""
+        return self.view().points_at(level)
+
+    @property
+    def level(self) -> int:
+        """Finest level with a decoded segment, see `view`."""
+        return self.view().level
+
+    @property
+    def bytes(self) -> int:
+        """Bytes held of header, layers and exactness; 0 before the first layer."""
+        return self.layers[-1].bytes if self.layers else 0
+
+    @property
+    def rms(self) -> float:
+        """Measured RMS error of the current state, see `view`."""
+        return self.view().rms
+
+    @property
+    def max_error(self) -> float:
+        """Measured maximum error of the current state, see `view`."""
+        return self.view().max_error
+
+    def _take(self, frame: Frame) -> None:
+        if frame.kind == sections.HEADER:
+            self._take_header(frame)
+        elif self.header is None:
+            raise CorruptStreamError(f"expected the header, got a section of kind {frame.kind}", frame.offset)
+        elif frame.kind == sections.LAYER:
+            self._take_layer(frame, self.header)
+        elif frame.kind == sections.EXACTNESS:
+            self._take_exactness(frame, self.header)
+        elif frame.kind == sections.METADATA:
+            self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+        else:
+            place = ByteRange(frame.offset, frame.end - frame.offset)
+            self.index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
+
+    def _take_header(self, frame: Frame) -> None:
+        if self.header is not None:
+            raise CorruptStreamError("expected one header, got a second", frame.offset)
+        self.header = sections.parse_header(frame.payload, frame.payload_offset, frame.end)
+        self._progress = Progress(self.header)
+        self._reconstruction = Reconstruction(self.header)
+        self._level = 0
+
+    def _take_layer(self, frame: Frame, header: Header) -> None:
+        number = len(self.layers)
+        if number >= header.layer_count:
+            raise CorruptStreamError(f"expected {header.layer_count} layers, got more", frame.offset)
+        rms, max_error, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+        segments = []
+        for entry in entries:
+            place = frame.payload_offset + start
+            first = self._progress.advance(entry.tile, entry.channel, entry.top, entry.planes, place)
+            data = bytes(frame.payload[start : start + entry.length])
+            segments.append(Coded(entry.tile, entry.channel, first, entry.planes, data, place))
+            start += entry.length
+            self._level = max(self._level, header.layout.tiles[entry.tile].level)
+        for segment in segments:
+            self._reconstruction.add(segment)
+        complete = number + 1 == header.layer_count and not header.corrected
+        self._show(number, self._level, frame.end, rms, max_error, complete)
+
+    def _take_exactness(self, frame: Frame, header: Header) -> None:
+        if len(self.layers) != header.layer_count or not header.corrected:
+            raise CorruptStreamError("expected layers, got exactness", frame.offset)
+        self._correct(frame)
+        self._show(len(self.layers), header.levels, frame.end, 0.0, 0.0, True)
+
+    def _correct(self, frame: Frame) -> None:
+        self._reconstruction.correct(bytes(frame.payload), frame.payload_offset)
+
+    def _take_metadata(self, values: dict[str, Any]) -> None:
+        self.metadata = values
+        self._values.update(values)
+
+    def _show(self, number: int, level: int, held: int, rms: float, max_error: float, complete: bool) -> None:
+        corrected = complete and self.header is not None and self.header.corrected
+        length, state = self._reconstruction.length, self._progress.state.copy()
+        self.layers.append(
+            View(number, level, held, rms, max_error, complete, self._reconstruction, length, state, corrected, self._values)
+        )
+
+    def _take_loose(self, offset: int, data: bytes) -> None:
+        """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
+        start, run = self._loose or (offset, bytearray())
+        if start + len(run) != offset:
+            raise CorruptStreamError(f"expected bytes that continue at {start + len(run)}, got others", offset)
+        run += data
+        self._loose = start, run
+        kind, place = run[0], ByteRange(start, len(run))
+        if kind not in (sections.INDEX, sections.METADATA):
+            raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
+        extent = section_extent(run)
+        if extent is None or len(run) < extent[1]:
+            return
+        if len(run) > extent[1]:
+            raise CorruptStreamError("expected a section by itself, got bytes after it", start + extent[1])
+        self._loose = None
+        if kind == sections.METADATA:
+            self._take_metadata(read_metadata(bytes(run), place))
+        elif self.header is not None:
+            self.index = index_from(bytes(run), place, self.header)
+            self._slices = Slices(self.index)
+
+    def _take_slice(self, offset: int, data: bytes) -> None:
+        assert self._slices is not None
+        assert self.header is not None
+        self._slices.add(offset, data)
+        for segment, payload in self._slices.segments():
+            if zlib.crc32(payload) != segment.crc:
+                raise CorruptStreamError("expected a segment to match its CRC, got other bytes", segment.range.offset)
+            known = bool(self._progress.top[segment.tile, segment.channel])
+            top = 0 if known else segment.top
+            first = self._progress.advance(segment.tile, segment.channel, top, segment.planes, segment.range.offset)
+            self._reconstruction.add(
+                Coded(segment.tile, segment.channel, first, segment.planes, payload, segment.range.offset)
+            )
+            if (state := self._slices.hold(segment)) is not None:
+                self._show(*state)
+        for frame in self._slices.sections():
+            if frame.kind == sections.METADATA:
+                self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+            else:
+                self._correct(frame)
+                if (state := self._slices.hold_exactness()) is not None:
+                    self._show(*state)
+
+
+def decode(container: bytes | bytearray | memoryview) -> Surface:
+    """The surface of a complete container.
+
+    Parameters
+    ----------
+    container : bytes
+
+    Returns
+    -------
+    Surface
+        With the dtype, axes and values of the original, bit for bit unless it was encoded with a precision.
+
+    Raises
+    ------
+    CorruptStreamError, UnsupportedVersionError
+    TruncatedStreamError
+        When the container is cut; use `Decoder` for a prefix.
+    """
+    decoder = Decoder()
+    decoder.feed(container)
+    decoder.finish()
+    return decoder.surface()

@@ -1,0 +1,288 @@
+"""A surface into a container."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import exactness
+from .allocation import TileCurve, assign_layers
+from .bitplanes import code_planes, new_model, plane_gains
+from .container.model import Header
+from .container.sections import TILE_BITS
+from .container.writer import CodedLayer, CodedSegment, write_container
+from .lattice import Lattice
+from .layout import Layout
+from .measure import distances, extent_of
+from .quantise import channel_of, choose_lattices
+from .reconstruction import to_points
+from .surface import Surface
+from .target import Tolerance
+from .tiles import Tiles, TileTable, gather
+from .transform import COEFFICIENT_BITS, allocate, forward, inverse, synthesis_norms
+
+__all__ = ["encode"]
+
+Figures = tuple[float, float]
+State = NDArray[np.int8]
+
+
+def encode(
+    surface: Surface | ArrayLike,
+    precision: float | str | Tolerance | None = None,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> bytes:
+    """Encode a surface into a container.
+
+    Parameters
+    ----------
+    surface : Surface or array
+        An array is taken as ``Surface(array)``.
+    precision : float, str, Tolerance or None
+        Largest distance allowed between a point and what comes back, in the surface's unit or, as ``"1e-4d"``, times
+        the range of the heights or the diagonal of the box. None: every value comes back bit for bit.
+    progress : callable, optional
+        Called now and then with the fraction done, 0 to 1.
+
+    Returns
+    -------
+    bytes
+        A container, see ``docs/format.md``.
+
+    Raises
+    ------
+    InputError
+        When the surface cannot be encoded, or not with this precision.
+    """
+    if not isinstance(surface, Surface):
+        surface = Surface(surface)
+    return _Encoding(surface, precision, progress or (lambda fraction: None)).run()
+
+
+@dataclass
+class _Channel:
+    """One channel on its way: coefficients with signs, flat, and what they weigh."""
+
+    true: NDArray[np.int32]
+    weights: NDArray[np.float64]  # a band
+    top: NDArray[np.int8]  # a tile
+
+
+class _Encoding:
+    """One run of the encoder; the methods stand in the order in which they are called."""
+
+    def __init__(
+        self, surface: Surface, precision: float | str | Tolerance | None, progress: Callable[[float], None]
+    ) -> None:
+        self.surface, self.points, self.progress = surface, surface.points, progress
+        count = 1 if self.points.ndim == 2 else self.points.shape[2]
+        self.geometric = min(count, 3)
+        self.extent = extent_of(self.points, self.geometric)
+        if isinstance(precision, str):
+            precision = Tolerance.parse(precision)
+        elif precision is not None and not isinstance(precision, Tolerance):
+            precision = Tolerance(float(precision))
+        self.precision = None if precision is None else precision.absolute(self.extent)
+        tile = tile_exponents(surface.shape)
+        self.layout = Layout(surface.shape, surface.closed, tile)
+        self.table = TileTable.of(self.layout)
+        self.lattices = choose_lattices(self.points, self.geometric, self.precision)
+
+    def run(self) -> bytes:
+        predictors = np.zeros((len(self.lattices), self.layout.levels, 2, 2), np.int8)
+        channels = []
+        for number, lattice in enumerate(self.lattices):
+            channel, predictors[number] = self._transform(number, lattice)
+            channels.append(channel)
+        self.channels = channels
+        self.progress(0.1)
+        states = assign_layers(self._curves(), self.layout)
+        self.progress(0.4)
+        self.header = Header(
+            dtype=self.points.dtype,
+            shape=self.surface.shape,
+            closed=self.surface.closed,
+            flat=self.points.ndim == 2,
+            lattices=tuple(self.lattices),
+            predictors=predictors,
+            extent=self.extent,
+            tile=self.layout.tile,
+            exact=False,
+            corrected=False,
+            layer_count=0,
+        )
+        states, figures = self._measured(states)
+        self.progress(0.7)
+        levels = self._level_figures(figures[-1])
+        self.progress(0.8)
+        correction = self._correction(figures[-1])
+        if correction or figures[-1] == (0.0, 0.0):
+            levels[-1] = (0.0, 0.0)
+        coded = self._coded(states, figures)
+        container = write_container(
+            self.header,
+            coded,
+            levels,
+            correction,
+            self.surface.metadata,
+            exact=bool(correction) or self._exact_already,
+        )
+        self.progress(1.0)
+        return container
+
+    def _transform(self, number: int, lattice: Lattice) -> tuple[_Channel, NDArray[np.int8]]:
+        """Lattice coordinates of a channel, transformed and cut into tiles."""
+        for fit in (True, False):
+            values = allocate(self.surface.shape)
+            values[:] = lattice.coordinates(channel_of(self.points, number))
+            predictors = forward(values, self.layout, fit)
+            if max(int(values.max()), -int(values.min())) < 1 << COEFFICIENT_BITS:
+                break
+        true = gather(self.table, values)
+        norms = synthesis_norms(self.layout, predictors)
+        spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
+        if number >= self.geometric:
+            # An attribute shares the stream in proportion to its own range.
+            span = extent_of(channel_of(self.points, number), 1)
+            spacing *= self.extent / span if span else 0.0
+        weights = np.array(
+            [norms[tile.level, *map(int, band.kind)] * spacing**2 for tile in self.layout.tiles for band in tile.bands]
+        )
+        top = np.array([self._top(true, number) for number in range(len(self.layout.tiles))], np.int8)
+        return _Channel(true, weights, top), predictors
+
+    def _top(self, true: NDArray[np.int32], tile: int) -> int:
+        """Bit-planes of a tile."""
+        rows = self.table.of_tile(tile)
+        largest = 0
+        for place, stride, height, _ in rows[:, :4]:
+            frame = true[place - stride - 1 : place + (height + 1) * stride - 1]
+            largest = max(largest, int(frame.max()), -int(frame.min()))
+        return largest.bit_length()
+
+    def _curves(self) -> list[TileCurve]:
+        """Cost and gain of every plane, by coding each tile once as a whole."""
+        coder = _TileCoder(self.table, self.channels)
+        curves = []
+        for tile in range(len(self.layout.tiles)):
+            for number, channel in enumerate(self.channels):
+                top = int(channel.top[tile])
+                if top:
+                    costs = np.zeros(top, np.float64)
+                    coder.code(tile, number, top, top, costs)
+                    bits = np.diff(costs[::-1], prepend=32.0 - 32.0)[::-1]
+                    gains = np.zeros(top + 1, np.float64)
+                    first, last = self.table.first[tile], self.table.first[tile + 1]
+                    plane_gains(self.table.bands[first:last], channel.weights[first:last], top, channel.true, gains)
+                    curves.append(TileCurve(tile, number, bits, -np.diff(gains[::-1])[::-1]))
+        return curves
+
+    def _picture(self, state: State, level: int | None = None) -> NDArray[Any]:
+        """What a receiver shows that knows this state: of all levels, or up to one and nothing finer."""
+        pictures = []
+        for number, channel in enumerate(self.channels):
+            tiles = Tiles(self.table)
+            np.abs(channel.true, out=tiles.known)
+            np.sign(channel.true, out=tiles.sign, casting="unsafe")
+            coefficients = allocate(self.surface.shape)
+            for tile, place in enumerate(self.layout.tiles):
+                if level is None or place.level <= level:
+                    tiles.spread(tile, int(state[tile, number]), coefficients)
+            inverse(coefficients, self.layout, self.header.predictors[number], self.layout.levels)
+            pictures.append(coefficients)
+        return to_points(self.header, pictures)
+
+    def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
+        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
+        kept: list[State] = []
+        figures: list[Figures] = []
+        for state in states:
+            self._last = self._picture(state)
+            measured = distances(self.points, self._last, self.geometric)
+            while figures and measured[0] > figures[-1][0]:
+                kept.pop()
+                figures.pop()
+            kept.append(state)
+            figures.append(measured)
+        return kept, figures
+
+    def _level_figures(self, last: Figures) -> list[Figures]:
+        """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
+        complete = np.zeros((len(self.layout.tiles), len(self.channels)), np.int8)
+        return [
+            distances(self.points, self._picture(complete, level), self.geometric)
+            for level in range(self.layout.levels)
+        ] + [last]
+
+    def _correction(self, last: Figures) -> bytes:
+        """The exactness section's payload; empty where the lattice is exact or a precision was asked for."""
+        delta = exactness.difference(self.points, self._last)
+        self._exact_already = not delta
+        return b"" if self.precision is not None else delta
+
+    def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
+        """Code the planes that each layer adds."""
+        coder = _TileCoder(self.table, self.channels)
+        before = np.stack([channel.top for channel in self.channels], axis=1)
+        top = before
+        layers = []
+        for state, (rms, worst) in zip(states, figures, strict=True):
+            segments = []
+            for tile, number in np.argwhere(state < before):
+                first, last = int(before[tile, number]), int(state[tile, number])
+                data = coder.code(int(tile), int(number), first, first - last)
+                started = int(top[tile, number])
+                segments.append(CodedSegment(int(tile), int(number), started, first - last, first == started, data))
+            layers.append(CodedLayer(rms, worst, segments))
+            before = state
+        return layers
+
+
+class _TileCoder:
+    """Codes the tiles of all channels, plane after plane, as a reader will meet them."""
+
+    def __init__(self, table: TileTable, channels: list[_Channel]) -> None:
+        self._table = table
+        self._channels = channels
+        self._tiles = [Tiles(table) for _ in channels]
+        self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
+
+    def code(
+        self, tile: int, channel: int, first: int, planes: int, costs: NDArray[np.float64] | None = None
+    ) -> bytes:
+        """The bytes of ``planes`` planes below ``first`` of a tile."""
+        model = self._models.setdefault((tile, channel), new_model())
+        tiles, rows = self._tiles[channel], self._table.of_tile(tile)
+        coefficients = int((rows[:, 2] * rows[:, 3]).sum())
+        # A decision takes at most 11 bits (a chance of 32 in 2**16); a coefficient decides twice in a plane at the most.
+        data = np.empty(64 + 3 * planes * coefficients, np.uint8)
+        length = code_planes(
+            False,
+            rows,
+            first - 1,
+            first - planes,
+            tiles.known,
+            tiles.sign,
+            tiles.flags,
+            self._channels[channel].true,
+            model,
+            data,
+            np.zeros(0, np.float64) if costs is None else costs,
+        )
+        return data[:length].tobytes()
+
+
+def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
+    """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
+    rows = TILE_BITS // 2
+    narrow = min(shape)
+    while rows > 1 and narrow <= 1 << rows:
+        rows -= 1
+    if narrow > 1 << (TILE_BITS // 2):
+        return TILE_BITS // 2, TILE_BITS // 2
+    return (rows, TILE_BITS - rows) if shape[0] <= shape[1] else (TILE_BITS - rows, rows)

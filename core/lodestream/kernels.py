@@ -1,0 +1,21 @@
+"""The one decorator behind every compiled loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+import numba
+
+__all__ = ["kernel"]
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile a plain loop at its first call, keep the machine code on disk, and run it without the interpreter's lock.
+
+    Multiplications and additions may be fused: kernels either compute with integers that float64 holds exactly, where
+    fusing changes nothing, or state the tolerance that they need.
+    """
+    return cast(_Function, numba.njit(cache=True, nogil=True, fastmath={"contract"})(function))

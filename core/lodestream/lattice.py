@@ -1,0 +1,152 @@
+"""From values to integers on a lattice, and back.
+
+Each channel has its own lattice, with either of two rules that float64 arithmetic evaluates the same way everywhere::
+
+    affine   value = origin + step * q
+    decimal  value = (origin + q) / step       origin and step whole: correctly rounded decimals
+
+and the result is rounded to the dtype of the surface: to nearest for floats, to the nearest integer and into the range
+of the type for integers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LATTICE_BITS", "Lattice", "find_lattice", "precision_lattice"]
+
+#: Lattice coordinates of valid values are below two to this power in magnitude.
+LATTICE_BITS = 24
+_MOST_DECIMALS = 9
+_SAMPLE = 4096
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """One channel's lattice: ``rule`` is "affine" or "decimal", see the module."""
+
+    rule: str
+    origin: float
+    step: float
+
+    def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Values of lattice coordinates, any shape, in the given dtype."""
+        q = coordinates.astype(np.float64)
+        if self.rule == "decimal":
+            q += self.origin
+            q /= self.step
+        else:
+            q *= self.step
+            q += self.origin
+        return to_dtype(q, dtype)
+
+    def coordinates(self, values: NDArray[Any]) -> NDArray[np.int32]:
+        """Nearest lattice coordinates of values of any dtype."""
+        q = values.astype(np.float64)
+        if self.rule == "decimal":
+            q *= self.step
+            q -= self.origin
+        else:
+            q -= self.origin
+            q /= self.step
+        return np.rint(q, out=q).astype(np.int32)
+
+
+def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Round float64 values into a dtype: integers to the nearest, clipped to the range of the type."""
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return values.astype(dtype, copy=False)
+    limits = np.iinfo(dtype)
+    rounded = np.rint(values)
+    if dtype.itemsize < 8:
+        return np.clip(rounded, limits.min, limits.max).astype(dtype)
+    # 2**63 - 1 and 2**64 - 1 are no float64: anything at or above the power itself becomes the largest integer.
+    top = float(limits.max) + 1.0 if float(limits.max) % 2 else float(limits.max)
+    high = rounded >= top
+    inside = np.where(high, 0.0, np.maximum(rounded, float(limits.min)))
+    return np.where(high, limits.max, inside.astype(dtype))
+
+
+def find_lattice(values: NDArray[Any]) -> Lattice | None:
+    """The lattice on which the values already lie, or None.
+
+    Tried are integers (any step that divides all differences), scaled powers of two, and decimals of up to nine places,
+    each with fewer than 2**24 steps between the least and the largest value. What is returned restores every value bit
+    for bit, except that -0.0 is taken for 0.0.
+    """
+    flat = values.ravel()
+    low, high = flat.min(), flat.max()
+    if values.dtype.kind in "iu":
+        return _integer_lattice(flat, int(low), int(high))
+    if low == high:
+        return _checked(flat, Lattice("affine", float(low), 1.0))
+    sample = flat[:: max(1, flat.size // _SAMPLE)].astype(np.float64)
+    for lattice in (_binary_lattice(flat, sample, float(low), float(high)), *_decimal_lattices(sample, low, high)):
+        if lattice is not None and _checked(flat, lattice) is not None:
+            return lattice
+    return None
+
+
+def _integer_lattice(flat: NDArray[Any], low: int, high: int) -> Lattice | None:
+    if max(abs(low), abs(high)) >= 2**53:
+        return None
+    step = int(np.gcd.reduce(flat.astype(np.int64) - low)) or 1
+    return _centred("affine", float(low), float(step), (high - low) // step)
+
+
+def _binary_lattice(flat: NDArray[Any], sample: NDArray[np.float64], low: float, high: float) -> Lattice | None:
+    """The coarsest power of two that divides all values, when it leaves fewer than 2**24 steps."""
+    step = _power_of_two(sample)
+    if (high - low) / step >= 2**LATTICE_BITS:
+        return None
+    step = _power_of_two(flat.astype(np.float64))
+    steps = (high - low) / step
+    return _centred("affine", low, step, int(steps)) if steps < 2**LATTICE_BITS else None
+
+
+def _power_of_two(values: NDArray[np.float64]) -> float:
+    """The largest power of two that every value is a whole multiple of."""
+    mantissas, exponents = np.frexp(values[values != 0])
+    whole = np.abs(np.ldexp(mantissas, 53)).astype(np.int64)
+    trailing = np.log2((whole & -whole).astype(np.float64)).astype(np.int64)
+    return float(np.ldexp(1.0, max(int((exponents - 53 + trailing).min()), -1022)))
+
+
+def _decimal_lattices(sample: NDArray[np.float64], low: float, high: float) -> list[Lattice]:
+    # A float32 holds about 7 digits of a decimal number, a float64 about 16: "equal" is decided in the surface's dtype
+    # by the check over all values; the sample only rules candidates out.
+    found = []
+    for places in range(1, _MOST_DECIMALS + 1):
+        scale = 10.0**places
+        steps = (float(high) - float(low)) * scale
+        if steps >= 2**LATTICE_BITS or max(abs(float(low)), abs(float(high))) * scale >= 2**53:
+            break
+        error = np.abs(np.rint(sample * scale) / scale - sample)
+        if np.all(error <= np.abs(sample) * 2.0**-23):
+            found.append(_centred("decimal", float(np.rint(float(low) * scale)), scale, int(np.rint(steps))))
+    return [lattice for lattice in found if lattice is not None]
+
+
+def _centred(rule: str, low: float, step: float, steps: int) -> Lattice | None:
+    """Put the origin in the middle, so that coordinates are small on both sides."""
+    if steps >= 2**LATTICE_BITS:
+        return None
+    half = float((steps + 1) // 2)
+    return Lattice(rule, low + (half if rule == "decimal" else half * step), step)
+
+
+def _checked(flat: NDArray[Any], lattice: Lattice) -> Lattice | None:
+    restored = lattice.values(lattice.coordinates(flat), flat.dtype)
+    return lattice if np.array_equal(restored, flat) else None
+
+
+def precision_lattice(low: float, high: float, step: float) -> Lattice:
+    """A lattice of this step (coarsened where it would need 2**24 steps or more) that spans low ... high."""
+    span = max(high - low, 0.0)
+    step = max(step, span / (2.0**LATTICE_BITS - 4), float(np.spacing(max(abs(low), abs(high), 1e-300))))
+    return Lattice("affine", low + step * float(np.rint(span / step / 2)), step)

@@ -1,0 +1,196 @@
+"""What to send of a container, in which order: one pure function for server and client.
+
+What travels is always slices of the file, so that pushing over WebSocket, fetching by HTTP Range, resuming and caching
+share this piece of logic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+from .container.model import ByteRange, Index
+from .errors import OptionError
+from .target import Target
+
+__all__ = ["Ended", "Mark", "Plan", "plan"]
+
+#: Why a stream ends; `plan` knows the first five, the others happen on the way.
+Ended = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A state that the receiver reaches when it has ``sent`` bytes of the plan's ranges.
+
+    ``number`` is that of the layer (quality order) or level (level order); ``bytes`` what is held of the container.
+    """
+
+    sent: int
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Slices of a container in sending order.
+
+    Attributes
+    ----------
+    before : tuple of ByteRange
+        Service slices that must come first: the index, where segments travel without the tables of their layers.
+    ranges : tuple of ByteRange
+        The surface. Their sum is the state's ``bytes``.
+    after : tuple of ByteRange
+        The metadata.
+    marks : tuple of Mark
+        States on the way, the last one being the state at the end.
+    ended : str
+        Why the plan ends where it does.
+    """
+
+    before: tuple[ByteRange, ...]
+    ranges: tuple[ByteRange, ...]
+    after: tuple[ByteRange, ...]
+    marks: tuple[Mark, ...]
+    ended: Ended
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the surface's slices."""
+        return self.marks[-1].bytes
+
+    @property
+    def level(self) -> int:
+        """Finest level with a decoded segment at the end."""
+        return self.marks[-1].level
+
+    @property
+    def rms(self) -> float:
+        """RMS error at the end."""
+        return self.marks[-1].rms
+
+    @property
+    def max_error(self) -> float:
+        """Maximum error at the end."""
+        return self.marks[-1].max_error
+
+
+def plan(index: Index, target: Target = Target()) -> Plan:  # noqa: B008 - an immutable value
+    """Decide what a receiver with this target gets.
+
+    Raises
+    ------
+    OptionError
+        When there is no such level, or not even the first layer fits into the bytes allowed.
+    """
+    if target.level is not None:
+        finest = index.header.levels
+        if target.level > finest:
+            raise OptionError(f"expected a level of 0 to {finest}, got {target.level}")
+        if target.level < finest:
+            if target.order == "level":
+                return _by_level(index, target, target.level)
+            return _slices_of_layers(index, target.level)
+    if target.order == "level":
+        return _by_level(index, target, index.header.levels)
+    return _prefix(index, target)
+
+
+def _prefix(index: Index, target: Target) -> Plan:
+    """Quality order: the file's own."""
+    marks = [Mark(r.end, r.number, r.level, r.end, r.rms, r.max_error) for r in index.layers]
+    if index.exactness:
+        marks.append(_exact(index, len(marks), index.surface_end))
+    marks, ended = _until(marks, target, index.header.extent)
+    return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended)
+
+
+def _exact(index: Index, number: int, held: int) -> Mark:
+    last = index.levels[-1]
+    return Mark(held, number, last.level, held, last.rms, last.max_error)
+
+
+def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark], Ended]:
+    """The marks up to the first limit met."""
+    rms, worst = (None if t is None else t.absolute(extent) for t in (target.until_rms, target.until_max))
+    kept: list[Mark] = []
+    for mark in marks:
+        if target.max_bytes is not None and mark.bytes > target.max_bytes:
+            if not kept:
+                raise OptionError(f"expected at least the {mark.bytes} bytes of the first step, got {target.max_bytes}")
+            return kept, "bytes"
+        kept.append(mark)
+        if mark is marks[-1]:
+            break
+        if rms is not None and mark.rms <= rms:
+            return kept, "rms"
+        if worst is not None and mark.max_error <= worst:
+            return kept, "max"
+    return kept, "complete"
+
+
+def _slices_of_layers(index: Index, level: int) -> Plan:
+    """Quality order of the levels up to one: of each layer the segments that belong to them, which stand together."""
+    tiles = index.header.layout.tiles
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    for layer, segments in groupby(index.segments, key=lambda segment: segment.layer):
+        for segment in segments:
+            if tiles[segment.tile].level <= level:
+                _append(ranges, segment.range)
+                held += segment.range.length
+        record = index.layers[layer]
+        if record.level <= level:
+            marks.append(Mark(held, layer, record.level, held, record.rms, record.max_error))
+    state = index.levels[level]
+    marks = [mark for mark in marks if mark.sent < held]
+    marks.append(Mark(held, level, level, held, state.rms, state.max_error))
+    return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), "level")
+
+
+def _by_level(index: Index, target: Target, level: int) -> Plan:
+    """Level order: level by level, the segments of all layers; the complete surface also has its exactness."""
+    tiles = index.header.layout.tiles
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    of_level: list[list[ByteRange]] = [[] for _ in index.levels]
+    for segment in index.segments:
+        of_level[tiles[segment.tile].level].append(segment.range)
+    for state, places in zip(index.levels[: level + 1], of_level, strict=False):
+        for place in places:
+            _append(ranges, place)
+            held += place.length
+        if state.level == index.header.levels and index.exactness:
+            _append(ranges, index.exactness)
+            held += index.exactness.length
+        marks.append(Mark(held, state.level, state.level, held, state.rms, state.max_error))
+    if target.level is not None:
+        return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
+    marks, ended = _until(marks, target, index.header.extent)
+    return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+
+
+def _level_end(index: Index, level: int) -> Ended:
+    return "complete" if level == index.header.levels else "level"
+
+
+def _append(ranges: list[ByteRange], place: ByteRange) -> None:
+    if ranges and ranges[-1].end == place.offset:
+        ranges[-1] = ByteRange(ranges[-1].offset, ranges[-1].length + place.length)
+    else:
+        ranges.append(place)
+
+
+def _cut(ranges: list[ByteRange], length: int) -> tuple[ByteRange, ...]:
+    kept = []
+    for place in ranges:
+        taken = min(place.length, length)
+        if taken:
+            kept.append(ByteRange(place.offset, taken))
+        length -= taken
+    return tuple(kept)

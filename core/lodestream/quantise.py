@@ -1,0 +1,86 @@
+"""Which lattice each channel of a surface gets, and what is left for the exactness section."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
+
+__all__ = ["channel_of", "choose_lattices"]
+
+_DEFAULT_STEPS = 2.0**20
+
+
+def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
+    """One channel of an array (row, column) or (row, column, channel), a view."""
+    return points if points.ndim == 2 else points[..., channel]
+
+
+def choose_lattices(points: NDArray[Any], geometric: int, precision: float | None) -> list[Lattice]:
+    """A lattice for each channel.
+
+    Parameters
+    ----------
+    points : array, shape (row, column) or (row, column, channel)
+    geometric : int
+        The first so many channels are coordinates, the others attributes.
+    precision : float or None
+        Largest distance allowed between a point and what comes back; None: whatever costs least, for what the lattice
+        leaves out is stored.
+
+    Returns
+    -------
+    list of Lattice
+        The channels' own lattices where there are such (attributes: always when found; coordinates: unless the precision
+        allows a coarser one), otherwise one step for all coordinates.
+    """
+    count = 1 if points.ndim == 2 else points.shape[2]
+    spans = []
+    for channel in range(count):
+        values = channel_of(points, channel)
+        spans.append((float(values.min()), float(values.max())))
+    widest = max(high - low for low, high in spans[:geometric])
+    if not math.isfinite(widest):
+        raise InputError(f"expected values whose range is a float64, got a range of {widest}")
+    wanted = widest / _DEFAULT_STEPS if precision is None else _step_for(points.dtype, precision, geometric, spans)
+    lattices = []
+    for channel in range(count):
+        low, high = spans[channel]
+        own = find_lattice(channel_of(points, channel))
+        if channel >= geometric:
+            lattices.append(own or precision_lattice(low, high, (high - low) / _DEFAULT_STEPS))
+        elif own is not None and (precision is None or _spacing(own) >= wanted):
+            lattices.append(own)
+        else:
+            lattices.append(precision_lattice(low, high, wanted))
+    return lattices
+
+
+def _spacing(lattice: Lattice) -> float:
+    return 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
+
+
+def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: list[tuple[float, float]]) -> float:
+    """The widest step that keeps every point within the precision, rounding into the dtype included."""
+    if not (math.isfinite(precision) and precision > 0):
+        raise InputError(f"expected a precision above 0, got {precision}")
+    largest = max(max(abs(low), abs(high)) for low, high in spans[:geometric])
+    if dtype.kind in "iu":
+        # Whole steps from a whole origin land on whole values: s steps err by at most floor(s / 2).
+        return max(1.0, float(2 * math.floor(precision / math.sqrt(geometric)) + 1))
+    rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
+    step = 2.0 * (precision / math.sqrt(geometric) - rounding)
+    if step <= 0:
+        raise InputError(f"expected a precision above {rounding * math.sqrt(geometric)} for {dtype} values, got {precision}")
+    widest = max(high - low for low, high in spans[:geometric])
+    if widest / step > 2.0**LATTICE_BITS - 4:
+        raise InputError(
+            f"expected a precision of at least {widest / 2**LATTICE_BITS * math.sqrt(geometric) / 2}, got {precision}; "
+            "without one, everything is exact"
+        )
+    return step

@@ -1,0 +1,165 @@
+"""Segments into points: the state of a surface that is being refined, and pictures of any state it has passed through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import exactness
+from .bitplanes import code_planes, new_model
+from .container.model import Header
+from .errors import CorruptStreamError
+from .tiles import Tiles, TileTable
+from .transform import allocate, inverse
+
+__all__ = ["Coded", "Progress", "Reconstruction", "to_points"]
+
+_NO_COSTS = np.zeros(0, np.float64)
+_NO_TRUTH = np.zeros(0, np.int32)
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A segment with its bytes: ``planes`` planes of a tile down from ``first``; ``offset`` is its place."""
+
+    tile: int
+    channel: int
+    first: int
+    planes: int
+    data: bytes
+    offset: int
+
+
+class Reconstruction:
+    """Decodes segments when a picture asks for them, in the order in which they were added.
+
+    A *state* is the lowest plane known of every tile and channel: int8, shape (tile, channel), the tile's ``top`` where
+    nothing is known. States that lie behind what was decoded are pictures too: bits below a state's planes are ignored.
+    """
+
+    def __init__(self, header: Header) -> None:
+        self.header = header
+        self._queue: list[Coded] = []
+        self._taken = 0
+        self._lock = Lock()
+        self._correction: tuple[bytes, int] | None = None
+        self._table: TileTable | None = None
+        self._tiles: list[Tiles] = []
+        self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
+
+    @property
+    def length(self) -> int:
+        """Segments added so far."""
+        return len(self._queue)
+
+    def add(self, segment: Coded) -> None:
+        """Take a segment; nothing is decoded yet."""
+        self._queue.append(segment)
+
+    def correct(self, payload: bytes, offset: int) -> None:
+        """Take the exactness section's payload, which stands at ``offset``."""
+        self._correction = payload, offset
+
+    def points(self, length: int, state: NDArray[np.int8], level: int, corrected: bool = False) -> NDArray[Any]:
+        """The grid of ``level`` when the first ``length`` segments are known, in the surface's dtype and axes.
+
+        Raises
+        ------
+        CorruptStreamError
+            When ``corrected`` is asked for and the exactness section does not fit.
+        """
+        with self._lock:
+            self._decode(length)
+            table = self._layout_table()
+            channels = []
+            for channel, tiles in enumerate(self._tiles):
+                coefficients = allocate(self.header.layout.shapes[level])
+                for number, tile in enumerate(table.layout.tiles):
+                    if tile.level <= level:
+                        tiles.spread(number, int(state[number, channel]), coefficients)
+                inverse(coefficients, table.layout, self.header.predictors[channel], level)
+                channels.append(coefficients)
+        points = to_points(self.header, channels)
+        if corrected and self._correction is not None:
+            points = exactness.restore(points, *self._correction)
+        return points
+
+    def _layout_table(self) -> TileTable:
+        if self._table is None:
+            self._table = TileTable.of(self.header.layout)
+            self._tiles = [Tiles(self._table) for _ in range(self.header.channels)]
+        return self._table
+
+    def _decode(self, length: int) -> None:
+        table = self._layout_table()
+        while self._taken < length:
+            segment = self._queue[self._taken]
+            key = segment.tile, segment.channel
+            tiles = self._tiles[segment.channel]
+            model = self._models.setdefault(key, new_model())
+            code_planes(
+                True,
+                table.of_tile(segment.tile),
+                segment.first,
+                segment.first - segment.planes + 1,
+                tiles.known,
+                tiles.sign,
+                tiles.flags,
+                _NO_TRUTH,
+                model,
+                np.frombuffer(segment.data, np.uint8).copy(),
+                _NO_COSTS,
+            )
+            if segment.first < segment.planes:
+                del self._models[key]
+            self._queue[self._taken] = Coded(*key, segment.first, segment.planes, b"", segment.offset)
+            self._taken += 1
+
+
+class Progress:
+    """Which planes of each tile have been announced so far, and whether a segment continues them."""
+
+    def __init__(self, header: Header) -> None:
+        shape = len(header.layout.tiles), header.channels
+        self.top = np.zeros(shape, np.int8)
+        self.state = np.zeros(shape, np.int8)
+
+    def advance(self, tile: int, channel: int, top: int, planes: int, offset: int) -> int:
+        """Note a segment; returns the first of its planes.
+
+        Parameters
+        ----------
+        top : int
+            Planes of the tile, told with its first segment; 0 with the others.
+
+        Raises
+        ------
+        CorruptStreamError
+            When the tile was not announced, was announced already, or has not so many planes left.
+        """
+        known = int(self.top[tile, channel])
+        if bool(top) == bool(known):
+            problem = "told again" if known else "not told"
+            raise CorruptStreamError(f"expected the planes of tile {tile} once, with its first segment: {problem}", offset)
+        if top:
+            self.top[tile, channel] = self.state[tile, channel] = top
+        below = int(self.state[tile, channel])
+        if planes > below:
+            raise CorruptStreamError(f"expected at most {below} more planes of tile {tile}, got {planes}", offset)
+        self.state[tile, channel] = below - planes
+        return below - 1
+
+
+def to_points(header: Header, channels: Sequence[NDArray[np.int32]]) -> NDArray[Any]:
+    """Values of lattice coordinates, one array (row, column) a channel, in the surface's dtype and axes."""
+    if header.flat:
+        return header.lattices[0].values(channels[0], header.dtype)
+    points = np.empty((*channels[0].shape, len(channels)), header.dtype)
+    for number, (lattice, coordinates) in enumerate(zip(header.lattices, channels, strict=True)):
+        points[..., number] = lattice.values(coordinates, header.dtype)
+    return points
