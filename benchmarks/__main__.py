@@ -15,6 +15,8 @@ SECTIONS = ("transform", "solver", "rate", "coder", "memory")
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_variable] = "1"
 
+import lodestream  # noqa: E402 - see above
+
 
 def processor() -> str:
     """The processor's name where the system tells it."""
@@ -33,8 +35,9 @@ def main() -> int:
     unknown = sorted(set(chosen) - set(SECTIONS))
     if unknown:
         parser.error(f"expected sections of {', '.join(SECTIONS)}, got {', '.join(unknown)}")
-    packages = ", ".join(f"{name} {version(name)}" for name in ("lodestream", "numpy", "numba", "scipy", "pywavelets"))
-    print(f"Python {platform.python_version()}, {packages}; one core of {processor()}", flush=True)
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "scipy", "pywavelets"))
+    print(f"Lodestream {lodestream.__version__}, Python {platform.python_version()}, {packages}")
+    print(f"one core of {processor()}", flush=True)
     for section in SECTIONS:
         if not chosen or section in chosen:
             importlib.import_module(f"benchmarks.{section}").main()

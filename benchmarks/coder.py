@@ -16,7 +16,7 @@ from lodestream.tiles import Tiles, TileTable, gather
 
 from .arrays import load
 from .measure import medians, note, table
-from .rate import precision_of
+from .rate import off_lattice, precision_of
 
 NAMES = ("bigtujunga", "jacksboro", "smooth", "knot")
 TILE = (7, 7)
@@ -83,13 +83,14 @@ def main() -> None:
         for channel in channels:
             tiles, _ = channel.code(decoding=True)
             assert np.array_equal(tiles.known * tiles.sign, channel.coefficients), "read back something else"
-        precision = precision_of(array)
-        container = lodestream.encode(array.points, precision=precision)
+        alike = off_lattice(array)
+        precision = precision_of(alike)
+        container = lodestream.encode(alike.points, precision=precision)
         seconds = medians(
             {
                 "coder, writing": partial(code_all, channels, decoding=False),
                 "coder, reading": partial(code_all, channels, decoding=True),
-                "encode": partial(lodestream.encode, array.points, precision=precision),
+                "encode": partial(lodestream.encode, alike.points, precision=precision),
                 "decode": partial(lodestream.decode, container),
             }
         )
