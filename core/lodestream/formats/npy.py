@@ -21,7 +21,7 @@ __all__ = ["MAGIC", "Header", "read", "read_header", "read_values", "sniff", "wr
 MAGIC = b"\x93NUMPY"
 
 #: Bytes moved at a time, so that a compressed member or a pipe needs no second copy of the array.
-_CHUNK = 1 << 22
+_CHUNK = 1 << 20
 
 #: More than numpy's limit for the text of a header. Only so much is looked at, because a header of version 2.0 may
 #: claim to be 4 GiB long, and a compressed member may deliver them.

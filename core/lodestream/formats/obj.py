@@ -32,7 +32,7 @@ _READ = frozenset((b"v", b"f", b"l"))
 #: Bytes of text in any encoding that extends ASCII, for names and comments.
 _TEXT = bytes((*b"\t\n\f\r", *range(0x20, 0x7F), *range(0x80, 0x100)))
 
-_BLOCK = 1 << 22
+_BLOCK = 1 << 20
 _ROWS = 1 << 16
 
 
