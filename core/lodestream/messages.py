@@ -67,7 +67,7 @@ CODES: Mapping[str, Code] = {
     "not-found": Code(4404, "No such surface"),
     "idle": Code(4408, "Nothing was heard or taken for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
-    "failed": Code(4410, "The surface could not be built"),
+    "failed": Code(4424, "The surface could not be built"),
     "bad-target": Code(4422, "A target that the surface cannot meet"),
     "unsupported-version": Code(4426, "Another version of the protocol"),
     "message-too-large": Code(1009, "A message above the limit"),

@@ -1,0 +1,141 @@
+"""The server's end of a stream without I/O: messages in; slices to read and messages to send out."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from .container import ByteRange, Index
+from .errors import CorruptStreamError, OptionError
+from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+from .plan import Mark, plan
+from .protocol import Connection, Side, State
+
+__all__ = ["Sender"]
+
+
+class Sender:
+    """One surface being sent.
+
+    Whoever integrates it moves bytes: each message that comes goes into `receive`; `next_message` gives what is to be
+    sent now; when it gives None, `wanted` names the slice of the container to read and hand to `provide`; when that
+    gives None too, there is nothing to do before the next message comes.
+
+    Parameters
+    ----------
+    index : Index
+        What the container holds and where.
+    container : str
+        SHA-256 of the container, in hexadecimal digits.
+
+    Attributes
+    ----------
+    sent : int
+        Bytes of the container that have been handed out.
+    why : str or None
+        Why the stream ended, once it has.
+    """
+
+    def __init__(self, index: Index, container: str) -> None:
+        self.sent = 0
+        self.why: str | None = None
+        self._index = index
+        self._container = container
+        self._connection = Connection(Side.SERVER)
+        self._outbox: deque[Event] = deque()
+        self._slices: deque[ByteRange] = deque()
+        self._marks: deque[tuple[int, Mark]] = deque()
+        self._ended = "complete"
+
+    @property
+    def state(self) -> State:
+        """Where the stream is; closed and failed are final once `next_message` gives None."""
+        return self._connection.state
+
+    def receive(self, message: bytes) -> None:
+        """Take one message.
+
+        Raises
+        ------
+        MessageError
+            When it is no message, or not one that is allowed now; its ``code`` is the answer to give with `fail`.
+        UnsupportedVersionError
+            When the client speaks another version.
+        """
+        event = self._connection.receive(message)
+        if isinstance(event, Open):
+            self._plan(event)
+        elif isinstance(event, Stop) and self.state is State.STOPPING:
+            # A header in the outbox is dropped too: a client that has stopped takes an end without one.
+            self._outbox = deque([End("stopped")])
+            self._slices.clear()
+            self._marks.clear()
+
+    def fail(self, code: str, detail: str) -> None:
+        """Refuse: an error, and nothing after it."""
+        if self.state not in (State.CLOSED, State.FAILED):
+            self._outbox = deque([Error(code, CODES[code].title, detail)])
+
+    def next_message(self) -> bytes | None:
+        """The message to send now, or None.
+
+        One at a time: what a `stop` overtakes is never handed out.
+        """
+        if not self._outbox:
+            return None
+        event = self._outbox.popleft()
+        if isinstance(event, Segments):
+            self.sent += len(event.data)
+        elif isinstance(event, End):
+            self.why = event.why
+        return self._connection.send(event)
+
+    def wanted(self) -> ByteRange | None:
+        """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
+        if self.state is not State.STREAMING or self._outbox or not self._slices or not self._connection.credit:
+            return None
+        # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
+        until_mark = self._marks[0][0] - self.sent if self._marks else MAX_DATA
+        slice_ = self._slices[0]
+        return ByteRange(slice_.offset, min(slice_.length, until_mark, self._connection.credit, MAX_DATA))
+
+    def provide(self, wanted: ByteRange, data: bytes) -> None:
+        """Hand over the bytes of a slice that `wanted` has named; after a stop they are dropped.
+
+        Raises
+        ------
+        CorruptStreamError
+            When they are fewer than asked for: the file has been cut.
+        """
+        if self.state is not State.STREAMING or not self._slices:
+            return
+        if len(data) != wanted.length:
+            raise CorruptStreamError(f"expected {wanted.length} bytes, got {len(data)}", wanted.offset)
+        slice_ = self._slices.popleft()
+        if slice_.length > wanted.length:
+            self._slices.appendleft(ByteRange(wanted.end, slice_.length - wanted.length))
+        self._outbox.append(Segments(wanted.offset, data))
+        self._mark(self.sent + len(data))
+        self._end_if_done()
+
+    def _plan(self, event: Open) -> None:
+        try:
+            chosen = plan(self._index, event.target)
+        except OptionError as error:
+            raise MessageError("bad-target", str(error)) from None
+        first = sum(slice_.length for slice_ in chosen.before)
+        self._slices.extend(
+            slice_ for part in (chosen.before, chosen.ranges, chosen.after) for slice_ in part if slice_.length
+        )
+        self._marks.extend((first + mark.sent, mark) for mark in chosen.marks)
+        self._ended = chosen.ended
+        self._outbox.append(Header(self._container, self._index.size, chosen.bytes, self._index.header.extent))
+        self._end_if_done()
+
+    def _mark(self, sent: int) -> None:
+        while self._marks and self._marks[0][0] <= sent:
+            mark = self._marks.popleft()[1]
+            self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
+
+    def _end_if_done(self) -> None:
+        if not self._slices:
+            self._outbox.append(End(self._ended))
