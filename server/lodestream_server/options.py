@@ -1,0 +1,100 @@
+"""The query of an upload: the surface options, and what can be said of an upload at once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lodestream import Tolerance
+from lodestream.errors import FormatError, OptionError
+
+from .worker import CLOSED
+
+__all__ = ["SurfaceOptions", "check", "identify", "plain_name"]
+
+_LONGEST_NAME = 255
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """The options of a surface.
+
+    Attributes
+    ----------
+    name : str or None
+        What the surface is to be called.
+    filename : str or None
+        Name of the file, where the body does not tell it.
+    chosen : mapping of str to str
+        ``precision`` in one spelling, ``closed`` unless it is auto, and options of the format as they came: what makes
+        another surface of the same bytes.
+    """
+
+    name: str | None
+    filename: str | None
+    chosen: dict[str, str]
+
+    @classmethod
+    def parse(cls, query: Iterable[tuple[str, str]]) -> SurfaceOptions:
+        """Read a query; what is not an option of every surface is taken for one of the format.
+
+        Raises
+        ------
+        OptionError
+            When a value is not one that its option takes, or an option stands there twice.
+        """
+        values: dict[str, str] = {}
+        for key, value in query:
+            if key in values:
+                raise OptionError(f"expected {key[:80]!a} once, got it twice")
+            values[key] = value
+        name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
+        closed, precision = values.pop("closed", "auto"), values.pop("precision", None)
+        if closed not in CLOSED:
+            raise OptionError(f"expected closed to be one of {', '.join(CLOSED)}, got {closed[:80]!a}")
+        if closed != "auto":
+            values["closed"] = closed
+        if precision is not None:
+            tolerance = Tolerance.parse(precision)
+            values["precision"] = f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
+        return cls(name, filename, values)
+
+
+def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -> str:
+    """Refuse what a look at the first bytes shows to be wrong; the name of the first file's format.
+
+    Raises
+    ------
+    FormatError
+        When a file is of no format that can be read.
+    OptionError
+        When the format has no such option.
+    """
+    from lodestream.formats import formats, sniff
+
+    found = [sniff(file, filename=name or "upload") for file, name in zip(files, names, strict=True)]
+    for format_ in found:
+        if format_.read is None:
+            readable = ", ".join(item.name for item in formats() if item.read)
+            raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
+    for key in options.chosen:
+        if key not in ("precision", "closed", *found[0].options):
+            known = ", ".join(("precision", "closed", "name", "filename", *found[0].options))
+            raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
+    return found[0].name
+
+
+def identify(digest: hashlib._Hash, format_name: str, options: SurfaceOptions) -> str:
+    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, its format and its options."""
+    whole = digest.copy()
+    whole.update(json.dumps([format_name, sorted(options.chosen.items())], ensure_ascii=True).encode())
+    return whole.hexdigest()[:20]
+
+
+def plain_name(text: str) -> str | None:
+    """A name as it is shown to people: the last part of a path, and nothing that could upset a terminal."""
+    name = "".join(character for character in text.replace("\\", "/").rpartition("/")[2] if character.isprintable())
+    return name[:_LONGEST_NAME].strip() or None

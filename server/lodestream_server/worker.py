@@ -1,0 +1,155 @@
+"""What runs in a build process: reading strangers' files and encoding them; the server survives what happens here."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import LodestreamError
+
+from .durable import NewFile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from lodestream import Surface
+
+__all__ = ["CLOSED", "Built", "Job", "Refused", "build", "read_progress", "warm"]
+
+_log = logging.getLogger(__name__)
+
+#: The values of ``closed``, as (rows, columns); `auto` leaves what the file says.
+CLOSED: dict[str, tuple[bool, bool] | None] = {
+    "auto": None,
+    "none": (False, False),
+    "rows": (True, False),
+    "cols": (False, True),
+    "both": (True, True),
+}
+
+_PROGRESS = "progress"
+_CONTAINER = "container"
+_REPORT_SECONDS = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One build.
+
+    Attributes
+    ----------
+    files : tuple of Path
+    filename : str or None
+        Name of the first file, as its owner knows it.
+    name : str or None
+        What the surface is to be called.
+    precision : str or None
+        As on the command line: a number, or a number and ``d``.
+    closed : str
+        A key of `CLOSED`.
+    options : mapping of str to str
+        Options of the format.
+    max_vertices : int
+    folder : Path
+        Where the build may write; empty at the start.
+    """
+
+    files: tuple[Path, ...]
+    filename: str | None
+    name: str | None
+    precision: str | None
+    closed: str
+    options: dict[str, str]
+    max_vertices: int
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Built:
+    """A container was built and is on disk."""
+
+    path: Path
+    sha256: str
+    info: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The upload is not a surface that can be built, for this reason."""
+
+    reason: str
+
+
+def build(job: Job) -> Built | Refused:
+    """Read and encode an upload."""
+    # Errors come back as values: not every exception survives the way between processes.
+    try:
+        return _build(job)
+    except LodestreamError as error:
+        return Refused(str(error))
+    except MemoryError:
+        return Refused("expected a surface that fits into memory, got a larger one")
+
+
+def read_progress(folder: Path) -> float:
+    """How much of the build in a folder is done, from 0 to 1."""
+    try:
+        return float((folder / _PROGRESS).read_text())
+    except (OSError, ValueError):
+        return 0.0
+
+
+def warm() -> None:
+    """Compile the kernels, or load them from the disk, by encoding and decoding a small surface."""
+    import numpy as np
+
+    from lodestream import decode, encode
+
+    rows, columns = np.mgrid[0:37, 0:41].astype(np.float64)
+    for points in (np.sin(rows / 5) * columns, np.stack((rows, columns, np.sin(rows * columns / 99)), axis=-1)):
+        if not np.array_equal(decode(encode(points)).points, points):
+            raise RuntimeError("expected the surface that was encoded, got another one")
+
+
+def _build(job: Job) -> Built:
+    from lodestream import Tolerance, encode
+    from lodestream.container import describe, read_index
+
+    surface = _read(job)
+    precision = None if job.precision is None else Tolerance.parse(job.precision)
+    container = encode(surface, precision, progress=_reporter(job.folder))
+    path = job.folder / _CONTAINER
+    with NewFile(path) as file:
+        file.write(container)
+    index = read_index(lambda offset, length: container[offset : offset + length], len(container))
+    return Built(path, hashlib.sha256(container).hexdigest(), describe(index))
+
+
+def _read(job: Job) -> Surface:
+    from lodestream import Surface
+    from lodestream.formats import read
+
+    surface = read(*job.files, max_vertices=job.max_vertices, filename=job.filename, **job.options)
+    closed = CLOSED[job.closed]
+    name = {} if job.name is None else {"name": job.name}
+    return Surface(surface.points, surface.closed if closed is None else closed, metadata={**surface.metadata, **name})
+
+
+def _reporter(folder: Path) -> Callable[[float], None]:
+    last = float("-inf")
+
+    def report(fraction: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _REPORT_SECONDS:
+            last = now
+            # Renamed, so that the server never reads half a number; not worth a sync.
+            new = folder / f"{_PROGRESS}.new"
+            new.write_text(f"{min(max(fraction, 0.0), 1.0):.4f}")
+            new.replace(folder / _PROGRESS)
+
+    return report
