@@ -1,0 +1,122 @@
+"""What OpenAPI shows: one surface through its life, and the shapes of bodies that the framework does not see."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "UPLOAD", "answer"]
+
+CONTAINER_TYPE = "application/vnd.lodestream.container"
+
+QUEUED: dict[str, Any] = {
+    "id": "5f1c0a9b3d7e42a68c10",
+    "url": "/v1/surfaces/5f1c0a9b3d7e42a68c10",
+    "name": "Jacksboro",
+    "state": "queued",
+    "progress": 0.0,
+    "reason": None,
+    "created": "2026-01-31T12:00:00.000+00:00",
+    "filenames": ["jacksboro.npy"],
+    "upload_bytes": 277328,
+    "options": {"precision": "0.5"},
+    "container": None,
+}
+
+_FIGURES: dict[str, Any] = {
+    "shape": [344, 403],
+    "closed": [False, False],
+    "bytes": 104025,
+}
+
+READY: dict[str, Any] = {
+    **QUEUED,
+    "state": "ready",
+    "progress": 1.0,
+    "container": "9c56cc51b374c3ba189210d5b6d4bf57790d351c96c47c02190ecf1e430635ab",
+    **_FIGURES,
+    "blocks": [{"shape": [344, 403], "closed": [False, False]}],
+    "levels": [{"level": 0, "shape": [2, 2], "bytes": 120, "rms": 181.2, "max": 651.0}],
+    "layers": [{"bytes": 130, "level": 0, "rms": 181.2, "max": 651.0}],
+    "exact": True,
+    "metadata": {"name": "Jacksboro"},
+}
+
+PAGE: dict[str, Any] = {
+    "surfaces": [
+        {**QUEUED, "state": "ready", "progress": 1.0, "container": READY["container"], **_FIGURES},
+    ],
+    "next": None,
+}
+
+LEVEL: dict[str, Any] = {
+    "description": "The grid of the level",
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+}
+
+_BINARY = {"type": "string", "format": "binary"}
+
+#: The query and body of an upload. Further parameters are options of the file's format.
+UPLOAD: dict[str, Any] = {
+    "parameters": [
+        {
+            "name": name,
+            "in": "query",
+            "required": False,
+            "description": description,
+            "schema": {"type": "string", **({"enum": values} if values else {})},
+            **({"example": example} if example else {}),
+        }
+        for name, description, values, example in (
+            (
+                "precision",
+                "largest step of the lattice: in the surface's unit, or <x>d for x times the extent",
+                None,
+                "1e-4d",
+            ),
+            ("closed", "axes that wrap", ["auto", "none", "rows", "cols", "both"], None),
+            ("name", "what to call the surface", None, "Jacksboro"),
+            ("filename", "name of a raw body's file", None, "jacksboro.npy"),
+            ("array", "of an NPZ file: name of the array", None, None),
+            ("band", "of a GeoTIFF file: number of the band", None, None),
+        )
+    ],
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/octet-stream": {"schema": _BINARY},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {"file": {"type": "array", "items": _BINARY}},
+                }
+            },
+        },
+    },
+}
+
+PROBLEM_SCHEMA: dict[str, Any] = {
+    "title": "Problem",
+    "description": "A problem document (RFC 9457)",
+    "type": "object",
+    "required": ["type", "title", "status", "code", "detail", "instance"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "code": {"type": "string"},
+        "detail": {"type": "string"},
+        "instance": {"type": "string"},
+    },
+}
+
+
+def answer(description: str, example: dict[str, Any], *, location: bool = False) -> dict[str, Any]:
+    """A response of OpenAPI with an example."""
+    documented: dict[str, Any] = {
+        "description": description,
+        "content": {"application/json": {"schema": {"type": "object"}, "example": example}},
+    }
+    if location:
+        documented["headers"] = {"Location": {"description": "the surface", "schema": {"type": "string"}}}
+    return documented

@@ -1,0 +1,227 @@
+"""The WebSocket route: a loop that moves bytes between a socket, a file and a `Sender`.
+
+A receiving task runs beside the sending one, so that a `stop` or a lost peer is noticed at once, whatever the other is
+doing. Every wait has an end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import APIRouter, WebSocket
+from fastapi.responses import JSONResponse
+from starlette.websockets import WebSocketDisconnect
+
+from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
+from lodestream.messages import CODES, SUBPROTOCOL, MessageError
+from lodestream.protocol import State
+from lodestream.sender import Sender
+
+from .containers import OpenContainer
+from .files import ready
+from .problems import BuildFailedError, NotReadyError
+from .routing import Parts
+from .settings import Settings
+
+__all__ = ["router"]
+
+_log = logging.getLogger(__name__)
+
+router = APIRouter()
+
+# A close frame carries 125 bytes, two of them the code.
+_LONGEST_REASON = 123
+
+# Long enough for a close frame to leave through a full buffer, short enough not to keep a dead peer.
+_CLOSE_SECONDS = 5.0
+
+
+@router.websocket("/v1/surfaces/{surface}/stream")
+async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
+    """Send a surface under the client's credit."""
+    if SUBPROTOCOL not in socket.scope["subprotocols"]:
+        await _refuse_handshake(socket)
+        return
+    await socket.accept(subprotocol=SUBPROTOCOL)
+    try:
+        record = ready(parts, surface)
+        container = await asyncio.to_thread(parts.containers.open, record.container or "")
+    except LodestreamError as error:
+        await _refuse(socket, _code(error), str(error))
+        return
+    started = time.monotonic()
+    session = _Session(socket, container, parts.settings)
+    try:
+        await session.run()
+    finally:
+        container.close()
+        _log.info(
+            "stream of %s ended: %s, %d bytes in %.3f s",
+            surface,
+            session.result,
+            session.sent,
+            time.monotonic() - started,
+        )
+
+
+class _SilentError(LodestreamError):
+    """The client said nothing, or took nothing, for too long."""
+
+
+class _Session:
+    """One stream.
+
+    Attributes
+    ----------
+    result : str
+        How it ended, in a word, for the log.
+    """
+
+    def __init__(self, socket: WebSocket, container: OpenContainer, settings: Settings) -> None:
+        self.result = "lost"
+        self._socket = socket
+        self._container = container
+        self._settings = settings
+        self._sender = Sender(container.index, container.sha256)
+        self._heard = asyncio.Event()
+
+    @property
+    def sent(self) -> int:
+        """Bytes of the container that were sent."""
+        return self._sender.sent
+
+    async def run(self) -> None:
+        """Stream until the client says bye, is refused, or is gone."""
+        try:
+            await self._both()
+        except WebSocketDisconnect:
+            return
+        except (LodestreamError, OSError) as error:
+            await self._fail(_code(error), str(error) if isinstance(error, LodestreamError) else "see the server's log")
+            if not isinstance(error, MessageError | UnsupportedVersionError | _SilentError):
+                _log.error("a stream failed", exc_info=error)
+        else:
+            self.result = self._sender.why or "closed"
+            await _close(self._socket, 1000, self.result)
+
+    async def _both(self) -> None:
+        # Whichever ends first ends the other: the sender because the client has said bye, the receiver with an error.
+        sending, receiving = asyncio.ensure_future(self._send()), asyncio.ensure_future(self._receive())
+        try:
+            done, _ = await asyncio.wait((sending, receiving), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            sending.cancel()
+            receiving.cancel()
+            await asyncio.gather(sending, receiving, return_exceptions=True)
+        # The receiver's error says why the sender failed, where both have.
+        for task in (receiving, sending):
+            if task in done:
+                task.result()
+
+    async def _receive(self) -> None:
+        while self._sender.state is not State.CLOSED:
+            message = await self._socket.receive()
+            if message["type"] == "websocket.disconnect":
+                raise WebSocketDisconnect(message.get("code", 1006), message.get("reason"))
+            data = message.get("bytes")
+            if data is None:
+                raise MessageError("bad-message", "expected a binary message, got text")
+            self._sender.receive(data)
+            self._heard.set()
+
+    async def _send(self) -> None:
+        while self._sender.state is not State.CLOSED:
+            message = self._sender.next_message()
+            if message is not None:
+                async with self._patience(self._settings.idle_seconds, "the client to take what was sent"):
+                    await self._socket.send_bytes(message)
+            elif (wanted := self._sender.wanted()) is not None:
+                self._sender.provide(wanted, await asyncio.to_thread(self._container.read, wanted))
+            else:
+                await self._hear()
+
+    async def _hear(self) -> None:
+        # Nothing is awaited between the last look at the sender and this: no message is missed.
+        self._heard.clear()
+        if self._sender.state is State.ENDED:
+            patience, what = self._settings.bye_seconds, "bye"
+        else:
+            patience, what = (
+                self._settings.idle_seconds,
+                "open" if self._sender.state is State.IDLE else "credit or stop",
+            )
+        async with self._patience(patience, what):
+            await self._heard.wait()
+
+    @asynccontextmanager
+    async def _patience(self, seconds: float, what: str) -> AsyncIterator[None]:
+        try:
+            async with asyncio.timeout(seconds):
+                yield
+        except TimeoutError:
+            raise _SilentError(f"expected {what} within {seconds:g} s") from None
+
+    async def _fail(self, code: str, detail: str) -> None:
+        self.result = code
+        self._sender.fail(code, detail)
+        message = self._sender.next_message()
+        if message is not None:
+            try:
+                async with asyncio.timeout(_CLOSE_SECONDS):
+                    await self._socket.send_bytes(message)
+            except (TimeoutError, WebSocketDisconnect, RuntimeError):
+                return
+        await _close(self._socket, CODES[code].close, f"{code}: {detail}")
+
+
+def _code(error: Exception) -> str:
+    if isinstance(error, MessageError):
+        return error.code
+    known: tuple[tuple[type[Exception], str], ...] = (
+        (_SilentError, "idle"),
+        (UnsupportedVersionError, "unsupported-version"),
+        (NotFoundError, "not-found"),
+        (NotReadyError, "not-ready"),
+        (BuildFailedError, "failed"),
+        (StreamError, "damaged"),
+    )
+    return next((code for kind, code in known if isinstance(error, kind)), "internal")
+
+
+async def _refuse(socket: WebSocket, code: str, detail: str) -> None:
+    from lodestream.messages import Error
+    from lodestream.wire import serialize
+
+    try:
+        async with asyncio.timeout(_CLOSE_SECONDS):
+            await socket.send_bytes(serialize(Error(code, CODES[code].title, detail)))
+    except (TimeoutError, WebSocketDisconnect):
+        return
+    await _close(socket, CODES[code].close, f"{code}: {detail}")
+
+
+async def _close(socket: WebSocket, code: int, reason: str) -> None:
+    cut = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
+    try:
+        async with asyncio.timeout(_CLOSE_SECONDS):
+            await socket.close(code, cut)
+    # A peer that is gone, or that takes nothing any more, has no use for a close frame.
+    except (TimeoutError, WebSocketDisconnect, RuntimeError):
+        return
+
+
+async def _refuse_handshake(socket: WebSocket) -> None:
+    offered = ", ".join(socket.scope["subprotocols"]) or "none"
+    content = {
+        "type": "urn:lodestream:unsupported-version",
+        "title": "Another subprotocol",
+        "status": 426,
+        "code": "unsupported-version",
+        "detail": f"expected the WebSocket subprotocol {SUBPROTOCOL}, got {offered[:80]!a}",
+        "instance": socket.url.path,
+    }
+    await socket.send_denial_response(JSONResponse(content, 426, media_type="application/problem+json"))
