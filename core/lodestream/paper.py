@@ -136,9 +136,9 @@ def curve_right_hand_sides(points: ArrayLike, closed: bool = False) -> Floats:
     Lemma 1 for curves. Half the gradient of sum_k (x_{2k} - z_k)^2 + sum_k (x_{2k+1} - (z_k + z_{k+1})/2)^2, times 4.
     """
     values = _numbers(points)
-    grid = values.reshape(values.shape[0], -1, 1)
+    grid = values.reshape(values.shape[0], 1, -1)
     sides = _right_hand_sides(grid, axis_step(grid.shape[0], bool(closed)), axis_step(1))
-    return sides.reshape(-1, *values.shape[1:])
+    return sides.reshape(sides.shape[0], *values.shape[1:])
 
 
 def surface_right_hand_sides(points: ArrayLike, closed: Closed = (False, False)) -> Floats:
