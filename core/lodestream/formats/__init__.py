@@ -140,6 +140,8 @@ def read(
     label = filename or os.fspath(path)
     name = Path(label)
     try:
+        if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
+            raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
         if more:
             raise OptionError(f"expected one file, got {1 + len(more)} (several files of one surface come later)")
         format_ = _sniff(path, name.suffix.lower())
