@@ -20,6 +20,8 @@ from .surface import Surface
 
 __all__ = ["Decoder", "View", "decode"]
 
+Bytes = bytes  # the name within classes that have a property of this name
+
 
 @dataclass(frozen=True)
 class View:
@@ -253,7 +255,7 @@ class Decoder:
             View(number, level, held, rms, max_error, complete, self._reconstruction, length, state, corrected, self._values)
         )
 
-    def _take_loose(self, offset: int, data: bytes) -> None:
+    def _take_loose(self, offset: int, data: Bytes) -> None:
         """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
         start, run = self._loose or (offset, bytearray())
         if start + len(run) != offset:
@@ -275,7 +277,7 @@ class Decoder:
             self.index = index_from(bytes(run), place, self.header)
             self._slices = Slices(self.index)
 
-    def _take_slice(self, offset: int, data: bytes) -> None:
+    def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None
         assert self.header is not None
         self._slices.add(offset, data)

@@ -42,8 +42,10 @@ def _difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
     if a.dtype.kind in "iu" and a.dtype.itemsize == 8:
         # Neighbours beyond 2**53 are the same float64: subtract before converting.
         larger = a >= b
-        return np.where(larger, a - b, b - a).astype(np.uint64).astype(np.float64)
-    return a.astype(np.float64) - b.astype(np.float64)
+        wide: NDArray[np.float64] = np.where(larger, a - b, b - a).astype(np.uint64).astype(np.float64)
+        return wide
+    delta: NDArray[np.float64] = a.astype(np.float64) - b.astype(np.float64)
+    return delta
 
 
 def extent_of(points: NDArray[Any], geometric: int) -> float:

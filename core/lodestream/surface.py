@@ -15,7 +15,7 @@ __all__ = ["Closed", "Surface"]
 #: Whether the rows and the columns of a grid wrap: ``(True, False)`` means that axis 0 is a circle.
 Closed = tuple[bool, bool]
 
-_DTYPES = "int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()
+_DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
 
 
 class Surface:

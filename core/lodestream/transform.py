@@ -10,7 +10,15 @@ from .kernels import kernel
 from .layout import Layout
 from .lifting import REACH, TAPS, forward_step, inverse_step
 
-__all__ = ["COEFFICIENT_BITS", "allocate", "default_predictors", "fitted_steps", "forward", "inverse", "synthesis_norms"]
+__all__ = [
+    "COEFFICIENT_BITS",
+    "allocate",
+    "default_predictors",
+    "fitted_steps",
+    "forward",
+    "inverse",
+    "synthesis_norms",
+]
 
 #: A coefficient has at most so many magnitude bits.
 COEFFICIENT_BITS = 28
@@ -116,8 +124,8 @@ def _least_squares(
     weights = np.ones_like(details)
     found = []
     for _ in range(5):
-        uu, uw, ww = (weights * first * first).sum(), (weights * first * second).sum(), (weights * second * second).sum()
-        ud, wd = 256 * (weights * first * details).sum(), 256 * (weights * second * details).sum()
+        uu, uw, ww = (float((weights * p).sum()) for p in (first * first, first * second, second * second))
+        ud, wd = (256 * float((weights * p * details).sum()) for p in (first, second))
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
             break
@@ -144,7 +152,8 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8]) -> NDArray[np.
     for axis in range(2):
         for level in range(layout.levels + 1):
             lines[axis, level] = [_line_norm(layout, predictors, axis, level, kind) for kind in (0, 1)]
-    return lines[0][:, :, None] * lines[1][:, None, :]
+    norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
+    return norms
 
 
 def _line_norm(layout: Layout, predictors: NDArray[np.int8], axis: int, level: int, kind: int) -> float:

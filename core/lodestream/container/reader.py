@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import CorruptStreamError, TruncatedStreamError
 from . import sections
 from .frames import FrameReader, whole_section
-from .model import ByteRange, Index
+from .model import ByteRange, Header, Index
 
 __all__ = ["describe", "index_from", "read_index", "read_metadata"]
 
@@ -45,7 +45,7 @@ def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
     return replace(index, metadata_values=read_metadata(read(metadata.offset, metadata.length), metadata))
 
 
-def _read_header(read: Callable[[int, int], bytes], size: int) -> sections.Header:
+def _read_header(read: Callable[[int, int], bytes], size: int) -> Header:
     reader, wanted = FrameReader(), _FIRST_READ
     position = 0
     while position < size:
@@ -59,7 +59,7 @@ def _read_header(read: Callable[[int, int], bytes], size: int) -> sections.Heade
     raise TruncatedStreamError(f"expected a container with a whole header, got {size} bytes without")
 
 
-def index_from(data: bytes, place: ByteRange, header: sections.Header) -> Index:
+def index_from(data: bytes, place: ByteRange, header: Header) -> Index:
     """Index from the bytes of its section, with what `plan` sends for each level."""
     frame = whole_section(data, place.offset, sections.INDEX)
     index = sections.parse_index(frame.payload, frame.payload_offset, place, header)

@@ -22,12 +22,12 @@ __all__ = [
     "FOOTER_LENGTH",
     "HEADER",
     "INDEX",
-    "LAYER",
     "LARGEST_SURFACE",
-    "TILE_BITS",
+    "LAYER",
     "MAGIC",
     "METADATA",
     "OPTIONAL",
+    "TILE_BITS",
     "VERSION",
     "Entry",
     "check_version",
@@ -57,7 +57,7 @@ LARGEST_SURFACE = 2**31
 #: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
 _LARGEST_FILE = 2**62
-_DTYPES = [np.dtype(name) for name in "i1 i2 i4 i8 u1 u2 u4 u8 f4 f8".split()]
+_DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 _RULES = ("affine", "decimal")
 
 
