@@ -1,0 +1,103 @@
+"""A server of one's own, in a process of its own, on a free port, with a folder that goes with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import httpx
+
+from lodestream.errors import LodestreamError
+
+__all__ = ["own_server"]
+
+# Compiling the kernels for the first time takes most of this.
+_READY_SECONDS = 100.0
+_LOOK_SECONDS = 0.1
+_END_SECONDS = 10.0
+_LOG_TAIL = 2000
+
+
+@contextmanager
+def own_server() -> Iterator[str]:
+    """The address of a server that is ready; it ends with the block, however that ends.
+
+    Raises
+    ------
+    LodestreamError
+        When it does not start; with the last lines that it said.
+    """
+    with tempfile.TemporaryDirectory(prefix="lodestream-demo-", ignore_cleanup_errors=True) as folder, _terminable():
+        log = Path(folder) / "server.log"
+        port = _free_port()
+        command = [sys.executable, "-m", "lodestream_client", "serve"]
+        command += ["--host", "127.0.0.1", "--port", str(port), "--data", str(Path(folder) / "data")]
+        with log.open("wb") as output:
+            # A session of its own: a Ctrl-C is ours to handle, and then ours to pass on.
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+            )
+        try:
+            url = f"http://127.0.0.1:{port}"
+            _await(process, url, log)
+            yield url
+        finally:
+            _end(process)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def _await(process: subprocess.Popen[bytes], url: str, log: Path) -> None:
+    until = time.monotonic() + _READY_SECONDS
+    with httpx.Client(trust_env=False, timeout=_READY_SECONDS) as client:
+        while time.monotonic() < until:
+            if process.poll() is not None:
+                said = log.read_text(errors="replace")[-_LOG_TAIL:].strip().splitlines() or ["it said nothing"]
+                raise LodestreamError(f"the server ended with code {process.returncode}: {said[-1]}")
+            with contextlib.suppress(httpx.TransportError):
+                if client.get(f"{url}/readyz").is_success:
+                    return
+            time.sleep(_LOOK_SECONDS)
+    raise LodestreamError(f"the server was not ready within {_READY_SECONDS:.0f} seconds")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_END_SECONDS)
+    except subprocess.TimeoutExpired:
+        # Its workers too: they are in its session, which is its own.
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    # SIGTERM ends Python without unwinding; as an exception it lets the server be ended first.
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    try:
+        previous = signal.signal(signal.SIGTERM, leave)
+    except ValueError:  # not in the main thread, where signals never arrive anyway
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
