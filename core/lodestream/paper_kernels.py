@@ -27,6 +27,8 @@ _PANEL_VALUES = 1 << 15
 #: However long the systems are, a panel has four cache lines of columns, or two of rows, which are turned on the way.
 _PANEL_COLUMNS = 32
 _PANEL_ROWS = 16
+#: Columns of systems so long that even such a panel has left the cache are solved where they are.
+_PANEL_LARGEST = 1 << 19
 
 
 @kernel
@@ -123,6 +125,10 @@ def solve_columns(values: Floats, pivots: Floats, terms: int, closed: bool) -> N
     """Systems along axis 0 of an array (p or more, q), in place, a panel of columns at a time."""
     size, total = pivots.size, values.shape[1]
     width = min(total, max(_PANEL_COLUMNS, _PANEL_VALUES // size))
+    # A panel that is the whole array, or that no cache would hold, is not worth copying.
+    if width == total or size * width > _PANEL_LARGEST:
+        _solve_panel(values[:size], pivots, terms, closed)
+        return
     scratch = np.empty(size * width)
     for start in range(0, total, width):
         count = min(width, total - start)
