@@ -181,7 +181,7 @@ def _inverse_columns(
                 x[2 * k + 1, start + i] = np.int32(min(max(odd, -_CLAMP), _CLAMP))
         if run < coarse:
             for i in range(width):
-                x[length - 1, start + i] = tail[i]
+                x[length - 1, start + i] = np.int32(min(max(float(tail[i]), -_CLAMP), _CLAMP))
 
 
 def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lodestream.axis import AxisStep, axis_step
+from lodestream.lifting import CLAMP, TAPS, forward_step, inverse_step
+
+from . import lifting_reference as reference
+from .lifting_reference import CLOSED, FREE, Ends
+from .reference import refinement_matrix
+
+LARGEST = 2**24
+#: Every kind of end.
+ENDS = [FREE, Ends(left=True), Ends(right=True), Ends(left=True, right=True), CLOSED]
+PREDICTORS = [(0, 0), (16, 0), (32, -7), (127, -127), (-127, 127), (-3, 90)]
+
+Ints = NDArray[np.int32]
+
+
+def step_of(length: int, ends: Ends) -> AxisStep:
+    return axis_step(length, ends.closed, (ends.left, ends.right))
+
+
+def random_grid(shape: tuple[int, int], seed: int, largest: int = LARGEST) -> Ints:
+    return np.random.default_rng(seed).integers(-largest, largest, shape, np.int32, endpoint=True)
+
+
+def hardest_lines(length: int) -> list[list[int]]:
+    """Lines that drive levels and coefficients far out: alternating, impulses, steps, and the signs of the filters."""
+    k = np.arange(length)
+    signs = [
+        k * 0 + 1,
+        1 - 2 * (k % 2),
+        1 - 2 * (k // 2 % 2),
+        1 - 2 * ((k + 1) // 2 % 2),
+        1 - 2 * (k // 3 % 2),
+        np.where(k < length // 2, 1, -1),
+        np.where(k == length // 2, 1, -1),
+        # What makes the update of the middle node as large as can be: midpoints alternate with the taps' signs.
+        np.where(k % 2 == 0, -1, 1 - 2 * (abs(k - length // 2) // 2 % 2)),
+        np.where(k % 2 == 0, 1, 1 - 2 * (abs(k - length // 2) // 2 % 2)),
+    ]
+    return [[int(s) * LARGEST for s in line] for line in signs]
+
+
+def test_the_taps_are_the_optimum_s_and_sum_to_a_quarter() -> None:
+    exact = (1 - 1 / np.sqrt(2)) * (2 * np.sqrt(2) - 3) ** np.arange(len(TAPS))
+    assert TAPS.sum() == 2**22
+    assert np.abs(TAPS / 2**24 - exact).max() < 1.5 / 2**24
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("ends", ENDS)
+def test_a_step_is_that_of_the_reference(ends: Ends, axis: int) -> None:
+    for length, predictor in itertools.product(range(1, 41), PREDICTORS):
+        lines = random_grid((length, 5), length)
+        lines[:, 3] = np.arange(length) ** 2
+        ours = np.array(lines if axis == 0 else lines.T, order="C")
+        forward_step(ours, axis, step_of(length, ends), predictor)
+        expected = reference.forward(lines.astype(np.int64), ends, *predictor).astype(np.int32)
+        np.testing.assert_array_equal(ours if axis == 0 else ours.T, expected)
+
+
+def test_strips_of_columns_and_strided_windows_make_no_difference() -> None:
+    for width in (1, 63, 64, 65, 130):
+        lines = random_grid((23, width), width)
+        window = np.zeros((46, 2 * width + 7), np.int32)[3:26, 5 : 5 + width]
+        window[:] = lines
+        expected = reference.forward(lines.astype(np.int64), FREE, 32, -7)
+        forward_step(window, 0, axis_step(23), (32, -7))
+        np.testing.assert_array_equal(window, expected)
+        inverse_step(window, 0, axis_step(23), (32, -7))
+        np.testing.assert_array_equal(window, lines)
+
+
+@pytest.mark.parametrize("kind", range(len(ENDS)))
+def test_every_pair_of_sizes_is_inverted_exactly(kind: int) -> None:
+    for rows, columns in itertools.product(range(1, 41), repeat=2):
+        # The strong predictors at the full amplitude would make coefficients beyond 28 bits, which no writer does.
+        predictors = PREDICTORS[(rows + kind) % 4], PREDICTORS[(columns + rows // 4) % 4]
+        original = random_grid((rows, columns), 41 * rows + columns, 2**18 if (127, -127) in predictors else LARGEST)
+        # Along axis 1 the kind of end changes with the sizes, so that every kind meets every other.
+        steps = step_of(rows, ENDS[kind]), step_of(columns, ENDS[(kind + rows + columns) % len(ENDS)])
+        values = original.copy()
+        for axis in (0, 1):
+            forward_step(values, axis, steps[axis], predictors[axis])
+        for axis in (1, 0):
+            inverse_step(values, axis, steps[axis], predictors[axis])
+        if not np.array_equal(values, original):
+            pytest.fail(f"{rows} x {columns}, {steps}, {predictors} was not inverted exactly")
+        assert values.shape == (rows, columns)
+
+
+@given(
+    length=st.integers(1, 150),
+    width=st.integers(1, 4),
+    ends=st.sampled_from(ENDS),
+    a=st.integers(-127, 127),
+    b=st.integers(-127, 127),
+    largest=st.sampled_from([1, 3, 1000, LARGEST]),
+    seed=st.integers(0, 2**32),
+)
+def test_any_line_comes_back(length: int, width: int, ends: Ends, a: int, b: int, largest: int, seed: int) -> None:
+    original = random_grid((length, width), seed, largest)
+    values = original.copy()
+    forward_step(values, 0, step_of(length, ends), (a, b))
+    np.testing.assert_array_equal(values, reference.forward(original.astype(np.int64), ends, a, b))
+    inverse_step(values, 0, step_of(length, ends), (a, b))
+    np.testing.assert_array_equal(values, original)
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_nodes_do_not_depend_on_the_third_step(ends: Ends) -> None:
+    for length in (3, 4, 9, 10, 31):
+        bare, predicted = random_grid((length, 3), length), random_grid((length, 3), length)
+        step = step_of(length, ends)
+        forward_step(bare, 0, step, (0, 0))
+        forward_step(predicted, 0, step, (127, -127))
+        np.testing.assert_array_equal(bare[: step.coarse], predicted[: step.coarse])
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_nodes_are_the_least_squares_optimum_with_clamped_ends_held(ends: Ends) -> None:
+    for length in range(3, 41):
+        lines = random_grid((length, 6), length, 2**20)  # noise of more bits meets the rounding of the taps
+        step = step_of(length, ends)
+        refined = refinement_matrix(length, ends.closed)
+        held = [0] * (step.left and step.midpoints > 0) + [step.coarse - 1] * (step.right and step.midpoints > 0)
+        free = [k for k in range(step.coarse) if k not in held]
+        best = np.zeros((step.coarse, 6))
+        best[held] = lines[[0 if k == 0 else length - 1 for k in held]]
+        best[free] = np.linalg.lstsq(refined[:, free], lines - refined @ best, rcond=None)[0]
+        forward_step(lines, 0, step, (16, 0))
+        assert np.abs(lines[: step.coarse] - best).max() <= 4
+        np.testing.assert_array_equal(lines[held], best[held])
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_the_hardest_lines_stay_within_the_bounds(ends: Ends) -> None:
+    """Ten steps of a line: levels below 2**26, bare details below 2**27, and all of them come back."""
+    for length in (16, 17, 33, 64, 65, 129, 256, 1025):
+        lines = np.array(hardest_lines(length), np.int32).T.copy()
+        levels, work = [lines.copy()], lines
+        while (step := step_of(len(work), ends)).midpoints:
+            forward_step(work, 0, step, (0, 0))
+            assert np.abs(work[: step.coarse]).max() < 2**26
+            assert np.abs(work[step.coarse :]).max() < 2**27
+            work = work[: step.coarse]
+            levels.append(work.copy())
+        np.testing.assert_array_equal(lines[: len(work)], levels[-1])
+        for level in levels[-2::-1]:
+            inverse_step(lines[: len(level)], 0, step_of(len(level), ends), (0, 0))
+            np.testing.assert_array_equal(lines[: len(level)], level)
+
+
+def test_sums_stay_below_2_to_the_51_where_nothing_overflows() -> None:
+    """The largest update of any line within +-2**24: every detail 2**25, of the sign of its tap."""
+    worst = 2 * 2**25 * int(np.abs(TAPS).sum())
+    assert worst + 3 * 2**21 < 2**51
+
+
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize("predictor", PREDICTORS)
+def test_hostile_coefficients_stay_within_the_limit_and_are_those_of_exact_integers(
+    ends: Ends, predictor: tuple[int, int]
+) -> None:
+    extreme = 2**28 - 1
+    for length in (2, 3, 4, 5, 6, 7, 8, 12, 19, 40):
+        rng = np.random.default_rng(length)
+        hostile = rng.choice(np.array([-extreme, extreme], np.int32), (length, 40))
+        hostile[:, ::3] = rng.integers(-extreme, extreme, hostile[:, ::3].shape, endpoint=True)
+        hostile[:, 1] = extreme
+        hostile[:, 2] = extreme * (1 - 2 * (np.arange(length) % 2))
+        expected = reference.inverse(hostile.astype(object), ends, *predictor)
+        ours = hostile.copy()
+        step = step_of(length, ends)
+        inverse_step(ours, 0, step, predictor)
+        np.testing.assert_array_equal(ours.astype(object), expected)
+        assert not step.midpoints or np.abs(ours).max() <= CLAMP
+
+
+def test_the_reference_in_plain_and_in_python_integers_agree() -> None:
+    lines = random_grid((21, 4), 5)
+    for ends, predictor in itertools.product(ENDS, PREDICTORS):
+        plain: NDArray[Any] = reference.forward(lines.astype(np.int64), ends, *predictor)
+        np.testing.assert_array_equal(plain, reference.forward(lines.astype(object), ends, *predictor).astype(np.int64))
+        np.testing.assert_array_equal(reference.inverse(plain, ends, *predictor), lines)
