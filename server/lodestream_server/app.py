@@ -64,8 +64,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     problems.install(app)
-    for router in (pages.router, surfaces.router, files.router, streams.router):
+    routers = (pages.router, surfaces.router, files.router, streams.router)
+    for router in routers:
         app.include_router(router)
+    app.state.routes = [router.routes for router in routers]
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

@@ -99,8 +99,6 @@ class Builder:
         try:
             # Scheduling starts the processes the first time, which takes a moment: not in the event loop.
             await asyncio.wrap_future(await asyncio.to_thread(self._pool.schedule, worker.warm))
-            # Levels are decoded in this process.
-            await asyncio.to_thread(worker.warm)
         except Exception:
             _log.exception("the kernels could not be compiled")
         else:
@@ -146,7 +144,7 @@ class Builder:
         options = dict(record.options)
         return worker.Job(
             files=tuple(self._storage.upload_files(record)),
-            filename=record.filenames[0],
+            filename=record.filenames[0] or None,
             name=record.name,
             precision=options.pop("precision", None),
             closed=options.pop("closed", "auto"),

@@ -11,7 +11,7 @@ from pathlib import Path
 from lodestream import Tolerance
 from lodestream.errors import FormatError, OptionError
 
-from .worker import CLOSED
+from .worker import CLOSED, UNNAMED
 
 __all__ = ["SurfaceOptions", "check", "identify", "plain_name"]
 
@@ -75,7 +75,7 @@ def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -
     """
     from lodestream.formats import formats, sniff
 
-    found = [sniff(file, filename=name or "upload") for file, name in zip(files, names, strict=True)]
+    found = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
     for format_ in found:
         if format_.read is None:
             readable = ", ".join(item.name for item in formats() if item.read)

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.routing import Route
 
 from lodestream.errors import (
     FormatError,
@@ -125,9 +126,21 @@ async def _refused(request: Request, error: Exception) -> Response:
     detail = error.detail
     if error.status_code == 404 and detail == phrase:
         detail = "expected a path that /docs lists"
+    headers = dict(error.headers or {})
     if error.status_code == 405:
-        detail = f"expected one of {(error.headers or {}).get('allow', 'the listed methods')}, got {request.method}"
-    return _document(request, error.status_code, code, phrase, detail, dict(error.headers or {}))
+        # The framework names the methods of the first route of this path only.
+        headers = {"allow": ", ".join(_methods(request))}
+        detail = f"expected one of {headers['allow']}, got {request.method}"
+    return _document(request, error.status_code, code, phrase, detail, headers)
+
+
+def _methods(request: Request) -> list[str]:
+    found = set[str]()
+    for routes in request.app.state.routes:
+        for route in routes:
+            if isinstance(route, Route) and route.path_regex.match(request.url.path):
+                found |= route.methods or set()
+    return sorted(found)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

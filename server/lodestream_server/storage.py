@@ -138,8 +138,15 @@ class Storage:
                 remove(upload)
                 return known, False
             remove(self._uploads / record.id)
-            rename(upload, self._uploads / record.id)
-            self._write(record)
+            try:
+                rename(upload, self._uploads / record.id)
+                self._write(record)
+            except OSError:
+                # What is not acknowledged does not come back after a restart.
+                remove(self._uploads / record.id)
+                if known is None:
+                    remove(self._records_folder / f"{record.id}.json")
+                raise
             return record, True
 
     def ready(self, surface: str, built: Path, sha256: str, info: dict[str, object]) -> None:
@@ -157,8 +164,9 @@ class Storage:
         with self._lock:
             record = self._records.get(surface)
             if record is not None:
-                self._write(replace(record, state="failed", reason=reason))
+                # First the bytes: whoever sees the failure finds nothing stored.
                 remove(self._uploads / surface)
+                self._write(replace(record, state="failed", reason=reason))
 
     def delete(self, surface: str) -> None:
         """Remove a surface, and its container unless another surface has the same.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from lodestream import Surface
 
-__all__ = ["CLOSED", "Built", "Job", "Refused", "build", "read_progress", "warm"]
+__all__ = ["CLOSED", "UNNAMED", "Built", "Job", "Refused", "build", "read_progress", "warm"]
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +30,9 @@ CLOSED: dict[str, tuple[bool, bool] | None] = {
     "cols": (False, True),
     "both": (True, True),
 }
+
+#: What a file without a name is called in messages, which must not tell where it lies on the server.
+UNNAMED = "upload"
 
 _PROGRESS = "progress"
 _CONTAINER = "container"
@@ -133,10 +136,16 @@ def _read(job: Job) -> Surface:
     from lodestream import Surface
     from lodestream.formats import read
 
-    surface = read(*job.files, max_vertices=job.max_vertices, filename=job.filename, **job.options)
+    filename = job.filename or UNNAMED
+    surface = read(*job.files, max_vertices=job.max_vertices, filename=filename, **job.options)
+    metadata = dict(surface.metadata)
+    if job.name is not None:
+        metadata["name"] = job.name
+    elif job.filename is None:
+        # Nobody gave it one: the reader took it from the name that stands in for the file's.
+        metadata.pop("name", None)
     closed = CLOSED[job.closed]
-    name = {} if job.name is None else {"name": job.name}
-    return Surface(surface.points, surface.closed if closed is None else closed, metadata={**surface.metadata, **name})
+    return Surface(surface.points, surface.closed if closed is None else closed, metadata=metadata)
 
 
 def _reporter(folder: Path) -> Callable[[float], None]:

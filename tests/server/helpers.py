@@ -1,0 +1,99 @@
+"""What the tests of the server share: small surfaces, and waiting for what must happen, with an end."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+from websockets.sync.client import ClientConnection, connect
+
+from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
+from lodestream.wire import parse, serialize
+
+T = TypeVar("T")
+
+PATIENCE = 60.0
+
+
+def hills(rows: int = 40, columns: int = 30, seed: int = 1) -> NDArray[np.float32]:
+    """A small height field, another one for each seed."""
+    r, c = np.mgrid[0:rows, 0:columns]
+    noise = np.random.default_rng(seed).normal(size=(rows, columns))
+    return np.asarray(50 * np.sin(r / 9 + seed) * np.cos(c / 7) + noise, np.float32)
+
+
+def npy(array: NDArray[Any]) -> bytes:
+    """The bytes of an NPY file."""
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def eventually(look: Callable[[], T | None], what: str) -> T:
+    """The first true value that `look` gives; fails when there is none in time."""
+    until = time.monotonic() + PATIENCE
+    while time.monotonic() < until:
+        value = look()
+        if value:
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"expected {what} within {PATIENCE:g} s")
+
+
+def settled(http: httpx.Client, location: str) -> dict[str, Any]:
+    """What the server says of a surface once it is ready or has failed."""
+
+    def look() -> dict[str, Any] | None:
+        surface: dict[str, Any] = http.get(location).raise_for_status().json()
+        return surface if surface["state"] in ("ready", "failed") else None
+
+    return eventually(look, "the build to end")
+
+
+def push(http: httpx.Client, data: bytes, **query: str) -> dict[str, Any]:
+    """Upload, and wait."""
+    answer = http.post("/v1/surfaces", content=data, params=query)
+    assert answer.status_code in (200, 202), answer.text
+    return settled(http, answer.headers["location"])
+
+
+class Raw:
+    """A WebSocket that speaks messages and nothing else: no credit is granted, no bye is said unless a test does."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket = socket
+
+    def send(self, event: Event) -> None:
+        self.socket.send(serialize(event))
+
+    def receive(self) -> Event:
+        message = self.socket.recv(timeout=PATIENCE, decode=False)
+        assert len(message) <= MAX_MESSAGE
+        return parse(message)
+
+    def until_end(self) -> list[Event]:
+        """Everything up to the end, which is answered."""
+        events = [self.receive()]
+        while not isinstance(events[-1], End):
+            events.append(self.receive())
+        self.send(Bye())
+        return events
+
+
+def data_of(events: list[Event]) -> int:
+    """Bytes of the container in some messages."""
+    return sum(len(event.data) for event in events if isinstance(event, Segments))
+
+
+@contextmanager
+def raw_stream(url: str, **options: Any) -> Iterator[Raw]:
+    """A socket to the stream of the surface at a URL."""
+    options = {"subprotocols": [SUBPROTOCOL], "max_size": MAX_MESSAGE, "compression": None, "proxy": None, **options}
+    with connect(url.replace("http", "ws", 1) + "/stream", **options) as socket:
+        yield Raw(socket)

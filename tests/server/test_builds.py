@@ -1,0 +1,236 @@
+"""Builds: progress, cancelling, processes that die, restarts, and the folder in which everything lies."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from lodestream.errors import LodestreamError
+from lodestream_server import durable, running_server, worker
+from lodestream_server.storage import Storage
+from tests.server import slow
+from tests.server.helpers import eventually, hills, npy, push, settled
+
+
+@contextmanager
+def running(data: Path, **settings: Any) -> Iterator[httpx.Client]:
+    with (
+        running_server(data, **{"workers": 1, **settings}) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        yield http
+
+
+def building(http: httpx.Client, location: str) -> dict[str, Any]:
+    def look() -> dict[str, Any] | None:
+        surface: dict[str, Any] = http.get(location).json()
+        return surface if surface["state"] == "building" and surface["progress"] == 0.5 else None
+
+    return eventually(look, "the build to be half done")
+
+
+def post(http: httpx.Client, seed: int) -> str:
+    answer = http.post("/v1/surfaces", content=npy(hills(seed=seed)), params={"filename": "hills.npy"})
+    assert answer.status_code == 202
+    return str(answer.headers["location"])
+
+
+def test_a_build_tells_its_progress_and_answers_409_until_it_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(tmp_path / "data") as http:
+        location = post(http, 1)
+        behind = post(http, 2)
+        building(http, location)
+        assert http.get(behind).json()["state"] == "queued"
+        for path in (f"{location}/container", f"{location}/levels/0", f"{behind}/container"):
+            answer = http.get(path)
+            assert (answer.status_code, answer.json()["code"]) == (409, "not-ready")
+            assert int(answer.headers["retry-after"]) >= 1
+        again = http.post("/v1/surfaces", content=npy(hills(seed=1)), params={"filename": "hills.npy"})
+        assert (again.status_code, again.headers["location"]) == (202, location)
+        (tmp_path / "data" / "go").touch()
+        assert [settled(http, where)["state"] for where in (location, behind)] == ["ready", "ready"]
+
+
+def test_deleting_stops_the_build_and_frees_its_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        location = post(http, 1)
+        building(http, location)
+        assert http.delete(location).status_code == 204
+        assert http.get(location).status_code == 404
+        monkeypatch.undo()
+        assert push(http, npy(hills(seed=2)))["state"] == "ready"
+        assert len(list((data / "uploads").iterdir())) == 1
+        assert list((data / "work").iterdir()) == []
+
+
+def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.kill)
+    with running(data) as http:
+        surface = settled(http, post(http, 1))
+        assert surface["state"] == "failed"
+        assert "process ended" in surface["reason"]
+        assert "9" in surface["reason"]
+        assert not (data / "uploads" / surface["id"]).exists()
+        monkeypatch.undo()
+        # The same bytes again are a new attempt.
+        assert settled(http, post(http, 1))["state"] == "ready"
+
+
+def test_what_nobody_foresaw_does_not_tell_the_servers_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.explode)
+    with running(tmp_path / "data") as http:
+        surface = settled(http, post(http, 1))
+        assert (surface["state"], surface["reason"]) == ("failed", "the build failed inside: ZeroDivisionError")
+
+
+def test_a_build_that_takes_too_long_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(tmp_path / "data", build_seconds=0.3) as http:
+        surface = settled(http, post(http, 1))
+        assert (surface["state"], surface["reason"]) == ("failed", "the build took longer than 0.3 s")
+
+
+def test_a_restart_keeps_surfaces_and_takes_up_builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        ready = push(http, npy(hills(seed=1)), name="kept")
+        failed = push(http, npy(hills(seed=2))[:-1])
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        half = post(http, 3)
+        building(http, half)
+        queued = post(http, 4)
+    monkeypatch.undo()
+    assert list((data / "work").iterdir()) == []
+    with running(data) as http:
+        assert http.get(ready["url"]).json() == ready
+        assert http.get(failed["url"]).json() == failed
+        assert [settled(http, where)["state"] for where in (half, queued)] == ["ready", "ready"]
+        assert len(http.get("/v1/surfaces").json()["surfaces"]) == 4
+
+
+def test_what_a_dead_server_left_half_done_is_swept_away(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        surface = push(http, npy(hills()))
+    for leftover in (
+        "incoming/ab/0",
+        "work/cd/container",
+        "uploads/0123456789abcdef0123/0",
+        f"containers/{'0' * 64}.lode",
+    ):
+        path = data / leftover
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"half")
+    (data / "records" / "x.json.0123.new").write_bytes(b"{")
+    with running(data) as http:
+        assert [entry["id"] for entry in http.get("/v1/surfaces").json()["surfaces"]] == [surface["id"]]
+    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
+    assert files == [
+        f"containers/{surface['container']}.lode",
+        "lock",
+        f"records/{surface['id']}.json",
+        f"uploads/{surface['id']}/0",
+    ]
+
+
+def test_a_lost_container_is_built_again_and_a_lost_upload_is_a_failure(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        one, two = push(http, npy(hills(seed=1))), push(http, npy(hills(seed=2)))
+    for surface in (one, two):
+        (data / "containers" / f"{surface['container']}.lode").unlink()
+    (data / "uploads" / two["id"] / "0").unlink()
+    with running(data) as http:
+        assert settled(http, one["url"])["container"] == one["container"]
+        lost = settled(http, two["url"])
+        assert (lost["state"], lost["reason"]) == ("failed", "the upload is gone")
+
+
+def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        surface = push(http, npy(hills()))
+    path = data / "records" / f"{surface['id']}.json"
+    path.write_text("{not json")
+    storage = Storage(data)
+    assert storage.records() == []
+    storage.close()
+    assert path.read_text() == "{not json"
+    assert (data / "uploads" / surface["id"] / "0").is_file()
+    assert (data / "containers" / f"{surface['container']}.lode").is_file()
+
+
+def test_two_servers_never_share_a_folder(tmp_path: Path) -> None:
+    storage = Storage(tmp_path)
+    with pytest.raises(LodestreamError, match="another works"):
+        Storage(tmp_path)
+    storage.close()
+    Storage(tmp_path).close()
+
+
+def test_a_record_written_by_a_later_version_is_read(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        surface = push(http, npy(hills()))
+    path = data / "records" / f"{surface['id']}.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "owner": "somebody"}))
+    storage = Storage(data)
+    assert storage.get(surface["id"]).state == "ready"
+    storage.close()
+
+
+@pytest.mark.parametrize("step", range(5))
+def test_a_full_disk_is_answered_507_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        kept = push(http, npy(hills(seed=1)))
+        before = sorted(path for path in data.rglob("*") if path.is_file())
+        # An upload puts its file, two folders and its record on disk: each of them may find it full.
+        calls = iter(range(100))
+        sync = os.fsync
+
+        def full(handle: int) -> None:
+            if next(calls) == step:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            sync(handle)
+
+        monkeypatch.setattr(os, "fsync", full)
+        answer = http.post("/v1/surfaces", content=npy(hills(seed=2)))
+        monkeypatch.undo()
+        assert (answer.status_code, answer.json()["code"]) == (507, "disk-full")
+        assert list((data / "incoming").iterdir()) == []
+        listed = [entry["id"] for entry in http.get("/v1/surfaces").json()["surfaces"]]
+        assert listed == [kept["id"]]
+        assert push(http, npy(hills(seed=2)))["state"] == "ready"
+    assert set(before) < {path for path in data.rglob("*") if path.is_file()}
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    durable.write_file(path, b"old")
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="space"):
+        durable.write_file(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,130 @@
+"""Containers and levels as files: ranges, caching, formats."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+import lodestream as ls
+from tests.server.helpers import hills, npy, push
+
+
+@pytest.fixture(scope="module")
+def surface(http: httpx.Client) -> dict[str, Any]:
+    return push(http, npy(hills(65, 50)))
+
+
+@pytest.fixture(scope="module")
+def address(surface: dict[str, Any]) -> str:
+    return f"/v1/containers/{surface['container']}.lode"
+
+
+def test_the_surface_leads_to_its_immutable_container(
+    http: httpx.Client, surface: dict[str, Any], address: str
+) -> None:
+    answer = http.get(surface["url"] + "/container")
+    assert (answer.status_code, answer.headers["location"]) == (307, address)
+    assert answer.headers["cache-control"] == "no-cache"
+    container = http.get(address)
+    assert container.status_code == 200
+    assert container.headers["etag"] == f'"{surface["container"]}"'
+    assert container.headers["accept-ranges"] == "bytes"
+    assert "immutable" in container.headers["cache-control"]
+    assert container.headers["content-length"] == str(surface["bytes"])
+
+
+def test_ranges_are_slices_of_the_file(http: httpx.Client, surface: dict[str, Any], address: str) -> None:
+    whole, size = http.get(address).content, surface["bytes"]
+    for header, expected in (
+        ("bytes=0-0", whole[:1]),
+        ("bytes=100-299", whole[100:300]),
+        ("bytes=-50", whole[-50:]),
+        (f"bytes={size - 5}-", whole[-5:]),
+        (f"bytes=10-{size + 1000}", whole[10:]),
+    ):
+        answer = http.get(address, headers={"range": header})
+        assert (answer.status_code, answer.content) == (206, expected)
+        start = whole.index(expected)
+        assert answer.headers["content-range"] == f"bytes {start}-{start + len(expected) - 1}/{size}"
+        assert answer.headers["etag"] == f'"{surface["container"]}"'
+    several = http.get(address, headers={"range": "bytes=0-9,100-109"})
+    assert several.status_code == 206
+    assert several.headers["content-type"].startswith("multipart/byteranges")
+    assert whole[100:110] in several.content
+    outside = http.get(address, headers={"range": f"bytes={size}-"})
+    assert (outside.status_code, outside.headers["content-range"]) == (416, f"bytes */{size}")
+
+
+def test_if_range_gives_the_whole_file_when_it_is_another(http: httpx.Client, address: str) -> None:
+    etag = http.head(address).headers["etag"]
+    same = http.get(address, headers={"range": "bytes=0-9", "if-range": etag})
+    other = http.get(address, headers={"range": "bytes=0-9", "if-range": '"other"'})
+    assert (same.status_code, other.status_code) == (206, 200)
+
+
+def test_what_the_client_has_is_not_sent_again(http: httpx.Client, surface: dict[str, Any], address: str) -> None:
+    for path in (address, surface["url"] + "/levels/2"):
+        etag = http.get(path).headers["etag"]
+        for header in (etag, f'"other", W/{etag}', "*"):
+            answer = http.get(path, headers={"if-none-match": header})
+            assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", etag)
+        assert http.get(path, headers={"if-none-match": '"other"'}).status_code == 200
+
+
+def test_head_tells_size_and_range(http: httpx.Client, surface: dict[str, Any], address: str) -> None:
+    head = http.head(address)
+    assert head.headers["content-length"] == str(surface["bytes"])
+    partial = http.head(address, headers={"range": "bytes=0-9"})
+    assert (partial.status_code, partial.headers["content-length"]) == (206, "10")
+
+
+def test_a_level_is_the_grid_that_decoding_gives(http: httpx.Client, surface: dict[str, Any]) -> None:
+    decoder = ls.Decoder()
+    decoder.feed(http.get(surface["url"] + "/container", follow_redirects=True).content)
+    finest = surface["levels"][-1]["level"]
+    for level in (0, 1, finest - 1, finest):
+        answer = http.get(f"{surface['url']}/levels/{level}")
+        assert answer.status_code == 200
+        assert f"-{level}.npy" in answer.headers["content-disposition"]
+        points = np.load(io.BytesIO(answer.content))
+        assert list(points.shape) == surface["levels"][level]["shape"]
+        assert np.array_equal(points, decoder.points_at(level))
+    assert np.array_equal(points, hills(65, 50))
+
+
+def test_levels_come_as_meshes_too(http: httpx.Client, surface: dict[str, Any], tmp_path: Path) -> None:
+    rows, columns = surface["levels"][3]["shape"]
+    obj = http.get(surface["url"] + "/levels/3", params={"format": "obj"})
+    assert obj.headers["content-type"].startswith("model/obj")
+    (tmp_path / "level.obj").write_bytes(obj.content)
+    mesh = ls.read(tmp_path / "level.obj")
+    assert mesh.shape == (rows, columns)
+    # A level is as large as the surface.
+    assert mesh.points[..., 0].max() == pytest.approx(49)
+    assert mesh.points[..., 1].max() == pytest.approx(64)
+    ply = http.get(surface["url"] + "/levels/3", params={"format": "ply"})
+    assert f"element vertex {rows * columns}\n".encode() in ply.content
+
+
+def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any]) -> None:
+    finest = surface["levels"][-1]["level"]
+    for path, words in (
+        ("/levels/99", f"0 to {finest}"),
+        ("/levels/-1", f"0 to {finest}"),
+        ("/levels/x", "integer"),
+        ("/levels/1?format=glb", "npy, obj, ply"),
+    ):
+        answer = http.get(surface["url"] + path)
+        assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")
+        assert words in answer.json()["detail"]
+
+
+def test_nothing_is_left_behind(http: httpx.Client, surface: dict[str, Any], data: Path) -> None:
+    http.get(surface["url"] + "/levels/2")
+    assert list((data / "work").iterdir()) == []
+    assert list((data / "incoming").iterdir()) == []

@@ -1,0 +1,243 @@
+"""Uploading, looking, listing, deleting; and what the server says of itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+import lodestream as ls
+from tests.server.helpers import eventually, hills, npy, push, settled
+
+
+def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
+    body = npy(hills())
+    answer = http.post("/v1/surfaces", content=body, params={"filename": "hills.npy", "name": "Hills"})
+    assert answer.status_code == 202
+    location = answer.headers["location"]
+    accepted = answer.json()
+    assert re.fullmatch("[0-9a-f]{20}", accepted["id"])
+    assert location == accepted["url"] == f"/v1/surfaces/{accepted['id']}"
+    surface = settled(http, location)
+    assert surface["state"] == "ready"
+    assert surface["progress"] == 1.0
+    assert surface["reason"] is None
+    assert surface["name"] == "Hills"
+    assert surface["filenames"] == ["hills.npy"]
+    assert surface["upload_bytes"] == len(body)
+    assert surface["shape"] == [40, 30]
+    assert surface["closed"] == [False, False]
+    assert surface["blocks"] == [{"shape": [40, 30], "closed": [False, False]}]
+    assert surface["exact"] is True
+    assert surface["metadata"]["name"] == "Hills"
+    assert [level["level"] for level in surface["levels"]] == list(range(len(surface["levels"])))
+    assert surface["layers"][-1]["bytes"] <= surface["bytes"]
+    container = http.get(f"{location}/container", follow_redirects=True).content
+    assert len(container) == surface["bytes"]
+    assert hashlib.sha256(container).hexdigest() == surface["container"]
+    assert np.array_equal(ls.decode(container).points, hills())
+    assert json.loads((data / "records" / f"{surface['id']}.json").read_text())["state"] == "ready"
+
+
+def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> None:
+    body = npy(hills(seed=2))
+    first = push(http, body, precision="0.5", filename="a.npy")
+    again = http.post("/v1/surfaces", content=body, params={"precision": "5e-1", "name": "another name"})
+    assert again.status_code == 200
+    assert again.headers["location"] == first["url"]
+    assert again.json()["id"] == first["id"]
+    form = http.post("/v1/surfaces", files=[("file", ("b.npy", body))], params={"precision": "0.50"})
+    assert (form.status_code, form.json()["id"]) == (200, first["id"])
+    others = [push(http, body)["id"], push(http, body, precision="0.25")["id"], push(http, body, closed="rows")["id"]]
+    assert len({first["id"], *others}) == 4
+
+
+def test_options_reach_the_surface(http: httpx.Client) -> None:
+    surface = push(http, npy(hills(seed=3)), closed="both", precision="1e-2d")
+    assert surface["closed"] == [True, True]
+    assert surface["exact"] is False
+    assert surface["options"] == {"closed": "both", "precision": "0.01d"}
+
+
+def test_options_of_a_format_reach_its_reader(http: httpx.Client, tmp_path: Path) -> None:
+    path = tmp_path / "two.npz"
+    np.savez(path, low=hills(8, 9, seed=4), high=hills(10, 11, seed=4))
+    shapes = [push(http, path.read_bytes(), array=name)["shape"] for name in ("low", "high")]
+    assert shapes == [[8, 9], [10, 11]]
+
+
+def test_files_may_come_as_parts_of_a_form(http: httpx.Client) -> None:
+    body = npy(hills(seed=5))
+    answer = http.post("/v1/surfaces", files=[("file", ("../../étrange\n.npy", body))])
+    assert answer.status_code == 202
+    surface = settled(http, answer.headers["location"])
+    assert surface["state"] == "ready"
+    assert "/" not in surface["filenames"][0]
+    assert surface["filenames"][0].endswith(".npy")
+
+
+def test_several_files_of_one_surface_are_taken_and_told_apart(http: httpx.Client) -> None:
+    one, two = npy(hills(seed=6)), npy(hills(seed=7))
+    answers = [
+        http.post("/v1/surfaces", files=[("file", ("1.npy", first)), ("file", ("2.npy", second))])
+        for first, second in ((one, two), (two, one))
+    ]
+    assert [answer.status_code for answer in answers] == [202, 202]
+    surfaces = [settled(http, answer.headers["location"]) for answer in answers]
+    assert surfaces[0]["id"] != surfaces[1]["id"]
+    # No format takes several files yet, and whoever reads them says so.
+    assert all(surface["state"] == "failed" and "one file" in surface["reason"] for surface in surfaces)
+
+
+def test_a_bad_file_fails_with_its_reason_and_leaves_no_bytes(http: httpx.Client, data: Path) -> None:
+    surface = push(http, npy(hills(seed=8))[:-100], filename="cut.npy")
+    assert surface["state"] == "failed"
+    assert "cut short" in surface["reason"]
+    assert "\n" not in surface["reason"]
+    assert not (data / "uploads" / surface["id"]).exists()
+    for path in ("/container", "/levels/0"):
+        answer = http.get(surface["url"] + path)
+        assert (answer.status_code, answer.json()["code"]) == (424, "failed")
+        assert "cut short" in answer.json()["detail"]
+    again = http.post("/v1/surfaces", content=npy(hills(seed=8))[:-100], params={"filename": "cut.npy"})
+    assert again.status_code == 202
+    assert settled(http, again.headers["location"])["state"] == "failed"
+
+
+def test_holes_fail_with_their_place(http: httpx.Client) -> None:
+    array = hills(seed=9)
+    array[3, 4] = np.nan
+    surface = push(http, npy(array))
+    assert surface["state"] == "failed"
+    assert "row 3, column 4" in surface["reason"]
+
+
+def test_a_deleted_surface_is_gone_with_all_its_bytes(http: httpx.Client, data: Path) -> None:
+    surface = push(http, npy(hills(seed=10)))
+    assert http.delete(surface["url"]).status_code == 204
+    assert http.get(surface["url"]).status_code == 404
+    assert http.delete(surface["url"]).status_code == 404
+    for path in (
+        f"records/{surface['id']}.json",
+        f"uploads/{surface['id']}",
+        f"containers/{surface['container']}.lode",
+    ):
+        assert not (data / path).exists()
+    assert http.get(f"/v1/containers/{surface['container']}.lode").status_code == 404
+
+
+def test_a_container_that_two_surfaces_share_stays_until_both_are_gone(http: httpx.Client) -> None:
+    body = npy(hills(seed=11))
+    one, two = push(http, body, name="same"), push(http, body, name="same", closed="none")
+    assert one["id"] != two["id"]
+    assert one["container"] == two["container"]
+    address = f"/v1/containers/{one['container']}.lode"
+    http.delete(one["url"])
+    assert http.get(address).status_code == 200
+    http.delete(two["url"])
+    assert http.get(address).status_code == 404
+
+
+def test_the_list_comes_in_pages_without_gaps(http: httpx.Client) -> None:
+    made = [push(http, npy(hills(5, 5, seed=20 + number)))["id"] for number in range(5)]
+    seen: list[str] = []
+    address: str | None = "/v1/surfaces?limit=2"
+    while address:
+        document = http.get(address).raise_for_status().json()
+        assert len(document["surfaces"]) <= 2
+        assert all("layers" not in surface for surface in document["surfaces"])
+        seen += [surface["id"] for surface in document["surfaces"]]
+        address = document["next"]
+    assert len(seen) == len(set(seen))
+    assert [name for name in seen if name in made] == made
+    assert [entry["id"] for entry in http.get("/v1/surfaces?limit=1000").json()["surfaces"]] == seen
+
+
+@pytest.mark.parametrize("query", ["limit=0", "limit=x", "limit=1001", "after=yesterday"])
+def test_a_page_that_does_not_exist_is_refused(http: httpx.Client, query: str) -> None:
+    answer = http.get(f"/v1/surfaces?{query}")
+    assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")
+    assert query.partition("=")[0] in answer.json()["detail"]
+
+
+def test_every_get_has_its_head(http: httpx.Client) -> None:
+    surface = push(http, npy(hills(seed=12)))
+    for path in (
+        "/",
+        "/healthz",
+        "/v1/surfaces",
+        surface["url"],
+        f"{surface['url']}/container",
+        f"{surface['url']}/levels/2",
+        f"/v1/containers/{surface['container']}.lode",
+    ):
+        got, head = http.get(path), http.head(path)
+        assert head.status_code == got.status_code
+        assert head.content == b""
+        assert head.headers["content-length"] == got.headers["content-length"]
+
+
+def test_what_the_server_says_of_itself(http: httpx.Client) -> None:
+    assert http.get("/healthz").json()["status"] == "ok"
+    eventually(lambda: http.get("/readyz").status_code == 200, "warm kernels")
+    page = http.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "docs" in page.text
+    assert http.get("/docs").status_code == 200
+
+
+def test_problems_have_one_shape(http: httpx.Client) -> None:
+    for answer, status, words in (
+        (http.get("/nowhere"), 404, "/docs"),
+        (http.get("/v1/surfaces/0123"), 404, "'0123'"),
+        (http.get("/v1/surfaces/" + "x" * 500), 404, "id"),
+        (http.get("/v1/surfaces/..%2f..%2fetc"), 404, "expected"),
+        (http.get(f"/v1/containers/{'0' * 64}.lode"), 404, "SHA-256"),
+        (http.get("/v1/containers/..%2f..%2frecords.lode"), 404, "expected"),
+        (http.put("/v1/surfaces"), 405, "GET, HEAD, POST"),
+        (http.post("/healthz"), 405, "GET, HEAD"),
+        (http.get("/v1/surfaces/"), 404, "expected"),
+    ):
+        assert answer.status_code == status, answer.url
+        assert answer.headers["content-type"] == "application/problem+json"
+        document: dict[str, Any] = answer.json()
+        assert set(document) == {"type", "title", "status", "code", "detail", "instance"}
+        assert document["status"] == status
+        assert words in document["detail"]
+        assert document["type"] == f"urn:lodestream:{document['code']}"
+    assert http.put("/v1/surfaces").headers["allow"] == "GET, HEAD, POST"
+
+
+def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None:
+    schema = http.get("/openapi.json").json()
+    assert set(schema["paths"]) == {
+        "/healthz",
+        "/readyz",
+        "/v1/surfaces",
+        "/v1/surfaces/{surface}",
+        "/v1/surfaces/{surface}/container",
+        "/v1/surfaces/{surface}/levels/{level}",
+        "/v1/containers/{sha256}.lode",
+    }
+    post = schema["paths"]["/v1/surfaces"]["post"]
+    assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
+    assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "closed", "name", "filename"}
+    assert set(post["responses"]) == {"200", "202", "408", "413", "422", "507"}
+    example = post["responses"]["202"]["content"]["application/json"]["example"]
+    real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()
+    # The framework leaves nulls out of examples.
+    assert set(example) == set(real) - {"reason", "container"}
+    ready = schema["paths"]["/v1/surfaces/{surface}"]["get"]["responses"]["200"]["content"]["application/json"][
+        "example"
+    ]
+    assert set(ready) <= set(settled(http, real["url"]))
+    text = json.dumps(schema)
+    assert "HTTPValidationError" not in text
+    for name in re.findall(r"#/components/schemas/(\w+)", text):
+        assert name in schema["components"]["schemas"]
