@@ -26,6 +26,8 @@ COEFFICIENT_BITS = 28
 FOUR_POINT = (16, 0)
 #: Nodes that an axis needs for an (a, b) of its own.
 FIT_NODES = 24
+#: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
+_CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
 _SAMPLE_LINES = 96
 _NORM_LEVELS = 6
 
@@ -113,8 +115,15 @@ def _fit(lines: NDArray[np.int32], step: AxisStep) -> tuple[int, int]:
     outer = [nodes[2 + shift : last + shift] for shift in range(-2, 4)]  # c_{k-2} ... c_{k+3}
     near = outer[2] + outer[3]
     first, second = near - outer[1] - outer[4], near - outer[0] - outer[5]
-    candidates = [(0, 0), FOUR_POINT, *_least_squares(first, second, inner)]
-    return min(candidates, key=lambda ab: _bits(inner - np.floor((ab[0] * first + ab[1] * second + 128) / 256)))
+
+    def bits(ab: tuple[int, int]) -> float:
+        return _bits(inner - np.floor((ab[0] * first + ab[1] * second + 128) / 256))
+
+    best = min([*_CANDIDATES, *_least_squares(first, second, inner)], key=bits)
+    for reach in (4, 2, 1):
+        around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
+        best = min((ab for ab in around if max(map(abs, ab)) <= 127), key=bits)
+    return best
 
 
 def _least_squares(
