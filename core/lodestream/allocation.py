@@ -52,7 +52,7 @@ def hull_slopes(curve: TileCurve) -> NDArray[np.float64]:
     return np.array(slopes[::-1])
 
 
-def assign_layers(curves: list[TileCurve], layout: Layout) -> list[NDArray[np.int8]]:
+def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> list[NDArray[np.int8]]:
     """The state after each layer.
 
     Parameters
@@ -60,13 +60,14 @@ def assign_layers(curves: list[TileCurve], layout: Layout) -> list[NDArray[np.in
     curves : list of TileCurve
         One for each tile and channel that has a plane.
     layout : Layout
+    channels : int
+        Of the surface; one whose coefficients are all 0 has no curve.
 
     Returns
     -------
     list of int8 arrays, shape (tile, channel)
         Lowest plane that is known after the layer; where nothing is, the tile's number of planes.
     """
-    channels = 1 + max((curve.channel for curve in curves), default=0)
     top = np.zeros((len(layout.tiles), channels), np.int8)
     slopes: dict[tuple[int, int], NDArray[np.float64]] = {}
     for curve in curves:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .container import sections
 from .container.frames import Frame, FrameReader, section_extent
 from .container.model import ByteRange, Header, Index
-from .container.reader import index_from, read_metadata
+from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .errors import CorruptStreamError, OptionError, TruncatedStreamError
 from .reconstruction import Coded, Progress, Reconstruction
@@ -207,7 +207,8 @@ class Decoder:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
         else:
             place = ByteRange(frame.offset, frame.end - frame.offset)
-            self.index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
+            index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
+            self.index = replace(with_level_bytes(index), metadata_values=self.metadata or {})
 
     def _take_header(self, frame: Frame) -> None:
         if self.header is not None:
@@ -252,7 +253,19 @@ class Decoder:
         corrected = complete and self.header is not None and self.header.corrected
         length, state = self._reconstruction.length, self._progress.state.copy()
         self.layers.append(
-            View(number, level, held, rms, max_error, complete, self._reconstruction, length, state, corrected, self._values)
+            View(
+                number,
+                level,
+                held,
+                rms,
+                max_error,
+                complete,
+                self._reconstruction,
+                length,
+                state,
+                corrected,
+                self._values,
+            )
         )
 
     def _take_loose(self, offset: int, data: Bytes) -> None:
@@ -265,7 +278,7 @@ class Decoder:
         kind, place = run[0], ByteRange(start, len(run))
         if kind not in (sections.INDEX, sections.METADATA):
             raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
-        extent = section_extent(run)
+        extent = section_extent(run, start)
         if extent is None or len(run) < extent[1]:
             return
         if len(run) > extent[1]:
@@ -276,6 +289,8 @@ class Decoder:
         elif self.header is not None:
             self.index = index_from(bytes(run), place, self.header)
             self._slices = Slices(self.index)
+            if (state := self._slices.state()) is not None:
+                self._show(*state)
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None
