@@ -1,4 +1,4 @@
-"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, each band in a frame of zeros."""
+"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat, each band in a frame of zeros."""
 
 from __future__ import annotations
 
@@ -107,11 +107,13 @@ def _spread(
     known: NDArray[np.int32], sign: NDArray[np.int8], offset: int, stride: int, plane: int, out: NDArray[np.int32]
 ) -> None:
     middle = reconstruction_point(plane)
+    width = out.shape[1]
     for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            at = offset + i * stride + j
-            high = known[at] >> plane
-            out[i, j] = int(sign[at]) * ((high << plane) + middle) if high else 0
+        start = offset + i * stride
+        magnitudes, signs, row = known[start : start + width], sign[start : start + width], out[i]
+        for j in range(width):
+            high = np.int32((magnitudes[j] >> plane) << plane)
+            row[j] = np.int32(signs[j]) * np.int32(high + middle) if high else 0
 
 
 def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -119,7 +121,7 @@ def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int3
     flat = np.zeros(table.size, np.int32)
     for number, tile in enumerate(table.layout.tiles):
         for band, row in zip(tile.bands, table.of_tile(number), strict=True):
-            place, stride, height, width = (int(x) for x in row[:4])
+            place, stride, height = (int(x) for x in row[:3])
             start = place - stride - 1
             frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
             frame[1:-1, 1:-1] = _window(coefficients, band)
