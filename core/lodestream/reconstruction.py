@@ -15,7 +15,7 @@ from .bitplanes import code_planes, new_model
 from .container.model import Header
 from .errors import CorruptStreamError
 from .tiles import Tiles, TileTable
-from .transform import allocate, inverse
+from .transform import COEFFICIENT_BITS, allocate, inverse
 
 __all__ = ["Coded", "Progress", "Reconstruction", "to_points"]
 
@@ -38,8 +38,8 @@ class Coded:
 class Reconstruction:
     """Decodes segments when a picture asks for them, in the order in which they were added.
 
-    A *state* is the lowest plane known of every tile and channel: int8, shape (tile, channel), the tile's ``top`` where
-    nothing is known. States that lie behind what was decoded are pictures too: bits below a state's planes are ignored.
+    A *state* is the lowest plane known of every tile and channel: int8, shape (tile, channel); where nothing is known, the
+    tile's ``top`` or more. States that lie behind what was decoded are pictures too: bits below a state's planes are ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -127,7 +127,8 @@ class Progress:
     def __init__(self, header: Header) -> None:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
-        self.state = np.zeros(shape, np.int8)
+        # Above every plane: a state holds nothing of a tile that comes later.
+        self.state = np.full(shape, COEFFICIENT_BITS, np.int8)
 
     def advance(self, tile: int, channel: int, top: int, planes: int, offset: int) -> int:
         """Note a segment; returns the first of its planes.
