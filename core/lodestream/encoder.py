@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import exactness
 from .allocation import TileCurve, assign_layers
-from .bitplanes import code_planes, new_model, plane_gains
+from .bitplanes import code_passes, new_model, pass_count, pass_gains
 from .container.model import Header
 from .container.sections import TILE_BITS
 from .container.writer import CodedLayer, CodedSegment, write_container
@@ -166,29 +166,28 @@ class _Encoding:
         return largest.bit_length()
 
     def _curves(self) -> list[TileCurve]:
-        """Cost and gain of every plane, by coding each tile once as a whole."""
-        coder = _TileCoder(self.table, self.channels)
+        """Cost and gain of every pass, by coding each tile once as a whole."""
+        coder = self._whole = _TileCoder(self.table, self.channels)
         curves = []
         for tile in range(len(self.layout.tiles)):
             for number, channel in enumerate(self.channels):
                 top = int(channel.top[tile])
                 if top:
-                    costs = np.zeros(top, np.float64)
-                    coder.code(tile, number, top, top, costs)
-                    bits = np.diff(costs[::-1], prepend=32.0 - 32.0)[::-1]
-                    gains = np.zeros(top + 1, np.float64)
+                    passes = pass_count(top)
+                    costs = np.zeros(passes, np.float64)
+                    coder.code(tile, number, passes, passes, costs)
+                    bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+                    errors = np.zeros(passes + 1, np.float64)
                     first, last = self.table.first[tile], self.table.first[tile + 1]
-                    plane_gains(self.table.bands[first:last], channel.weights[first:last], top, channel.true, gains)
-                    curves.append(TileCurve(tile, number, bits, -np.diff(gains[::-1])[::-1]))
+                    early, weights = coder.tiles[number].early, channel.weights[first:last]
+                    pass_gains(self.table.bands[first:last], weights, passes, channel.true, early, errors)
+                    curves.append(TileCurve(tile, number, bits, np.diff(errors)))
         return curves
 
     def _picture(self, state: State, level: int | None = None) -> NDArray[Any]:
         """What a receiver shows that knows this state: of all levels, or up to one and nothing finer."""
         pictures = []
-        for number, channel in enumerate(self.channels):
-            tiles = Tiles(self.table)
-            np.abs(channel.true, out=tiles.known)
-            np.sign(channel.true, out=tiles.sign, casting="unsafe")
+        for number, tiles in enumerate(self._whole.tiles):
             coefficients = allocate(self.surface.shape)
             for tile, place in enumerate(self.layout.tiles):
                 if level is None or place.level <= level:
@@ -213,11 +212,15 @@ class _Encoding:
 
     def _level_figures(self, last: Figures) -> list[Figures]:
         """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
-        complete = np.zeros((len(self.layout.tiles), len(self.channels)), np.int8)
+        complete = np.zeros_like(self._all_passes())
         return [
             distances(self.points, self._picture(complete, level), self.geometric)
             for level in range(self.layout.levels)
         ] + [last]
+
+    def _all_passes(self) -> State:
+        """Passes of every tile and channel."""
+        return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
 
     def _correction(self, last: Figures) -> bytes:
         """The exactness section's payload; empty where the lattice is exact or a precision was asked for."""
@@ -226,18 +229,17 @@ class _Encoding:
         return b"" if self.precision is not None else delta
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
-        """Code the planes that each layer adds."""
+        """Code the passes that each layer adds."""
         coder = _TileCoder(self.table, self.channels)
-        before = np.stack([channel.top for channel in self.channels], axis=1)
-        top = before
+        before = start = self._all_passes()
         layers = []
         for state, (rms, worst) in zip(states, figures, strict=True):
             segments = []
             for tile, number in np.argwhere(state < before):
                 first, last = int(before[tile, number]), int(state[tile, number])
                 data = coder.code(int(tile), int(number), first, first - last)
-                started = int(top[tile, number])
-                segments.append(CodedSegment(int(tile), int(number), started, first - last, first == started, data))
+                top, begins = int(self.channels[number].top[tile]), first == start[tile, number]
+                segments.append(CodedSegment(int(tile), int(number), top, first - last, bool(begins), data))
             layers.append(CodedLayer(rms, worst, segments))
             before = state
         return layers
@@ -249,26 +251,27 @@ class _TileCoder:
     def __init__(self, table: TileTable, channels: list[_Channel]) -> None:
         self._table = table
         self._channels = channels
-        self._tiles = [Tiles(table) for _ in channels]
+        self.tiles = [Tiles(table) for _ in channels]
         self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
     def code(
-        self, tile: int, channel: int, first: int, planes: int, costs: NDArray[np.float64] | None = None
+        self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None
     ) -> bytes:
-        """The bytes of ``planes`` planes below ``first`` of a tile."""
+        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
         model = self._models.setdefault((tile, channel), new_model())
-        tiles, rows = self._tiles[channel], self._table.of_tile(tile)
+        tiles, rows = self.tiles[channel], self._table.of_tile(tile)
         coefficients = int((rows[:, 2] * rows[:, 3]).sum())
         # A decision takes at most 11 bits (a chance of 32 in 2**16); a coefficient decides twice in a plane at the most.
-        data = np.empty(64 + 3 * planes * coefficients, np.uint8)
-        length = code_planes(
+        data = np.empty(64 + 3 * passes * coefficients, np.uint8)
+        length = code_passes(
             False,
             rows,
             first - 1,
-            first - planes,
+            first - passes,
             tiles.known,
             tiles.sign,
             tiles.flags,
+            tiles.early,
             self._channels[channel].true,
             model,
             data,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import exactness
-from .bitplanes import code_planes, new_model
+from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
 from .errors import CorruptStreamError
 from .tiles import Tiles, TileTable
@@ -25,12 +25,12 @@ _NO_TRUTH = np.zeros(0, np.int32)
 
 @dataclass(frozen=True)
 class Coded:
-    """A segment with its bytes: ``planes`` planes of a tile down from ``first``; ``offset`` is its place."""
+    """A segment with its bytes: ``passes`` passes of a tile down from ``first``; ``offset`` is its place."""
 
     tile: int
     channel: int
     first: int
-    planes: int
+    passes: int
     data: bytes
     offset: int
 
@@ -38,8 +38,8 @@ class Coded:
 class Reconstruction:
     """Decodes segments when a picture asks for them, in the order in which they were added.
 
-    A *state* is the lowest plane known of every tile and channel: int8, shape (tile, channel), the tile's ``top`` where
-    nothing is known. States that lie behind what was decoded are pictures too: bits below a state's planes are ignored.
+    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel).
+    States that lie behind what was decoded are pictures too: what later passes told is ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -102,56 +102,57 @@ class Reconstruction:
             key = segment.tile, segment.channel
             tiles = self._tiles[segment.channel]
             model = self._models.setdefault(key, new_model())
-            code_planes(
+            code_passes(
                 True,
                 table.of_tile(segment.tile),
                 segment.first,
-                segment.first - segment.planes + 1,
+                segment.first - segment.passes + 1,
                 tiles.known,
                 tiles.sign,
                 tiles.flags,
+                tiles.early,
                 _NO_TRUTH,
                 model,
                 np.frombuffer(segment.data, np.uint8).copy(),
                 _NO_COSTS,
             )
-            if segment.first < segment.planes:
+            if segment.first < segment.passes:
                 del self._models[key]
-            self._queue[self._taken] = Coded(*key, segment.first, segment.planes, b"", segment.offset)
+            self._queue[self._taken] = Coded(*key, segment.first, segment.passes, b"", segment.offset)
             self._taken += 1
 
 
 class Progress:
-    """Which planes of each tile have been announced so far, and whether a segment continues them."""
+    """Which passes of each tile have been announced so far, and whether a segment continues them."""
 
     def __init__(self, header: Header) -> None:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
         self.state = np.zeros(shape, np.int8)
 
-    def advance(self, tile: int, channel: int, top: int, planes: int, offset: int) -> int:
-        """Note a segment; returns the first of its planes.
+    def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
+        """Note a segment; returns the first of its passes.
 
         Parameters
         ----------
         top : int
-            Planes of the tile, told with its first segment; 0 with the others.
+            Bit-planes of the tile, told with its first segment; 0 with the others.
 
         Raises
         ------
         CorruptStreamError
-            When the tile was not announced, was announced already, or has not so many planes left.
+            When the tile was not announced, was announced already, or has not so many passes left.
         """
         known = int(self.top[tile, channel])
         if bool(top) == bool(known):
             problem = "told again" if known else "not told"
             raise CorruptStreamError(f"expected the planes of tile {tile} once, with its first segment: {problem}", offset)
         if top:
-            self.top[tile, channel] = self.state[tile, channel] = top
+            self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
         below = int(self.state[tile, channel])
-        if planes > below:
-            raise CorruptStreamError(f"expected at most {below} more planes of tile {tile}, got {planes}", offset)
-        self.state[tile, channel] = below - planes
+        if passes > below:
+            raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
+        self.state[tile, channel] = below - passes
         return below - 1
 
 

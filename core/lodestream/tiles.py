@@ -80,22 +80,23 @@ class TileTable:
 
 
 class Tiles:
-    """Magnitudes, signs and block flags of one channel."""
+    """Magnitudes, signs, block flags and marks of first passes of one channel, see `bitplanes.code_passes`."""
 
     def __init__(self, table: TileTable) -> None:
         self.table = table
         self.known = np.zeros(table.size, np.int32)
         self.sign = np.zeros(table.size, np.int8)
         self.flags = np.zeros(table.blocks, np.uint8)
+        self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, plane: int, coefficients: NDArray[np.int32]) -> None:
-        """Put a tile's coefficients, as far as they are known down to ``plane``, into the array of all coefficients.
+    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32]) -> None:
+        """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
 
-        Unknown bits are replaced by the reconstruction point; planes below ``plane`` count as unknown even where they
-        are known.
+        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
         """
         for band, row in zip(self.table.layout.tiles[tile].bands, self.table.of_tile(tile), strict=True):
-            _spread(self.known, self.sign, row[0], row[1], plane, _window(coefficients, band))
+            window = _window(coefficients, band)
+            _spread(self.known, self.sign, self.early, row[0], row[1], remaining, window)
 
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
@@ -104,14 +105,28 @@ def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
 
 @kernel
 def _spread(
-    known: NDArray[np.int32], sign: NDArray[np.int8], offset: int, stride: int, plane: int, out: NDArray[np.int32]
+    known: NDArray[np.int32],
+    sign: NDArray[np.int8],
+    early: NDArray[np.uint8],
+    offset: int,
+    stride: int,
+    remaining: int,
+    out: NDArray[np.int32],
 ) -> None:
-    middle = reconstruction_point(plane)
+    half = remaining & 1
+    begun = remaining >> 1  # the plane whose first pass is the last one known, if half
+    plane = begun + half
+    middle, middle_begun = reconstruction_point(plane), (1 << begun) + reconstruction_point(begun)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             at = offset + i * stride + j
             high = known[at] >> plane
-            out[i, j] = int(sign[at]) * ((high << plane) + middle) if high else 0
+            if high:
+                out[i, j] = int(sign[at]) * ((high << plane) + middle)
+            elif half and early[at] == begun + 1 and known[at] >> begun:
+                out[i, j] = int(sign[at]) * middle_begun
+            else:
+                out[i, j] = 0
 
 
 def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:

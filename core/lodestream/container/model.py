@@ -122,7 +122,7 @@ class LevelRecord:
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of ``planes`` bit-planes that one tile of one channel adds in one layer.
+    """A run of ``passes`` coding passes that one tile of one channel adds in one layer.
 
     ``top`` is the number of bit-planes of the tile, told with its first segment and repeated here.
     """
@@ -131,7 +131,7 @@ class Segment:
     tile: int
     channel: int
     top: int
-    planes: int
+    passes: int
     range: ByteRange
     crc: int
 
