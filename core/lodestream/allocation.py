@@ -19,6 +19,7 @@ __all__ = ["MOST_LAYERS", "TileCurve", "assign_layers", "hull_slopes"]
 MOST_LAYERS = 24
 _FIRST_LAYER = 48  # bytes of coefficients in the first layer
 _LEAST_GROWTH = 1.2
+_LAST_LOSSY = 0.92
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,8 @@ def _layer_ends(sizes: NDArray[np.float64]) -> list[int]:
     total = float(sizes[-1])
     first = min(_FIRST_LAYER, total)
     count = min(MOST_LAYERS, 1 + int(np.log(total / first) / np.log(_LEAST_GROWTH)))
-    targets = np.geomspace(first, total, count)
+    # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
+    targets = np.append(np.geomspace(first, max(first, _LAST_LOSSY * total), max(count - 1, 1)), total)
     ends = np.searchsorted(sizes, targets * (1 - 1e-12)) + 1
     ends[-1] = sizes.size
     return [int(end) for end in np.unique(np.minimum(ends, sizes.size))]

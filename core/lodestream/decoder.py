@@ -250,7 +250,8 @@ class Decoder:
 
     def _show(self, number: int, level: int, held: int, rms: float, max_error: float, complete: bool) -> None:
         corrected = complete and self.header is not None and self.header.corrected
-        length, state = self._reconstruction.length, self._progress.state.copy()
+        whole = self.header is not None and (complete or number == self.header.layer_count - 1 and level == self.header.levels)
+        length, state = self._reconstruction.length, self._progress.snapshot(whole)
         self.layers.append(
             View(number, level, held, rms, max_error, complete, self._reconstruction, length, state, corrected, self._values)
         )

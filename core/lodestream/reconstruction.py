@@ -14,10 +14,10 @@ from . import exactness
 from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
 from .errors import CorruptStreamError
-from .tiles import Tiles, TileTable
+from .tiles import UNANNOUNCED, Tiles, TileTable
 from .transform import allocate, inverse
 
-__all__ = ["Coded", "Progress", "Reconstruction", "to_points"]
+__all__ = ["Coded", "Progress", "Reconstruction", "channel_picture", "initial_state", "to_points"]
 
 _NO_COSTS = np.zeros(0, np.float64)
 _NO_TRUTH = np.zeros(0, np.int32)
@@ -38,8 +38,8 @@ class Coded:
 class Reconstruction:
     """Decodes segments when a picture asks for them, in the order in which they were added.
 
-    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel).
-    States that lie behind what was decoded are pictures too: what later passes told is ignored.
+    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
+    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes told is ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -75,15 +75,10 @@ class Reconstruction:
         """
         with self._lock:
             self._decode(length)
-            table = self._layout_table()
-            channels = []
-            for channel, tiles in enumerate(self._tiles):
-                coefficients = allocate(self.header.layout.shapes[level])
-                for number, tile in enumerate(table.layout.tiles):
-                    if tile.level <= level:
-                        tiles.spread(number, int(state[number, channel]), coefficients)
-                inverse(coefficients, table.layout, self.header.predictors[channel], level)
-                channels.append(coefficients)
+            channels = [
+                channel_picture(self.header, channel, tiles, state[:, channel], level)
+                for channel, tiles in enumerate(self._tiles)
+            ]
         points = to_points(self.header, channels)
         if corrected and self._correction is not None:
             points = exactness.restore(points, *self._correction)
@@ -128,7 +123,7 @@ class Progress:
     def __init__(self, header: Header) -> None:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
-        self.state = np.zeros(shape, np.int8)
+        self.state = initial_state(header)
 
     def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
         """Note a segment; returns the first of its passes.
@@ -144,6 +139,8 @@ class Progress:
             When the tile was not announced, was announced already, or has not so many passes left.
         """
         known = int(self.top[tile, channel])
+        if not known and self.state[tile, channel] == 0:
+            raise CorruptStreamError(f"expected no segment of tile {tile}, whose level has zeros only", offset)
         if bool(top) == bool(known):
             problem = "told again" if known else "not told"
             raise CorruptStreamError(f"expected the planes of tile {tile} once, with its first segment: {problem}", offset)
@@ -155,12 +152,46 @@ class Progress:
         self.state[tile, channel] = below - passes
         return below - 1
 
+    def snapshot(self, whole: bool) -> NDArray[np.int8]:
+        """The present state; a tile that no layer announces has nothing but zeros, which the ``whole`` of them tells."""
+        return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
 
-def to_points(header: Header, channels: Sequence[NDArray[np.int32]]) -> NDArray[Any]:
-    """Values of lattice coordinates, one array (row, column) a channel, in the surface's dtype and axes."""
+
+def initial_state(header: Header) -> NDArray[np.int8]:
+    """The state before the first layer: of the levels without a coefficient other than 0 everything is known."""
+    levels = np.array([tile.level for tile in header.layout.tiles])
+    known = (np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1
+    return np.where(known.astype(bool), 0, UNANNOUNCED).astype(np.int8)
+
+
+def channel_picture(
+    header: Header, channel: int, tiles: Tiles, state: NDArray[np.int8], level: int
+) -> tuple[NDArray[np.int32], int]:
+    """One channel of the grid of ``level`` in a state.
+
+    Returns
+    -------
+    (int32 array, shape (row, column), int)
+        Lattice coordinates over two to the power of the second.
+    """
+    layout = header.layout
+    whole = 0
+    while whole < level and not state[layout.tiles_of(whole + 1)].any():
+        whole += 1
+    fraction = header.fraction if whole < level else 0
+    coefficients = allocate(layout.shapes[level])
+    for number in range(layout.tiles_of(level).stop):
+        finer = fraction if layout.tiles[number].level > whole else 0
+        tiles.spread(number, int(state[number]), finer, coefficients)
+    inverse(coefficients, layout, header.predictors[channel], level, whole, fraction)
+    return coefficients, fraction
+
+
+def to_points(header: Header, channels: Sequence[tuple[NDArray[np.int32], int]]) -> NDArray[Any]:
+    """Values of each `channel_picture`, in the surface's dtype and axes."""
     if header.flat:
-        return header.lattices[0].values(channels[0], header.dtype)
-    points = np.empty((*channels[0].shape, len(channels)), header.dtype)
-    for number, (lattice, coordinates) in enumerate(zip(header.lattices, channels, strict=True)):
-        points[..., number] = lattice.values(coordinates, header.dtype)
+        return header.lattices[0].values(channels[0][0], header.dtype, channels[0][1])
+    points = np.empty((*channels[0][0].shape, len(channels)), header.dtype)
+    for number, (lattice, (coordinates, fraction)) in enumerate(zip(header.lattices, channels, strict=True)):
+        points[..., number] = lattice.values(coordinates, header.dtype, fraction)
     return points

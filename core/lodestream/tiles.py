@@ -11,8 +11,10 @@ from .bitplanes import BAND_FIELDS, reconstruction_point
 from .kernels import kernel
 from .layout import Band, Layout
 
-__all__ = ["TileTable", "Tiles"]
+__all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
 
+#: Passes that remain of a tile that was not announced: more than any tile has.
+UNANNOUNCED = 57
 _NO_SHIFT = 31  # takes any row or column to 0, where a band without a parent finds a zero
 
 
@@ -89,14 +91,15 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32]) -> None:
+    def spread(self, tile: int, remaining: int, fraction: int, coefficients: NDArray[np.int32]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
 
-        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
+        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown. The
+        numbers are multiplied by 2**fraction.
         """
         for band, row in zip(self.table.layout.tiles[tile].bands, self.table.of_tile(tile), strict=True):
             window = _window(coefficients, band)
-            _spread(self.known, self.sign, self.early, row[0], row[1], remaining, window)
+            _spread(self.known, self.sign, self.early, row[0], row[1], remaining, fraction, window)
 
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
@@ -111,6 +114,7 @@ def _spread(
     offset: int,
     stride: int,
     remaining: int,
+    fraction: int,
     out: NDArray[np.int32],
 ) -> None:
     half = remaining & 1
@@ -122,9 +126,9 @@ def _spread(
             at = offset + i * stride + j
             high = known[at] >> plane
             if high:
-                out[i, j] = int(sign[at]) * ((high << plane) + middle)
+                out[i, j] = int(sign[at]) * ((high << plane) + middle) << fraction
             elif half and early[at] == begun + 1 and known[at] >> begun:
-                out[i, j] = int(sign[at]) * middle_begun
+                out[i, j] = int(sign[at]) * middle_begun << fraction
             else:
                 out[i, j] = 0
 

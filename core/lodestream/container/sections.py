@@ -26,6 +26,7 @@ __all__ = [
     "LAYER",
     "MAGIC",
     "METADATA",
+    "MOST_FRACTION",
     "OPTIONAL",
     "TILE_BITS",
     "VERSION",
@@ -57,6 +58,8 @@ LARGEST_SURFACE = 2**31
 #: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
 _LARGEST_FILE = 2**62
+#: Most binary places between lattice steps.
+MOST_FRACTION = 6
 _DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 _RULES = ("affine", "decimal")
 
@@ -89,10 +92,13 @@ def serialize_header(header: Header) -> bytes:
     for number in (*header.shape, header.channels, header.layer_count):
         out.varint(number)
     out.byte(header.tile[0] | header.tile[1] << 4)
+    out.byte(header.fraction)
     out.pack("d", header.extent)
     for lattice in header.lattices:
         out.byte(_RULES.index(lattice.rule))
         out.pack("dd", lattice.origin, lattice.step)
+    for levels in header.empty:
+        out.varint(levels)
     fitted = fitted_steps(header.layout)
     for predictors in header.predictors:
         for level, axis in fitted:
@@ -117,6 +123,9 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     tile = exponents & 15, exponents >> 4
     if sum(tile) != TILE_BITS or min(tile) < 1:
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
+    fraction = fields.byte()
+    if fraction > MOST_FRACTION:
+        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
     (extent,) = fields.unpack("d")
     lattices = []
     for _ in range(channels):
@@ -129,6 +138,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     closed = bool(flags & 1), bool(flags & 2)
     layout = Layout(shape, closed, tile)
+    empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
     fitted = fitted_steps(layout)
     predictors = np.stack([default_predictors(layout)] * channels)
     for channel in range(channels):
@@ -145,6 +155,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         lattices=tuple(lattices),
         predictors=predictors,
         extent=extent,
+        fraction=fraction,
+        empty=empty,
         tile=tile,
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
