@@ -31,8 +31,10 @@ def build_parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for module in _MODULES:
         module.register(subparsers)
-    for entry in sorted(entry_points(group="lodestream.commands"), key=lambda entry: entry.name):
-        _register(entry, subparsers)
+    # By name: a second, stale installation on the path may announce the same.
+    found = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
+    for name in sorted(found):
+        _register(found[name], subparsers)
     return parser
 
 

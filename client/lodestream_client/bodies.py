@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeAlias, TypeGuard, cast
 
 from lodestream.errors import OptionError
 from lodestream.target import Tolerance
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Body", "Closure", "Source", "opened", "surface_parameters"]
 
-#: What can be uploaded: a file by its name, the bytes of one, or a surface in memory.
-Source: TypeAlias = "str | os.PathLike[str] | bytes | Surface"
+#: What can be uploaded: a file by its name, one that is open, the bytes of one, or a surface in memory.
+Source: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes | Surface"
 #: Which axes of a grid wrap, in the words of the command line.
 Closure = Literal["auto", "none", "rows", "cols", "both"]
 
@@ -108,9 +108,16 @@ def opened(sources: Sequence[Source], sent: Callable[[float], None] | None = Non
             elif isinstance(source, str | os.PathLike):
                 path = Path(source)
                 files.append((path.name, stack.enter_context(path.open("rb"))))
-            else:
+            elif _is_surface(source):
                 files.append(("surface.npy", _as_npy(source)))
+            else:
+                files.append(("", cast("BinaryIO", source)))
         yield Body(files, sent)
+
+
+def _is_surface(source: Source) -> TypeGuard[Surface]:
+    """Whether this is a surface in memory; known without importing what surfaces are made of."""
+    return hasattr(source, "points")
 
 
 def _as_npy(surface: Surface) -> BinaryIO:
@@ -140,7 +147,7 @@ def surface_parameters(
     """
     parameters: dict[str, str] = {}
     for source in sources:
-        if not isinstance(source, str | os.PathLike | bytes):
+        if _is_surface(source):
             closed = _CLOSURES[source.closed] if closed == "auto" else closed
             name = name or source.metadata.get("name")
     if precision is not None:

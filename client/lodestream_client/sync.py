@@ -15,6 +15,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -48,8 +49,10 @@ class Stream(BaseStream):
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect as connect_socket
 
+        # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
+        self._held = ExitStack()
         try:
-            self._socket = connect_socket(addresses.stream_url(self.url), **self._options())
+            self._socket = self._held.enter_context(connect_socket(addresses.stream_url(self.url), **self._options()))
         except (OSError, WebSocketException) as error:
             raise problems.from_connection(error, self.url) from error
         # The download is told things by whoever iterates and by whoever stops, which may be two threads.
@@ -59,7 +62,7 @@ class Stream(BaseStream):
             self._tick()
             self._send()
         except BaseException:
-            self._socket.close()
+            self._held.close()
             raise
 
     def __iter__(self) -> Iterator[View]:
@@ -106,7 +109,7 @@ class Stream(BaseStream):
 
     def _abandon(self) -> None:
         self._abandoned = True
-        self._socket.close()
+        self._held.close()
 
     def _exchange(self, patience: float) -> None:
         message = self._receive(patience)
@@ -164,7 +167,7 @@ class Stream(BaseStream):
         except (TimeoutError, ConnectionClosed):
             pass
         finally:
-            self._socket.close()
+            self._held.close()
 
 
 def connect(
@@ -230,8 +233,8 @@ def upload(
     ----------
     url : str
         The server's address.
-    *sources : str, path, bytes or Surface
-        One file, or several that make one surface; the bytes of one; a surface in memory.
+    *sources : str, path, binary file, bytes or Surface
+        One file, or several that make one surface; one that is open; the bytes of one; a surface in memory.
     precision : Tolerance, float, str or None
         Greatest error of the complete surface; None for a lossless one.
     closed : "auto", "none", "rows", "cols" or "both"

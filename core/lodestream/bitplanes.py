@@ -51,6 +51,8 @@ _FIRST_FLAG = _MAGNITUDE_CONTEXTS + _SIGN_CONTEXTS
 _MASK = 0xFFFFFFFF
 _BOTTOM = 1 << 24
 _HALF = 1 << 15
+# An index known to be positive spares the compiled loop the test for one that counts from the end.
+_INDEX = 0x7FFFFFFF
 #: Class of a sum of neighbours, in halves of the plane's unit.
 _SUM_CLASS = np.array(
     [0, 1, 2, 3, 4, 5, 6, 7, 7, 8, 8, 8, 9, 9, 9, 9, 9, 10, 10, 10, 10, 10, 10, 10, 10, 10, 10] + [11] * 37, np.int64
@@ -66,66 +68,64 @@ def pass_count(planes: int) -> int:
 
 
 def new_model() -> NDArray[np.int32]:
-    """The contexts of a tile before its first plane: int32, shape (context, 3): fast and slow probability, count."""
-    model = np.full((CONTEXTS, 3), _HALF, np.int32)
-    model[:, 2] = 0
-    return model
+    """The contexts of a tile before its first plane: int32, flat; four each: fast and slow probability, count, 0."""
+    model = np.full((CONTEXTS, 4), _HALF, np.int32)
+    model[:, 2:] = 0
+    return model.reshape(-1)
 
 
 @kernel
-def _probability(model: NDArray[np.int32], context: int) -> int:
-    """Probability of a 1 over 2**16, within 32 ... 2**16 - 32."""
-    return min(max((int(model[context, 0]) + int(model[context, 1])) >> 1, 32), 65504)
-
-
-@kernel
-def _learn(model: NDArray[np.int32], context: int, bit: int) -> None:
-    fast, slow, count = int(model[context, 0]), int(model[context, 1]), int(model[context, 2])
-    target = 65535 if bit else 0
-    model[context, 0] = fast + ((target - fast) >> _FAST[count])
-    model[context, 1] = slow + ((target - slow) >> _SLOW[count])
-    model[context, 2] = min(count + 1, 255)
+def _carry(place: int, data: NDArray[np.uint8]) -> None:
+    """Add 1 to the number that ends before ``place``."""
+    back = place - 1
+    while data[back] == 255:
+        data[back] = 0
+        back -= 1
+    data[back] += np.uint8(1)
 
 
 @kernel
 def _code(
-    decoding: bool, bit: int, chance: int, low: int, width: int, place: int, data: NDArray[np.uint8]
+    decoding: bool,
+    bit: int,
+    low: int,
+    width: int,
+    place: int,
+    data: NDArray[np.uint8],
+    model: NDArray[np.int32],
+    context: int,
 ) -> tuple[int, int, int, int]:
-    """Code one bit whose chance of being 1 is ``chance`` over 2**16; returns bit, low, width, place.
+    """Code one bit in a context and let the context learn it; returns bit, low, width, place.
 
-    Writing, ``low`` is the interval's lower end and a carry runs back into bytes already written; reading, it is the
-    distance of the data from that end. Bytes past the end of the data are zeros.
+    The chance of a 1 is the mean of the context's two probabilities, over 2**16, within 32 ... 2**16 - 32. Writing,
+    ``low`` is the interval's lower end and a carry runs back into bytes already written; reading, it is the distance
+    of the data from that end. Bytes past the end of the data are zeros.
     """
-    bound = (width >> 16) * chance
+    slot = (context << 2) & _INDEX
+    fast, slow, count = int(model[slot]), int(model[slot | 1]), int(model[slot | 2])
+    bound = (width >> 16) * min(max((fast + slow) >> 1, 32), 65504)
     if decoding:
         bit = 1 if low < bound else 0
-        if bit:
-            width = bound
-        else:
-            low -= bound
-            width -= bound
-        while width < _BOTTOM:
-            low = low << 8
-            if place < data.size:
-                low |= int(data[place])
-            place += 1
-            width <<= 8
+        low = low if bit else low - bound
     else:
-        if bit:
-            width = bound
-        else:
-            low += bound
-            width -= bound
-        if low > _MASK:
+        low = low if bit else low + bound
+    width = bound if bit else width - bound
+    target = 65535 if bit else 0
+    model[slot] = fast + ((target - fast) >> int(_FAST[count & 255]))
+    model[slot | 1] = slow + ((target - slow) >> int(_SLOW[count & 255]))
+    model[slot | 2] = min(count + 1, 255)
+    if width < _BOTTOM:
+        if not decoding and low > _MASK:
             low &= _MASK
-            back = place - 1
-            while data[back] == 255:
-                data[back] = 0
-                back -= 1
-            data[back] += np.uint8(1)
+            _carry(place, data)
         while width < _BOTTOM:
-            data[place] = low >> 24
-            low = (low << 8) & _MASK
+            if decoding:
+                low = low << 8
+                if place < data.size:
+                    low |= int(data[place & _INDEX])
+            else:
+                data[place & _INDEX] = low >> 24
+                low = (low << 8) & _MASK
             place += 1
             width <<= 8
     return bit, low, width, place
@@ -133,18 +133,14 @@ def _code(
 
 @kernel
 def _finish(low: int, width: int, place: int, data: NDArray[np.uint8]) -> int:
-    """Write the fewest bytes that name a number in the interval, leave out zeros at the end; returns the length, at least 1."""
+    """Write the fewest bytes that name a number in the interval, without zeros at the end; returns the length, >= 1."""
     for count in range(5):
         mask = _MASK >> (8 * count)
         value = (low + mask) & ~mask
         if value < low + width:
             if value > _MASK:
                 value &= _MASK
-                back = place - 1
-                while data[back] == 255:
-                    data[back] = 0
-                    back -= 1
-                data[back] += np.uint8(1)
+                _carry(place, data)
             for i in range(count):
                 data[place] = (value >> (24 - 8 * i)) & 255
                 place += 1
@@ -217,78 +213,81 @@ def code_passes(
             rows, columns = bands[band, _ROWS], bands[band, _COLUMNS]
             parent, parent_stride = bands[band, _PARENT], bands[band, _PARENT_STRIDE]
             row_shift, column_shift = bands[band, _ROW_SHIFT], bands[band, _COLUMN_SHIFT]
-            across = (columns + 7) >> 3
-            for block_row in range((rows + 7) >> 3):
-                for block_column in range(across):
-                    block = bands[band, _FLAGS] + block_row * (across + 1) + block_column
-                    if flags[block] == 0:
+            first_flag, across = bands[band, _FLAGS], (columns + 7) >> 3
+            for top in range(0, rows, 8):
+                bottom = min(top + 8, rows)
+                for left in range(0, columns, 8):
+                    right = min(left + 8, columns)
+                    block = first_flag + (top >> 3) * (across + 1) + (left >> 3)
+                    if flags[block & _INDEX] == 0:
                         if begins:
                             continue
-                        family = known[
-                            parent
-                            + ((block_row << 3) >> row_shift) * parent_stride
-                            + ((block_column << 3) >> column_shift)
-                        ]
-                        context = _FIRST_FLAG + 2 * (int(flags[block - 1]) + int(flags[block - across - 1]))
+                        family = known[(parent + (top >> row_shift) * parent_stride + (left >> column_shift)) & _INDEX]
+                        context = _FIRST_FLAG + 2 * (
+                            int(flags[(block - 1) & _INDEX]) + int(flags[(block - across - 1) & _INDEX])
+                        )
                         context += 1 if (family >> plane) != 0 else 0
-                        bit = 0
                         if not decoding:
-                            for i in range(block_row << 3, min((block_row << 3) + 8, rows)):
+                            seen = 0
+                            for i in range(top, bottom):
                                 start = offset + i * stride
-                                for j in range(block_column << 3, min((block_column << 3) + 8, columns)):
-                                    if abs(true[start + j]) >= unit:
-                                        bit = 1
-                        chance = _probability(model, context)
-                        bit, low, width, place = _code(decoding, bit, chance, low, width, place, data)
-                        _learn(model, context, bit)
+                                for j in range(left, right):
+                                    seen |= abs(int(true[(start + j) & _INDEX]))
+                            bit = 1 if seen >= unit else 0
+                        bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
                         if bit == 0:
                             continue
-                        flags[block] = 1
-                    for i in range(block_row << 3, min((block_row << 3) + 8, rows)):
-                        above = offset + (i - 1) * stride
+                        flags[block & _INDEX] = 1
+                    for i in range(top, bottom):
+                        at = offset + i * stride + left
+                        north, south = at - stride, at + stride
                         family_row = parent + (i >> row_shift) * parent_stride
-                        for j in range(block_column << 3, min((block_column << 3) + 8, columns)):
-                            north = above + j
-                            at = north + stride
-                            if (known[at] != 0) if begins else (early[at] == plane + 1):
-                                continue
-                            south = at + stride
-                            total = (
-                                2 * (known[north] + known[south] + known[at - 1] + known[at + 1])
-                                + known[north - 1]
-                                + known[north + 1]
-                                + known[south - 1]
-                                + known[south + 1]
-                            ) >> plane
+                        # Sums of the neighbours above and below, one column back and here; they move along the row.
+                        behind = int(known[(north - 1) & _INDEX]) + int(known[(south - 1) & _INDEX])
+                        here = int(known[north & _INDEX]) + int(known[south & _INDEX])
+                        west, value = int(known[(at - 1) & _INDEX]), int(known[at & _INDEX])
+                        for j in range(left, right):
+                            ahead = int(known[(north + 1) & _INDEX]) + int(known[(south + 1) & _INDEX])
+                            east = int(known[(at + 1) & _INDEX])
+                            total = (behind + 2 * (here + west + east) + ahead) >> plane
                             if begins:
-                                if total == 0:
-                                    continue
-                                early[at] = plane + 1
-                            own = known[at] >> (plane + 1)
-                            family = known[family_row + (j >> column_shift)] >> plane
-                            context = (
-                                (min(own, 2) if own < 4 else 3) * 12 + _SUM_CLASS[min(total, 63)]
-                            ) * 3 + min(family, 2)
-                            if not decoding:
-                                bit = (abs(true[at]) >> plane) & 1
-                            chance = _probability(model, context)
-                            bit, low, width, place = _code(decoding, bit, chance, low, width, place, data)
-                            _learn(model, context, bit)
-                            if bit == 0:
-                                continue
-                            known[at] += unit
-                            if own == 0:
-                                side = min(max(int(sign[at - 1]) + int(sign[at + 1]), -1), 1)
-                                rise = min(max(int(sign[north]) + int(sign[south]), -1), 1)
-                                context = _FIRST_SIGN + 3 * (side + 1) + rise + 1
+                                visits = value == 0 and total != 0
+                                early[at & _INDEX] = plane + 1 if visits else early[at & _INDEX]
+                            else:
+                                visits = early[at & _INDEX] != plane + 1
+                            if visits:
+                                own = value >> (plane + 1)
+                                family = known[(family_row + (j >> column_shift)) & _INDEX] >> plane
+                                context = (
+                                    (min(own, 2) if own < 4 else 3) * 12 + int(_SUM_CLASS[min(total, 63)])
+                                ) * 3 + min(family, 2)
                                 if not decoding:
-                                    bit = 1 if true[at] < 0 else 0
-                                chance = _probability(model, context)
-                                bit, low, width, place = _code(decoding, bit, chance, low, width, place, data)
-                                _learn(model, context, bit)
-                                sign[at] = -1 if bit else 1
+                                    bit = (abs(int(true[at & _INDEX])) >> plane) & 1
+                                bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
+                                if bit:
+                                    value += unit
+                                    known[at & _INDEX] = value
+                                    if own == 0:
+                                        side = int(sign[(at - 1) & _INDEX]) + int(sign[(at + 1) & _INDEX])
+                                        rise = int(sign[north & _INDEX]) + int(sign[south & _INDEX])
+                                        context = _FIRST_SIGN + 3 * (min(max(side, -1), 1) + 1)
+                                        context += min(max(rise, -1), 1) + 1
+                                        if not decoding:
+                                            bit = 1 if true[at & _INDEX] < 0 else 0
+                                        bit, low, width, place = _code(
+                                            decoding, bit, low, width, place, data, model, context
+                                        )
+                                        sign[at & _INDEX] = -1 if bit else 1
+                            west, value = value, east
+                            behind, here = here, ahead
+                            at += 1
+                            north += 1
+                            south += 1
         if costs.size:
             costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
+    if not decoding and low > _MASK:
+        low &= _MASK
+        _carry(place, data)
     return 0 if decoding else _finish(low, width, place, data)
 
 

@@ -91,6 +91,8 @@ class _Encoding:
             precision = Tolerance.parse(precision)
         elif precision is not None and not isinstance(precision, Tolerance):
             precision = Tolerance(float(precision))
+        if precision is not None and precision.relative and not self.extent:
+            precision = None  # a fraction of nothing: one point, which a lattice holds exactly
         self.precision = None if precision is None else precision.absolute(self.extent)
         tile = tile_exponents(surface.shape)
         self.layout = Layout(surface.shape, surface.closed, tile)
@@ -154,10 +156,10 @@ class _Encoding:
         true = gather(self.table, values)
         norms = synthesis_norms(self.layout, predictors)
         spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
-        if number >= self.geometric:
-            # An attribute shares the stream in proportion to its own range.
-            span = extent_of(channel_of(self.points, number), 1)
-            spacing *= self.extent / span if span else 0.0
+        # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
+        # attribute shares the stream in proportion to its own range.
+        span = self.extent if number < self.geometric else extent_of(channel_of(self.points, number), 1)
+        spacing = spacing / span if span else 0.0
         weights = np.array(
             [norms[tile.level, *map(int, band.kind)] * spacing**2 for tile in self.layout.tiles for band in tile.bands]
         )

@@ -5,8 +5,8 @@ Each channel has its own lattice, with either of two rules that float64 arithmet
     affine   value = origin + step * q
     decimal  value = (origin + q) / step       origin and step whole: correctly rounded decimals
 
-and the result is rounded to the dtype of the surface: to nearest for floats, to the nearest integer and into the range
-of the type for integers.
+and the result is rounded to the dtype of the surface, to the nearest float or the nearest integer, and into the range
+of the type.
 """
 
 from __future__ import annotations
@@ -60,8 +60,10 @@ class Lattice:
 def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Round float64 values into a dtype: integers to the nearest, clipped to the range of the type."""
     if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return values.astype(dtype, copy=False)
+        if dtype.itemsize < 8:
+            # A picture on its way may overshoot the largest values of the surface.
+            values = np.clip(values, -float(np.finfo(dtype).max), float(np.finfo(dtype).max))
+        return values.astype(dtype, copy=False)
     limits = np.iinfo(dtype)
     rounded = np.rint(values)
     if dtype.itemsize < 8:
@@ -102,8 +104,7 @@ def _integer_lattice(flat: NDArray[Any], low: int, high: int) -> Lattice | None:
 
 def _binary_lattice(flat: NDArray[Any], sample: NDArray[np.float64], low: float, high: float) -> Lattice | None:
     """The coarsest power of two that divides all values, when it leaves fewer than 2**24 steps."""
-    step = _power_of_two(sample)
-    if (high - low) / step >= 2**LATTICE_BITS:
+    if sample.any() and (high - low) / _power_of_two(sample) >= 2**LATTICE_BITS:
         return None
     step = _power_of_two(flat.astype(np.float64))
     steps = (high - low) / step
@@ -111,7 +112,7 @@ def _binary_lattice(flat: NDArray[Any], sample: NDArray[np.float64], low: float,
 
 
 def _power_of_two(values: NDArray[np.float64]) -> float:
-    """The largest power of two that every value is a whole multiple of."""
+    """The largest power of two that every value is a whole multiple of; not all of them are 0."""
     mantissas, exponents = np.frexp(values[values != 0])
     whole = np.abs(np.ldexp(mantissas, 53)).astype(np.int64)
     trailing = np.log2((whole & -whole).astype(np.float64)).astype(np.int64)

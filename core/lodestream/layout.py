@@ -56,7 +56,7 @@ class Tile:
 def tile_bounds(length: int, exponent: int) -> list[int]:
     """Where tiles of 2**exponent coefficients begin along an axis of so many nodes, and where the last one ends.
 
-    The last tile takes what is less than half a tile with it.
+    The last tile takes what is left with it, up to half a tile.
     """
     size = 1 << exponent
     count = max(1, (length + size // 2 - 1) // size)

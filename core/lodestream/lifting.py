@@ -9,7 +9,12 @@ One step along one axis turns samples x into nodes c and details e (the formulas
     v_k = a (-c_{k+2} + c_{k+1} + c_k - c_{k-1}) + b (-c_{k+3} + c_{k+1} + c_k - c_{k-2})
 
 Every number is an integer that float64 holds exactly (below 2^53), so the order of operations does not matter and
-every machine gets the same result.
+every machine gets the same result. Samples, nodes and details are int32 throughout; the two sums are taken in int32
+where their terms are so small that nothing can overflow (nearly always), and in float64 otherwise.
+
+Samples of an axis are worked on in buffers of their own, in which neighbours along the axis stand ``gap`` apart: 1 for
+a row, `_STRIP` for a strip of columns side by side. Nodes begin at 2 ``gap`` there and details at 10 ``gap``; ``wide``
+is room for a buffer in float64. A closed run of even length has as many midpoints as nodes.
 """
 
 from __future__ import annotations
@@ -28,160 +33,289 @@ REACH = len(TAPS)
 #: Largest magnitude that the inverse hands on after each axis; a full decode never reaches it.
 CLAMP = 2**27
 
-_STRIP = 64  # columns worked on together: their details and nodes stay in the cache
+_STRIP = 64  # columns worked on together
+_i32 = np.int32
+_CLAMP = _i32(CLAMP)
+_DETAIL_CLAMP = _i32(2 * CLAMP)
+_ANY = _i32(2**31 - 1)
 _T0, _T1, _T2, _T3, _T4, _T5, _T6, _T7, _T8, _T9 = (float(tap) / 2**24 for tap in TAPS)
-_CLAMP = float(CLAMP)
-_DETAIL_CLAMP = float(2 * CLAMP)
+# h_j = 2048 high_j + low_j: the magnitudes of the halves sum to 2896 and 3500, so that neither weighted sum of details
+# of at most 2^18 leaves int32 (2 * 3500 * 2^18 + 3/8 2^24 < 2^31).
+_H0, _H1, _H2, _H3, _H4 = (_i32(round(tap / 2048)) for tap in TAPS[:5])
+_L0, _L1, _L2, _L3, _L4 = (_i32(tap - 2048 * round(tap / 2048)) for tap in TAPS[:5])
+_L5, _L6, _L7, _L8, _L9 = (_i32(tap) for tap in TAPS[5:])
+_SMALL = 2**18
+_BIAS = _i32(3 * 2**21)
 
 
 @kernel
-def _extend(rows: NDArray[np.float64], midpoints: int, table: NDArray[np.int64], width: int) -> None:
-    """Fill the ten rows before and after the details, which stand from row 10 on."""
+def _magnitude(values: NDArray[np.int32]) -> int:
+    """Something at least as large as every magnitude, and less than twice the largest."""
+    bits = _i32(0)
+    for i in range(values.size):
+        bits = _i32(bits | values[i] ^ (values[i] >> 31))
+    return int(bits) + 1
+
+
+@kernel
+def _copy(source: NDArray[np.int32], target: NDArray[np.int32]) -> None:
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@kernel
+def _clamp(values: NDArray[np.int32]) -> None:
+    for i in range(values.size):
+        values[i] = min(max(values[i], -_CLAMP), _CLAMP)
+
+
+@kernel
+def _move(outside: NDArray[np.int32], inside: NDArray[np.int32], loads: bool) -> None:
+    if loads:
+        _copy(outside, inside)
+    else:
+        _copy(inside, outside)
+
+
+@kernel
+def _extend(details: NDArray[np.int32], midpoints: int, table: NDArray[np.int64], gap: int) -> None:
+    """Fill the ten places before and after the details."""
     for side in range(20):
-        source, sign = table[side, 0] + 10, float(table[side, 1])
-        target = side if side < 10 else midpoints + side
-        for i in range(width):
-            rows[target, i] = sign * rows[source, i]
+        source, sign = (table[side, 0] + 10) * gap, table[side, 1]
+        target = (side if side < 10 else midpoints + side) * gap
+        for i in range(gap):
+            details[target + i] = sign * details[source + i]
 
 
 @kernel
-def _update(rows: NDArray[np.float64], k: int, out: NDArray[np.float64], width: int) -> None:
-    """Update of node k, from details that stand from row 10 on."""
-    m, p = k + 9, k + 10
-    for i in range(width):
-        out[i] = np.floor(
-            _T0 * (rows[p, i] + rows[m, i])
-            + _T1 * (rows[p + 1, i] + rows[m - 1, i])
-            + _T2 * (rows[p + 2, i] + rows[m - 2, i])
-            + _T3 * (rows[p + 3, i] + rows[m - 3, i])
-            + _T4 * (rows[p + 4, i] + rows[m - 4, i])
-            + _T5 * (rows[p + 5, i] + rows[m - 5, i])
-            + _T6 * (rows[p + 6, i] + rows[m - 6, i])
-            + _T7 * (rows[p + 7, i] + rows[m - 7, i])
-            + _T8 * (rows[p + 8, i] + rows[m - 8, i])
-            + _T9 * (rows[p + 9, i] + rows[m - 9, i])
-            + 0.375
-        )
+def _update(
+    details: NDArray[np.int32], nodes: NDArray[np.int32], wide: NDArray[np.float64], run: int, sign: int, gap: int
+) -> None:
+    """Add ``sign`` times the update to the nodes."""
+    count = run * gap
+    d = details[: count + 19 * gap]
+    c = nodes[2 * gap : count + 2 * gap]
+    if _magnitude(d) <= _SMALL:
+        for i in range(count):
+            s0 = _i32(d[i + 10 * gap] + d[i + 9 * gap])
+            s1 = _i32(d[i + 11 * gap] + d[i + 8 * gap])
+            s2 = _i32(d[i + 12 * gap] + d[i + 7 * gap])
+            s3 = _i32(d[i + 13 * gap] + d[i + 6 * gap])
+            s4 = _i32(d[i + 14 * gap] + d[i + 5 * gap])
+            s5 = _i32(d[i + 15 * gap] + d[i + 4 * gap])
+            s6 = _i32(d[i + 16 * gap] + d[i + 3 * gap])
+            s7 = _i32(d[i + 17 * gap] + d[i + 2 * gap])
+            s8 = _i32(d[i + 18 * gap] + d[i + 1 * gap])
+            s9 = _i32(d[i + 19 * gap] + d[i])
+            high = _i32(_H0 * s0 + _H1 * s1 + _H2 * s2 + _H3 * s3 + _H4 * s4)
+            low = _i32(_L0 * s0 + _L1 * s1 + _L2 * s2 + _L3 * s3 + _L4 * s4 + _L5 * s5 + _L6 * s6 + _L7 * s7)
+            low = _i32(low + _L8 * s8 + _L9 * s9 + _BIAS)
+            c[i] += sign * (_i32(high + (low >> 11)) >> 13)
+    else:
+        w = wide[: d.size]
+        for i in range(d.size):
+            w[i] = d[i]
+        for i in range(count):
+            total = (
+                _T0 * (w[i + 10 * gap] + w[i + 9 * gap])
+                + _T1 * (w[i + 11 * gap] + w[i + 8 * gap])
+                + _T2 * (w[i + 12 * gap] + w[i + 7 * gap])
+                + _T3 * (w[i + 13 * gap] + w[i + 6 * gap])
+                + _T4 * (w[i + 14 * gap] + w[i + 5 * gap])
+                + _T5 * (w[i + 15 * gap] + w[i + 4 * gap])
+                + _T6 * (w[i + 16 * gap] + w[i + 3 * gap])
+                + _T7 * (w[i + 17 * gap] + w[i + 2 * gap])
+                + _T8 * (w[i + 18 * gap] + w[i + 1 * gap])
+                + _T9 * (w[i + 19 * gap] + w[i])
+            )
+            c[i] += sign * _i32(np.floor(total + 0.375))
 
 
 @kernel
-def _surround(nodes: NDArray[np.float64], run: int, wraps: bool, width: int) -> None:
-    """Fill the two rows before and the three after the nodes of a run, which stand from row 2 on."""
-    first, last = 2, run + 1
-    for i in range(width):
+def _surround(nodes: NDArray[np.int32] | NDArray[np.float64], run: int, wraps: bool, gap: int) -> None:
+    """Fill the two places before and the three after the nodes of a run."""
+    first, last = 2 * gap, (run + 1) * gap
+    for i in range(gap):
+        p, q = first + i, last + i
         if wraps:
-            nodes[1, i] = nodes[last, i]
-            nodes[0, i] = nodes[last - 1, i]
-            nodes[last + 1, i] = nodes[first, i]
-            nodes[last + 2, i] = nodes[first + 1, i]
-            nodes[last + 3, i] = nodes[first + 2, i]
+            nodes[p - gap] = nodes[q]
+            nodes[p - 2 * gap] = nodes[q - gap]
+            nodes[q + gap] = nodes[p]
+            nodes[q + 2 * gap] = nodes[p + gap]
+            nodes[q + 3 * gap] = nodes[p + 2 * gap]
         else:
-            nodes[1, i] = 3.0 * nodes[first, i] - 3.0 * nodes[first + 1, i] + nodes[first + 2, i]
-            nodes[0, i] = 3.0 * nodes[1, i] - 3.0 * nodes[first, i] + nodes[first + 1, i]
-            nodes[last + 1, i] = 3.0 * nodes[last, i] - 3.0 * nodes[last - 1, i] + nodes[last - 2, i]
-            nodes[last + 2, i] = 3.0 * nodes[last + 1, i] - 3.0 * nodes[last, i] + nodes[last - 1, i]
+            nodes[p - gap] = 3 * nodes[p] - 3 * nodes[p + gap] + nodes[p + 2 * gap]
+            nodes[p - 2 * gap] = 3 * nodes[p - gap] - 3 * nodes[p] + nodes[p + gap]
+            nodes[q + gap] = 3 * nodes[q] - 3 * nodes[q - gap] + nodes[q - 2 * gap]
+            nodes[q + 2 * gap] = 3 * nodes[q + gap] - 3 * nodes[q] + nodes[q - gap]
 
 
 @kernel
-def _surplus(nodes: NDArray[np.float64], k: int, a: float, b: float, out: NDArray[np.float64], width: int) -> None:
-    """What the third step predicts of detail k, from nodes that stand from row 2 on."""
-    j = k + 2
-    for i in range(width):
-        near = nodes[j, i] + nodes[j + 1, i]
-        out[i] = np.floor(
-            (a * (near - nodes[j - 1, i] - nodes[j + 2, i]) + b * (near - nodes[j - 2, i] - nodes[j + 3, i]) + 128.0)
-            * 0.00390625
-        )
-
-
-@kernel
-def _forward_columns(
-    x: NDArray[np.int32], midpoints: int, run: int, wraps: bool, table: NDArray[np.int64], a: int, b: int
+def _surplus(
+    nodes: NDArray[np.int32],
+    details: NDArray[np.int32],
+    wide: NDArray[np.float64],
+    midpoints: int,
+    run: int,
+    a: int,
+    b: int,
+    sign: int,
+    gap: int,
 ) -> None:
-    """Step along axis 0 in place: nodes to the first rows, details to those after."""
-    length, columns = x.shape
+    """Add ``sign`` times what the third step predicts to the details; where that undoes it, clamp them."""
+    count = midpoints * gap
+    n = nodes[: (run + 5) * gap]
+    d = details[10 * gap : count + 10 * gap]
+    a32, b32, sign32 = _i32(a), _i32(b), _i32(sign)
+    highest = _DETAIL_CLAMP if sign > 0 else _ANY
+    lowest = _i32(-highest)
+    # Nodes extrapolated from ones of at most m are at most 7 m and 25 m.
+    if _magnitude(n[2 * gap : (run + 2) * gap]) * max(10 * abs(a) + 34 * abs(b), 25) < 2**31 - 128:
+        _surround(n, run, midpoints == run, gap)
+        for i in range(count):
+            near = _i32(n[i + 2 * gap] + n[i + 3 * gap])
+            inner = _i32(near - n[i + gap] - n[i + 4 * gap])
+            outer = _i32(near - n[i] - n[i + 5 * gap])
+            v = _i32(a32 * inner + b32 * outer + 128)
+            e = _i32(d[i] + sign32 * (v >> 8))
+            d[i] = min(max(e, lowest), highest)
+    else:
+        w = wide[: n.size]
+        for i in range(n.size):
+            w[i] = n[i]
+        _surround(w, run, midpoints == run, gap)
+        for i in range(count):
+            near = w[i + 2 * gap] + w[i + 3 * gap]
+            v = a * (near - w[i + gap] - w[i + 4 * gap]) + b * (near - w[i] - w[i + 5 * gap])
+            f = d[i] + sign * np.floor((v + 128.0) * 0.00390625)
+            d[i] = _i32(min(max(f, float(lowest)), float(highest)))
+
+
+@kernel
+def _predict(
+    nodes: NDArray[np.int32], details: NDArray[np.int32], midpoints: int, run: int, sign: int, gap: int
+) -> None:
+    """Add ``sign`` times the means of neighbouring nodes to the details; where that undoes it, clamp both."""
+    count = midpoints * gap
+    n = nodes[2 * gap : (run + 3) * gap]
+    d = details[10 * gap : count + 10 * gap]
+    if midpoints == run:
+        _copy(n[:gap], n[run * gap : (run + 1) * gap])
+    if sign < 0:
+        for i in range(count):
+            d[i] -= _i32(n[i] + n[i + gap]) >> 1
+    else:
+        for i in range(count):
+            d[i] += _i32(n[i] + n[i + gap]) >> 1
+        _clamp(d)
+        _clamp(n[: run * gap])
+
+
+@kernel
+def _lift(
+    nodes: NDArray[np.int32],
+    details: NDArray[np.int32],
+    wide: NDArray[np.float64],
+    midpoints: int,
+    run: int,
+    table: NDArray[np.int64],
+    a: int,
+    b: int,
+    inverse: bool,
+    gap: int,
+) -> None:
+    """The three steps on samples that are in the buffers, or all of them undone."""
+    for turn in range(3):
+        step = 2 - turn if inverse else turn
+        if step == 0:
+            _predict(nodes, details, midpoints, run, 1 if inverse else -1, gap)
+        elif step == 1:
+            _extend(details, midpoints, table, gap)
+            _update(details, nodes, wide, run, -1 if inverse else 1, gap)
+        elif run >= 3 and (a != 0 or b != 0):
+            _surplus(nodes, details, wide, midpoints, run, a, b, 1 if inverse else -1, gap)
+
+
+@kernel
+def _step_columns(
+    x: NDArray[np.int32],
+    pitch: int,
+    columns: int,
+    length: int,
+    midpoints: int,
+    run: int,
+    table: NDArray[np.int64],
+    a: int,
+    b: int,
+    inverse: bool,
+) -> None:
+    """Step along columns in place: nodes to the first rows, details to those after, or back."""
     coarse = length - midpoints
-    predicts = run >= 3 and (a != 0 or b != 0)
-    details = np.empty((midpoints + 20, _STRIP), np.float64)
-    nodes = np.empty((run + 5, _STRIP), np.float64)
-    work = np.empty(_STRIP, np.float64)
-    tail = np.empty(_STRIP, np.int32)
+    nodes = np.zeros((run + 5) * _STRIP, np.int32)
+    details = np.zeros((midpoints + 20) * _STRIP, np.int32)
+    wide = np.empty(max(nodes.size, details.size), np.float64)
+    tail = np.zeros(_STRIP, np.int32)
     for start in range(0, columns, _STRIP):
         width = min(_STRIP, columns - start)
-        for k in range(run):
-            for i in range(width):
-                nodes[k + 2, i] = x[2 * k, start + i]
-        for k in range(midpoints):
-            right = 2 if wraps and k == midpoints - 1 else k + 3
-            for i in range(width):
-                details[k + 10, i] = x[2 * k + 1, start + i] - np.floor((nodes[k + 2, i] + nodes[right, i]) * 0.5)
-        for i in range(width):
-            tail[i] = x[length - 1, start + i]
-        _extend(details, midpoints, table, width)
-        for k in range(run):
-            _update(details, k, work, width)
-            for i in range(width):
-                nodes[k + 2, i] += work[i]
-                x[k, start + i] = np.int32(nodes[k + 2, i])
-        if run < coarse:
-            for i in range(width):
-                x[coarse - 1, start + i] = tail[i]
-        if predicts:
-            _surround(nodes, run, wraps, width)
-        for k in range(midpoints):
-            if predicts:
-                _surplus(nodes, k, float(a), float(b), work, width)
-                for i in range(width):
-                    x[coarse + k, start + i] = np.int32(details[k + 10, i] - work[i])
-            else:
-                for i in range(width):
-                    x[coarse + k, start + i] = np.int32(details[k + 10, i])
+        for loads in (True, False):
+            split = loads == inverse
+            last = start + ((coarse if split else length) - 1) * pitch
+            if run < coarse:
+                _move(x[last : last + width], tail[:width], loads)
+            for k in range(run):
+                at, p = start + (k if split else 2 * k) * pitch, (k + 2) * _STRIP
+                _move(x[at : at + width], nodes[p : p + width], loads)
+            for k in range(midpoints):
+                at, p = start + (coarse + k if split else 2 * k + 1) * pitch, (k + 10) * _STRIP
+                _move(x[at : at + width], details[p : p + width], loads)
+            if loads:
+                _lift(nodes, details, wide, midpoints, run, table, a, b, inverse, _STRIP)
+                if inverse:
+                    _clamp(tail)
 
 
 @kernel
-def _inverse_columns(
-    x: NDArray[np.int32], midpoints: int, run: int, wraps: bool, table: NDArray[np.int64], a: int, b: int
+def _step_rows(
+    x: NDArray[np.int32],
+    pitch: int,
+    rows: int,
+    length: int,
+    midpoints: int,
+    run: int,
+    table: NDArray[np.int64],
+    a: int,
+    b: int,
+    inverse: bool,
 ) -> None:
-    """Undo `_forward_columns` in place."""
-    length, columns = x.shape
+    """Step along rows in place, see `_step_columns`."""
     coarse = length - midpoints
-    predicts = run >= 3 and (a != 0 or b != 0)
-    details = np.empty((midpoints + 20, _STRIP), np.float64)
-    nodes = np.empty((run + 5, _STRIP), np.float64)
-    work = np.empty(_STRIP, np.float64)
-    tail = np.empty(_STRIP, np.int32)
-    for start in range(0, columns, _STRIP):
-        width = min(_STRIP, columns - start)
-        for k in range(run):
-            for i in range(width):
-                nodes[k + 2, i] = x[k, start + i]
-        for i in range(width):
-            tail[i] = x[coarse - 1, start + i]
-        if predicts:
-            _surround(nodes, run, wraps, width)
-        for k in range(midpoints):
-            if predicts:
-                _surplus(nodes, k, float(a), float(b), work, width)
-                for i in range(width):
-                    detail = x[coarse + k, start + i] + work[i]
-                    details[k + 10, i] = min(max(detail, -_DETAIL_CLAMP), _DETAIL_CLAMP)
-            else:
-                for i in range(width):
-                    details[k + 10, i] = x[coarse + k, start + i]
-        _extend(details, midpoints, table, width)
-        for k in range(run):
-            _update(details, k, work, width)
-            for i in range(width):
-                nodes[k + 2, i] -= work[i]
-                x[2 * k, start + i] = np.int32(min(max(nodes[k + 2, i], -_CLAMP), _CLAMP))
-        for k in range(midpoints):
-            right = 2 if wraps and k == midpoints - 1 else k + 3
-            for i in range(width):
-                odd = details[k + 10, i] + np.floor((nodes[k + 2, i] + nodes[right, i]) * 0.5)
-                x[2 * k + 1, start + i] = np.int32(min(max(odd, -_CLAMP), _CLAMP))
+    nodes = np.zeros(run + 5, np.int32)
+    details = np.zeros(midpoints + 20, np.int32)
+    wide = np.empty(max(nodes.size, details.size), np.float64)
+    n, d = nodes[2 : run + 2], details[10 : midpoints + 10]
+    for row in range(rows):
+        line = x[row * pitch : row * pitch + length]
+        tail = line[(coarse if inverse else length) - 1]
+        if inverse:
+            tail = min(max(tail, -_CLAMP), _CLAMP)
+            _copy(line[:run], n)
+            _copy(line[coarse:], d)
+        else:
+            for k in range(midpoints):
+                n[k] = line[2 * k]
+                d[k] = line[2 * k + 1]
+            n[run - 1] = line[2 * run - 2]
+        _lift(nodes, details, wide, midpoints, run, table, a, b, inverse, 1)
+        if inverse:
+            for k in range(midpoints):
+                line[2 * k] = n[k]
+                line[2 * k + 1] = d[k]
+            line[2 * run - 2] = n[run - 1]
+        else:
+            _copy(n, line[:run])
+            _copy(d, line[coarse:])
         if run < coarse:
-            for i in range(width):
-                x[length - 1, start + i] = np.int32(min(max(float(tail[i]), -_CLAMP), _CLAMP))
+            line[(length if inverse else coarse) - 1] = tail
 
 
 def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
@@ -189,7 +323,7 @@ def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
 
     Parameters
     ----------
-    values : int32 array, shape (H, W), any strides
+    values : int32 array, shape (H, W)
         Samples in; the coarser level's nodes first and the details after them out, along ``axis``.
     axis : 0 or 1
     step : AxisStep
@@ -197,13 +331,32 @@ def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
     predictor : (int, int)
         The third step's (a, b), at most 127 in magnitude; (0, 0) leaves the paper's bare details.
     """
-    if step.midpoints:
-        columns = values if axis == 0 else values.T
-        _forward_columns(columns, step.midpoints, step.run, step.wraps, step.extension(REACH), *predictor)
+    _step(values, axis, step, predictor, False)
 
 
 def inverse_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
-    """Undo `forward_step` in place; what comes out is within +-`CLAMP`, whatever goes in."""
-    if step.midpoints:
-        columns = values if axis == 0 else values.T
-        _inverse_columns(columns, step.midpoints, step.run, step.wraps, step.extension(REACH), *predictor)
+    """Undo `forward_step` in place; what comes out is within +-`CLAMP`, for any magnitudes below 2^29."""
+    _step(values, axis, step, predictor, True)
+
+
+def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: bool) -> None:
+    if not step.midpoints:
+        return
+    rows, columns = values.shape
+    if axis == 0 and columns < _STRIP // 4:
+        # Too few columns to fill a strip: each is a row of its own.
+        for column in range(columns):
+            line = values[None, :, column].copy()
+            _step(line, 1, step, predictor, inverse)
+            values[:, column] = line[0]
+        return
+    if values.strides[1] != values.itemsize or values.strides[0] < 0:
+        packed = values.copy(order="C")
+        _step(packed, axis, step, predictor, inverse)
+        values[...] = packed
+        return
+    pitch = values.strides[0] // values.itemsize
+    flat = np.lib.stride_tricks.as_strided(values, ((rows - 1) * pitch + columns,), (values.itemsize,))
+    kernel_of_axis, across = (_step_columns, columns) if axis == 0 else (_step_rows, rows)
+    table = step.extension(REACH)
+    kernel_of_axis(flat, pitch, across, step.length, step.midpoints, step.run, table, *predictor, inverse)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,16 +27,40 @@ def distances(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> 
     (float, float)
         In the surface's unit.
     """
+    total, worst = _squares(original, picture, geometric, 1.0)
+    unit = 1.0
+    if not 1e-250 < worst < 1e250:
+        # The squares are too small or too large for float64: measure in a unit of the differences' own size.
+        unit = _largest(original, picture, geometric)
+        if unit == 0.0:
+            return 0.0, 0.0
+        total, worst = _squares(original, picture, geometric, unit)
+    return unit * math.sqrt(total / (original.shape[0] * original.shape[1])), unit * math.sqrt(worst)
+
+
+def _squares(original: NDArray[Any], picture: NDArray[Any], geometric: int, unit: float) -> tuple[float, float]:
+    """Sum and largest of the squared distances, in a unit; infinite where they are too large."""
     total, worst = 0.0, 0.0
+    for delta in _differences(original, picture, geometric):
+        if unit != 1.0:
+            delta /= unit
+        with np.errstate(over="ignore", under="ignore"):
+            squares = delta * delta if delta.ndim == 2 else np.einsum("ijk,ijk->ij", delta, delta)
+            total += float(squares.sum())
+        worst = max(worst, float(squares.max()))
+    return total, worst
+
+
+def _largest(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> float:
+    return max(float(np.abs(delta).max()) for delta in _differences(original, picture, geometric))
+
+
+def _differences(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> Iterator[NDArray[np.float64]]:
     for start in range(0, original.shape[0], _ROWS):
         a, b = original[start : start + _ROWS], picture[start : start + _ROWS]
         if a.ndim == 3:
             a, b = a[..., :geometric], b[..., :geometric]
-        delta = _difference(a, b)
-        squares = delta * delta if delta.ndim == 2 else np.einsum("ijk,ijk->ij", delta, delta)
-        total += float(squares.sum())
-        worst = max(worst, float(squares.max()))
-    return math.sqrt(total / (original.shape[0] * original.shape[1])), math.sqrt(worst)
+        yield _difference(a, b)
 
 
 def _difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
@@ -53,5 +78,5 @@ def extent_of(points: NDArray[Any], geometric: int) -> float:
     if points.ndim == 2:
         return float(points.max()) - float(points.min())
     flat = points[..., :geometric].reshape(-1, geometric)
-    sides = flat.max(axis=0).astype(np.float64) - flat.min(axis=0).astype(np.float64)
-    return float(np.sqrt((sides * sides).sum()))
+    sides = (float(high) - float(low) for low, high in zip(flat.min(axis=0), flat.max(axis=0), strict=True))
+    return math.hypot(*sides)

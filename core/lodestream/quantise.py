@@ -14,6 +14,8 @@ from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
 __all__ = ["channel_of", "choose_lattices"]
 
 _DEFAULT_STEPS = 2.0**20
+#: Sums and differences of pictures on their way to such values do not overflow.
+LARGEST_VALUE = 1e300
 
 
 def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
@@ -45,8 +47,9 @@ def choose_lattices(points: NDArray[Any], geometric: int, precision: float | Non
         values = channel_of(points, channel)
         spans.append((float(values.min()), float(values.max())))
     widest = max(high - low for low, high in spans[:geometric])
-    if not math.isfinite(widest):
-        raise InputError(f"expected values whose range is a float64, got a range of {widest}")
+    furthest = max(max(abs(low), abs(high)) for low, high in spans)
+    if furthest > LARGEST_VALUE:
+        raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
     wanted = widest / _DEFAULT_STEPS if precision is None else _step_for(points.dtype, precision, geometric, spans)
     lattices = []
     for channel in range(count):
@@ -70,13 +73,19 @@ def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: lis
     if not (math.isfinite(precision) and precision > 0):
         raise InputError(f"expected a precision above 0, got {precision}")
     largest = max(max(abs(low), abs(high)) for low, high in spans[:geometric])
+    allowed = precision / math.sqrt(geometric)
     if dtype.kind in "iu":
-        # Whole steps from a whole origin land on whole values: s steps err by at most floor(s / 2).
-        return max(1.0, float(2 * math.floor(precision / math.sqrt(geometric)) + 1))
-    rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
-    step = 2.0 * (precision / math.sqrt(geometric) - rounding)
+        # Whole steps from a whole origin land on whole values, which float64 holds up to 2**53: a step of s then errs
+        # by at most floor(s / 2).
+        rounding = 4 * float(np.spacing(largest)) if largest >= 2.0**53 else 0.0
+        step = 2.0 * math.floor(allowed - rounding) + 1.0
+    else:
+        rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
+        step = 2.0 * (allowed - rounding)
     if step <= 0:
-        raise InputError(f"expected a precision above {rounding * math.sqrt(geometric)} for {dtype} values, got {precision}")
+        raise InputError(
+            f"expected a precision above {rounding * math.sqrt(geometric)} for {dtype} values, got {precision}"
+        )
     widest = max(high - low for low, high in spans[:geometric])
     if widest / step > 2.0**LATTICE_BITS - 4:
         raise InputError(

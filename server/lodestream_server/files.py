@@ -15,6 +15,7 @@ from lodestream.errors import OptionError
 from . import examples
 from .levels import MEDIA_TYPES, write_level
 from .problems import BuildFailedError, NotReadyError, responses
+from .ranges import sort_out
 from .records import Record
 from .routing import Parts, State, matches, readable
 
@@ -48,8 +49,7 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
         200: {"description": "The whole container", "content": {examples.CONTAINER_TYPE: {}}},
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
-        416: {"description": "A range outside the container"},
-        **responses(404),
+        **responses(404, 416),
     },
 )
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
@@ -61,7 +61,9 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     if unchanged is not None:
         unchanged.headers.update(headers)
         return unchanged
-    return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=path.stat())
+    status = path.stat()
+    sort_out(request, status.st_size, etag)
+    return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
 
 
 @readable(

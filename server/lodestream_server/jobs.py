@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import multiprocessing
+import signal
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 # A process gives memory back when it ends: a large build is not paid for by the small ones after it.
 _BUILDS_PER_PROCESS = 32
+
+_ATTEMPTS = 3
 
 
 @dataclass
@@ -99,18 +102,28 @@ class Builder:
         try:
             # Scheduling starts the processes the first time, which takes a moment: not in the event loop.
             await asyncio.wrap_future(await asyncio.to_thread(self._pool.schedule, worker.warm))
+        except ProcessExpired as error:
+            _log.warning("the process that compiles the kernels ended (exit code %s)", error.exitcode)
         except Exception:
             _log.exception("the kernels could not be compiled")
         else:
             self.ready = True
 
     async def _build(self, record: Record) -> None:
+        for _ in range(_ATTEMPTS):
+            if await self._attempt(record):
+                return
+        await self._keep(record, worker.Refused("the build was told to end too often"))
+
+    async def _attempt(self, record: Record) -> bool:
         folder = await asyncio.to_thread(self._storage.new_work)
         try:
-            job = self._job(record, folder)
-            future = await asyncio.to_thread(self._schedule, job)
+            future = await asyncio.to_thread(self._schedule, self._job(record, folder))
             self._running[record.id] = _Running(folder, future)
-            await self._keep(record, await self._result(future))
+            result = await self._result(future)
+            if result is not None:
+                await self._keep(record, result)
+            return result is not None
         finally:
             self._running.pop(record.id, None)
             await asyncio.to_thread(remove, folder)
@@ -118,10 +131,15 @@ class Builder:
     def _schedule(self, job: worker.Job) -> ProcessFuture[worker.Built | worker.Refused]:
         return self._pool.schedule(worker.build, args=(job,), timeout=self._settings.build_seconds)
 
-    async def _result(self, future: ProcessFuture[Any]) -> worker.Built | worker.Refused:
+    async def _result(self, future: ProcessFuture[Any]) -> worker.Built | worker.Refused | None:
+        # None when the process was told to end: whoever stops a service tells all of its processes, this one a little
+        # later, and the build is to be taken up again after a restart rather than fail.
         try:
             result: worker.Built | worker.Refused = await asyncio.wrap_future(future)
         except ProcessExpired as error:
+            # The pool's processes answer the signal by exiting with its number.
+            if abs(error.exitcode or 0) == signal.SIGTERM:
+                return None
             return worker.Refused(f"the build process ended before it was done (exit code {error.exitcode})")
         except TimeoutError:
             return worker.Refused(f"the build took longer than {self._settings.build_seconds:g} s")

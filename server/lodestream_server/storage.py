@@ -216,7 +216,7 @@ class Storage:
     def _remove_unknown(self, folder: Path, known: set[str]) -> None:
         for path in folder.iterdir():
             if path.name not in known:
-                _log.info("removing %s, left over", path)
+                _log.debug("removing %s, left over", path)
                 remove(path)
 
     def _claim(self) -> int:

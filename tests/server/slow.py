@@ -8,7 +8,7 @@ import time
 
 from lodestream_server.worker import Built, Job, Refused, build
 
-__all__ = ["explode", "kill", "wait"]
+__all__ = ["end_once", "explode", "kill", "wait"]
 
 
 def wait(job: Job) -> Built | Refused:
@@ -27,6 +27,16 @@ def kill(job: Job) -> Built | Refused:
     """End as the kernel ends a process that takes too much memory."""
     os.kill(os.getpid(), signal.SIGKILL)
     return Refused("survived")
+
+
+def end_once(job: Job) -> Built | Refused:
+    """Be told to end the first time, as all processes of a service are that is stopped."""
+    marker = job.folder.parent.parent / "told"
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+    return build(job)
 
 
 def explode(job: Job) -> Built | Refused:

@@ -90,6 +90,13 @@ def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkey
         assert settled(http, post(http, 1))["state"] == "ready"
 
 
+def test_a_process_that_is_told_to_end_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.end_once)
+    with running(tmp_path / "data") as http:
+        assert settled(http, post(http, 1))["state"] == "ready"
+        assert (tmp_path / "data" / "told").exists()
+
+
 def test_what_nobody_foresaw_does_not_tell_the_servers_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.explode)
     with running(tmp_path / "data") as http:

@@ -56,8 +56,30 @@ def test_ranges_are_slices_of_the_file(http: httpx.Client, surface: dict[str, An
     assert several.status_code == 206
     assert several.headers["content-type"].startswith("multipart/byteranges")
     assert whole[100:110] in several.content
-    outside = http.get(address, headers={"range": f"bytes={size}-"})
-    assert (outside.status_code, outside.headers["content-range"]) == (416, f"bytes */{size}")
+    for header in (f"bytes={size}-", f"bytes=0-1,{size + 5}-{size + 9}", "bytes=-0"):
+        outside = http.get(address, headers={"range": header})
+        assert (outside.status_code, outside.headers["content-range"]) == (416, f"bytes */{size}")
+        assert outside.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "bytes",
+        "bytes=",
+        "bytes=a-b",
+        "bytes=5-2",
+        "lines=1-2",
+        "bytes=--1",
+        "bytes=0-" + ",0-" * 10_000,
+        "bytes=" + "9" * 99,
+    ],
+)
+def test_what_is_no_list_of_ranges_is_ignored(
+    http: httpx.Client, surface: dict[str, Any], address: str, header: str
+) -> None:
+    answer = http.get(address, headers={"range": header})
+    assert (answer.status_code, len(answer.content)) == (200, surface["bytes"])
 
 
 def test_if_range_gives_the_whole_file_when_it_is_another(http: httpx.Client, address: str) -> None:

@@ -42,7 +42,8 @@ def run(args: argparse.Namespace) -> int:
 def _of_url(args: argparse.Namespace) -> Mapping[str, Any]:
     from .. import sync
 
-    return sync.describe(args.what, token=token_of(args)).details
+    surface = sync.describe(args.what, token=token_of(args))
+    return {**surface.details, "url": surface.url}
 
 
 def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:

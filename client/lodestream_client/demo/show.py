@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,9 +70,11 @@ def show(folder: Path, *, as_json: bool = False) -> int:
     out = console(stderr=as_json)
     chosen = (models.jacksboro(), models.torus())
     folder.mkdir(parents=True, exist_ok=True)
-    with out.status("starting a server (the first time it compiles its kernels)"), own_server() as url:
+    with ExitStack() as stack:
+        with out.status("starting a server (the first time, kernels are compiled, which takes a while)"):
+            url = stack.enter_context(own_server())
+            _warm()
         out.print(f"A server of our own at {url}, and a link of 64 kbit/s to it")
-        _warm()
         runs = [_run(model, url, out) for model in chosen]
     agreed = [_compare(run, out) for run in runs]
     paths = _write(runs, folder)
@@ -101,7 +104,7 @@ def _run(model: models.Model, url: str, out: Console) -> _Run:
     started = time.monotonic()
     with (
         sync.connect(surface.url, target=ls.Target(until_rms=_STOP), limit_rate=_LINK) as stream,
-        Live(table, console=out, refresh_per_second=8),
+        Live(table, console=out, refresh_per_second=8, vertical_overflow="visible"),
     ):
         for view in stream:
             arrivals.append(_Arrival(time.monotonic() - started, view))

@@ -1,0 +1,45 @@
+"""The Range header: which requests for parts of a file are obeyed.
+
+The framework's file response cuts the ranges. What it answers in plain text, or should not be asked at all, is sorted
+out before: a header that is no list of byte ranges, or one of very many, is ignored as RFC 9110 (14.2) allows.
+"""
+
+from __future__ import annotations
+
+import re
+
+from fastapi import Request
+from starlette.exceptions import HTTPException
+
+__all__ = ["sort_out"]
+
+_MOST = 16
+_RANGE = re.compile(r"\s*(\d{1,18})-(\d{1,18})?\s*|\s*-(\d{1,18})\s*")
+
+
+def sort_out(request: Request, size: int, etag: str) -> None:
+    """Take a Range header out of a request that is to be answered with the whole file.
+
+    Raises
+    ------
+    HTTPException
+        416 when the client asks for bytes beyond the end.
+    """
+    header = request.headers.get("range")
+    if header is None:
+        return
+    unit, _, text = header.partition("=")
+    ranges = [_RANGE.fullmatch(part) for part in text.split(",", _MOST)]
+    usable = unit.strip().lower() == "bytes" and len(ranges) <= _MOST and all(map(_ordered, ranges))
+    if not usable or request.headers.get("if-range", etag) != etag:
+        request.scope["headers"] = [(name, value) for name, value in request.scope["headers"] if name != b"range"]
+        return
+    for found in ranges:
+        if found is not None and (int(found[1]) >= size if found[1] else int(found[3]) == 0):
+            raise HTTPException(
+                416, f"expected bytes of a file of {size}, got {found[0]}", {"content-range": f"bytes */{size}"}
+            )
+
+
+def _ordered(found: re.Match[str] | None) -> bool:
+    return found is not None and not (found[1] and found[2] and int(found[2]) < int(found[1]))

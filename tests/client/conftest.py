@@ -1,0 +1,71 @@
+"""A server on a real socket with one surface, shared by the tests of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lodestream_client.__main__ import main
+from lodestream_client.sync import upload
+from lodestream_server import running_server
+
+
+def make_terrain(rows: int = 97, columns: int = 70) -> NDArray[np.float32]:
+    random = np.random.default_rng(7)
+    y, x = np.mgrid[0:rows, 0:columns]
+    hills = 90 * np.sin(x / 9) * np.cos(y / 13) + 25 * np.sin((x + 2 * y) / 5)
+    points: NDArray[np.float32] = (hills + random.normal(0, 1.5, hills.shape)).astype(np.float32)
+    return points
+
+
+@pytest.fixture(scope="session")
+def terrain() -> NDArray[np.float32]:
+    return make_terrain()
+
+
+@pytest.fixture(scope="session")
+def terrain_file(terrain: NDArray[np.float32], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("terrain") / "terrain.npy"
+    np.save(path, terrain)
+    return path
+
+
+@pytest.fixture(scope="session")
+def container_file(terrain_file: Path) -> Path:
+    path = terrain_file.with_suffix(".lode")
+    assert main(["encode", str(terrain_file), str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with running_server(tmp_path_factory.mktemp("server") / "data", workers=1) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def surface(server: str, terrain_file: Path) -> str:
+    return upload(server, terrain_file).url
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsysbinary: pytest.CaptureFixture[bytes]) -> Run:
+    """Runs the command line in this process: exit code, standard output, standard error."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        capsysbinary.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as error:
+            code = int(error.code or 0)
+        captured = capsysbinary.readouterr()
+        return code, captured.out.decode(), captured.err.decode()
+
+    return call

@@ -1,0 +1,50 @@
+"""Writes docs/cli.md from the command line's own help: ``python -m tests.client.manual``."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from pathlib import Path
+
+from lodestream_client.__main__ import main
+
+PATH = Path(__file__).parents[2] / "docs" / "cli.md"
+COMMANDS = ("demo", "serve", "encode", "decode", "info", "push", "pull", "list", "rm")
+
+_INTRODUCTION = """\
+# The command line
+
+This page is `--help` of every command, written by `python -m tests.client.manual` and checked by a test.
+
+- Results go to standard output; progress, notes and errors to standard error. With `--json`, standard output is one
+  JSON object.
+- Exit code 0: done. 1: it could not be done, and one line says why. 2: the command line alone is wrong. 130:
+  interrupted.
+- A path `-` is standard input or output. A file is written beside its name and renamed when it is whole.
+- `decode` and `pull` with `--json` print `bytes` (held of the surface, comparable with the layers of `info`),
+  `wire_bytes` (all that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
+  bytes, seconds, stopped or truncated.
+- A limit that is out of reach gives the complete surface, with a note.
+- Clients take a token from `--token` or the environment variable `LODESTREAM_TOKEN`.
+"""
+
+
+def help_of(*command: str) -> str:
+    """What ``--help`` prints, 100 columns wide."""
+    os.environ["COLUMNS"] = "100"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        main([*command, "--help"])
+    return printed.getvalue()
+
+
+def render() -> str:
+    """The whole page."""
+    sections = [_INTRODUCTION, f"```text\n{help_of()}```\n"]
+    sections += [f"## {command}\n\n```text\n{help_of(command)}```\n" for command in COMMANDS]
+    return "\n".join(sections)
+
+
+if __name__ == "__main__":
+    PATH.write_text(render())

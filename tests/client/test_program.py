@@ -1,0 +1,157 @@
+"""The command as a program of its own: what it loads, prints, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.sync.server import ServerConnection
+
+import lodestream
+import lodestream_client
+
+from . import manual
+from .test_misbehaving import websocket_server
+
+ROOT = Path(__file__).parents[2]
+COMMAND = [sys.executable, "-m", "lodestream_client"]
+
+
+def environment() -> dict[str, str]:
+    paths = [str(ROOT / name) for name in ("core", "server", "client")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "100"}
+
+
+def call(*arguments: object, data: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, input=data, capture_output=True, env=environment(), timeout=120, check=False)
+
+
+def loaded_after(statement: str, names: Sequence[str]) -> list[str]:
+    code = f"{statement}\nimport sys\nprint([name for name in {list(names)!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment(), check=True)
+    return [str(name) for name in json.loads(done.stdout.replace(b"'", b'"'))]
+
+
+HEAVY = ("numba", "fastapi", "uvicorn", "rasterio", "matplotlib")
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import lodestream_client",
+        "from lodestream_client import connect, upload, list, delete, SilenceError",
+        "from lodestream_client.sync import connect, upload, list, delete",
+    ],
+)
+def test_importing_the_client_is_light(statement: str) -> None:
+    assert loaded_after(statement, HEAVY) == []
+
+
+def test_the_command_line_is_lighter_still() -> None:
+    statement = "from lodestream_client.__main__ import build_parser\nbuild_parser()"
+    assert loaded_after(statement, (*HEAVY, "numpy", "httpx", "websockets", "rich")) == []
+
+
+def test_all_names_are_there() -> None:
+    from lodestream_client import sync
+
+    for name in lodestream_client.__all__:
+        assert getattr(lodestream_client, name) is not None
+    assert list(lodestream_client.__all__) == sorted(lodestream_client.__all__, key=lambda name: (name.islower(), name))
+    assert set(sync.__all__) == set(lodestream_client.__all__) - {"Description", "SilenceError", "UnreachableError"}
+    with pytest.raises(AttributeError, match="no attribute 'juggle'"):
+        _ = lodestream_client.juggle
+
+
+def test_version_and_help() -> None:
+    assert call("--version").stdout.decode() == f"lodestream {lodestream.__version__}\n"
+    done = call("--help")
+    assert done.returncode == 0
+    commands = re.findall(r"^    ([a-z]+)\b", done.stdout.decode(), re.MULTILINE)
+    assert set(commands) == set(manual.COMMANDS)
+
+
+def test_the_manual_is_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    # How lines are broken differs from one version of argparse to the next.
+    assert manual.PATH.read_text().split() == manual.render().split(), "run python -m tests.client.manual"
+
+
+def test_pipes(terrain_file: Path) -> None:
+    encoded = call("encode", "-", "-", data=terrain_file.read_bytes())
+    assert encoded.returncode == 0
+    decoded = call("decode", "-", "-", "--max-bytes", "2000", data=encoded.stdout)
+    assert decoded.returncode == 0
+    assert decoded.stdout.startswith(b"\x93NUMPY")
+    whole = call("decode", "-", "-", data=encoded.stdout)
+    assert whole.stdout == terrain_file.read_bytes()
+    assert b"complete" in whole.stderr
+    described = call("info", "-", "--json", data=encoded.stdout)
+    assert json.loads(described.stdout)["shape"] == [97, 70]
+
+
+@pytest.mark.parametrize("arguments", [("info",), ("decode", "-")])
+def test_a_closed_pipe_is_quiet(container_file: Path, arguments: tuple[str, ...]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [*COMMAND, arguments[0], str(container_file), *arguments[1:]]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, env=environment(), timeout=120, check=False)
+    os.close(write)
+    assert done.returncode == 1
+    assert done.stderr == b""
+
+
+def test_an_interrupt_ends_quietly(tmp_path: Path) -> None:
+    heard = threading.Event()
+
+    def behave(connection: ServerConnection) -> None:
+        connection.recv()
+        heard.set()
+        for _ in connection:
+            pass
+
+    with websocket_server(behave) as url:
+        process = subprocess.Popen(
+            [*COMMAND, "pull", url, str(tmp_path / "out.npy")], stderr=subprocess.PIPE, env=environment()
+        )
+        assert heard.wait(60)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said == b""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_colours_and_no_bars_where_there_is_no_terminal(container_file: Path, tmp_path: Path) -> None:
+    done = call("decode", container_file, tmp_path / "out.obj")
+    assert b"\x1b" not in done.stdout + done.stderr
+    assert done.stdout == b""
+    assert done.stderr.count(b"\n") == 1
+
+
+def test_the_demo(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the demo draws with matplotlib")
+    done = call("demo", "--out", tmp_path / "demo", "--json")
+    assert done.returncode == 0, done.stderr.decode()
+    shown = json.loads(done.stdout)
+    assert [it["name"] for it in shown["surfaces"]] == ["jacksboro", "torus"]
+    for surface in shown["surfaces"]:
+        assert f"{surface['rms']:.9g}" == f"{surface['rms_found']:.9g}"
+        assert f"{surface['max']:.9g}" == f"{surface['max_found']:.9g}"
+        assert surface["bytes"] < surface["raw_bytes"] / 2
+    assert shown["surfaces"][1]["ended"] == "rms"
+    assert shown["surfaces"][1]["bytes"] < shown["surfaces"][1]["whole_bytes"] / 10
+    assert (tmp_path / "demo" / "moments.png").read_bytes().startswith(b"\x89PNG")
+    torus = lodestream.read(tmp_path / "demo" / "torus.obj")
+    assert torus.shape == (384, 192)
+    assert np.isfinite(torus.points).all()

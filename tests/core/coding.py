@@ -1,0 +1,94 @@
+"""Coefficients through the embedded coder and back, by the package's own two ends of it.
+
+What stands between the tests and the coder's insides: these two functions and `uncompiled` are all that knows them.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import lodestream
+from lodestream.container import Header
+from lodestream.encoder import _Channel, _TileCoder
+from lodestream.lattice import Lattice
+from lodestream.layout import Layout
+from lodestream.reconstruction import Coded, Reconstruction
+from lodestream.tiles import TileTable, gather
+
+__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "planes_of", "uncompiled"]
+
+Ints = NDArray[np.int32]
+#: (tile, channel, first plane, planes), in coding order.
+Runs = Iterable[tuple[int, int, int, int]]
+
+
+def planes_of(layout: Layout, coefficients: Ints) -> list[int]:
+    """Bit-planes of every tile."""
+    return [
+        max(
+            (int(np.abs(coefficients[slice(*b.rows), slice(*b.columns)]).max()) for b in tile.bands), default=0
+        ).bit_length()
+        for tile in layout.tiles
+    ]
+
+
+def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]:
+    """Code runs of planes, one after another."""
+    table = TileTable.of(layout)
+    bands = np.ones(len(table.bands))
+    coder = _TileCoder(
+        table,
+        [_Channel(gather(table, c), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
+    )
+    return [
+        Coded(tile, channel, first, planes, coder.code(tile, channel, first + 1, planes), 0)
+        for tile, channel, first, planes in runs
+    ]
+
+
+def header_for(layout: Layout, channels: int) -> Header:
+    """A header of int32 values that are their own lattice coordinates."""
+    return Header(
+        dtype=np.dtype(np.int32),
+        shape=layout.shape,
+        closed=layout.closed,
+        flat=False,
+        lattices=(Lattice("affine", 0.0, 1.0),) * channels,
+        predictors=np.zeros((channels, layout.levels, 2, 2), np.int8),
+        extent=1.0,
+        tile=layout.tile,
+        exact=False,
+        corrected=False,
+        layer_count=1,
+    )
+
+
+def decode_runs(layout: Layout, channels: int, coded: Iterable[Coded], state: list[list[int]]) -> list[Ints]:
+    """Coefficients after the runs, as far as planes are known down to ``state[tile][channel]``."""
+    reader = Reconstruction(header_for(layout, channels))
+    for segment in coded:
+        reader.add(segment)
+    reader._decode(reader.length)
+    decoded = []
+    for channel, tiles in enumerate(reader._tiles):
+        coefficients = np.zeros(layout.shape, np.int32)
+        for tile in range(len(layout.tiles)):
+            tiles.spread(tile, state[tile][channel], coefficients)
+        decoded.append(coefficients)
+    return decoded
+
+
+def uncompiled(script: str) -> str:
+    """What a script prints in an interpreter in which no kernel is compiled."""
+    core, root = Path(lodestream.__file__).parents[1], Path(__file__).parents[2]
+    paths = os.pathsep.join([str(core), str(root)])
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": paths}
+    command = [sys.executable, "-W", "error", "-c", script]
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=200).stdout

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lodestream.allocation import MOST_LAYERS, TileCurve, assign_layers, hull_slopes
+from lodestream.layout import Layout
+
+
+def curves_for(layout: Layout, channels: int, seed: int) -> list[TileCurve]:
+    rng = np.random.default_rng(seed)
+    curves = []
+    for tile in range(len(layout.tiles)):
+        for channel in range(channels):
+            planes = int(rng.integers(0, 12))
+            if planes:
+                bits = rng.random(planes) * 10 ** rng.uniform(0, 4, planes)
+                gains = rng.normal(size=planes) * 10 ** rng.uniform(-200, 200) * 4.0 ** np.arange(planes)
+                curves.append(TileCurve(tile, channel, bits, gains))
+    return curves
+
+
+layouts = st.builds(
+    Layout,
+    st.tuples(st.integers(1, 80), st.integers(1, 80)),
+    st.tuples(st.booleans(), st.booleans()),
+    st.tuples(st.integers(2, 5), st.integers(2, 5)),
+)
+
+
+@given(layouts, st.integers(1, 3), st.integers(0, 2**32))
+def test_layers_add_every_plane_once_and_parents_never_after_children(layout: Layout, channels: int, seed: int) -> None:
+    curves = curves_for(layout, channels, seed)
+    states = assign_layers(curves, layout)
+    assert 1 <= len(states) <= MOST_LAYERS
+    top = np.zeros(states[0].shape, np.int8)
+    for curve in curves:
+        top[curve.tile, curve.channel] = len(curve.bits)
+    before = top
+    for state in states:
+        assert (state <= before).all()
+        assert (state >= 0).all()
+        for number, tile in enumerate(layout.tiles):
+            if tile.parent >= 0:
+                known, above = state[number], state[tile.parent]
+                # Planes at least as high as any that the child has must be known of the parent, as far as it has them.
+                expected = np.minimum(known, top[tile.parent])
+                assert (above <= np.where(known < top[number], expected, top[tile.parent])).all()
+        before = state
+    assert not states[-1].any()
+
+
+@given(st.integers(1, 28), st.integers(0, 2**32))
+def test_slopes_never_rise_towards_lower_planes_and_keep_the_sum(planes: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    curve = TileCurve(0, 0, rng.random(planes) + 0.01, rng.normal(size=planes))
+    slopes = hull_slopes(curve)
+    assert slopes.shape == (planes,)
+    assert (np.diff(slopes[::-1]) <= 1e-12).all()
+    assert np.isclose((slopes * curve.bits).sum(), curve.gains.clip(0).sum())
+
+
+def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
+    layout = Layout((500, 500), (False, False), (5, 5))
+    rng = np.random.default_rng(0)
+    curves = [
+        TileCurve(t, 0, np.full(16, 800.0), 4.0 ** (np.arange(16) + rng.random())) for t in range(len(layout.tiles))
+    ]
+    states = assign_layers(curves, layout)
+    sizes = np.array([100.0 * (16 - state).sum() for state in states])
+    ratios = (sizes[1:] / sizes[:-1])[sizes[:-1] > 10_000]
+    assert len(states) > MOST_LAYERS / 2
+    assert ratios.max() < 1.3 * ratios.min()
+
+
+def test_nothing_to_send_is_one_layer() -> None:
+    layout = Layout((5, 5), (False, False), (7, 7))
+    states = assign_layers([], layout)
+    assert len(states) == 1
+    assert not states[0].any()

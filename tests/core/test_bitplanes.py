@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lodestream.bitplanes import plane_gains, reconstruction_point
+from lodestream.layout import Layout
+from lodestream.reconstruction import Coded
+from lodestream.tiles import TileTable, gather
+from lodestream.transform import COEFFICIENT_BITS
+
+from .coding import decode_runs, encode_runs, planes_of, uncompiled
+
+Ints = NDArray[np.int32]
+
+
+def coefficients(shape: tuple[int, int], bits: int, density: float, seed: int) -> Ints:
+    """Coefficients of all sizes up to so many bits, many of them 0, in clusters."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(0, bits + 1, shape)
+    values = rng.integers(0, 2**28, shape) >> (28 - sizes)
+    values[np.repeat(np.repeat(rng.random(shape) >= density, 3, 0), 3, 1)[: shape[0], : shape[1]]] = 0
+    return np.asarray(values * rng.choice([-1, 1], shape), np.int32)
+
+
+def random_runs(
+    rng: np.random.Generator, layout: Layout, channels: list[Ints]
+) -> tuple[list[tuple[int, int, int, int]], list[list[int]]]:
+    """All planes in runs of random lengths, in an order in which what contexts may see comes first."""
+    tops = [planes_of(layout, c) for c in channels]
+    left = {
+        (tile, c): tops[c][tile] for tile in range(len(layout.tiles)) for c in range(len(channels)) if tops[c][tile]
+    }
+    runs = []
+    for threshold in sorted(
+        {int(n) for n in rng.integers(0, COEFFICIENT_BITS, rng.integers(0, 8))} | {0}, reverse=True
+    ):
+        for (tile, channel), known in sorted(left.items()):
+            if known > threshold:
+                runs.append((tile, channel, known - 1, known - threshold))
+                left[tile, channel] = threshold
+    return runs, [[0] * len(channels) for _ in layout.tiles]
+
+
+@given(
+    shape=st.tuples(st.integers(1, 60), st.integers(1, 60)),
+    closed=st.tuples(st.booleans(), st.booleans()),
+    tile=st.tuples(st.integers(1, 5), st.integers(1, 5)),
+    count=st.integers(1, 3),
+    bits=st.integers(0, COEFFICIENT_BITS),
+    density=st.sampled_from([0.01, 0.2, 1.0]),
+    seed=st.integers(0, 2**32),
+)
+def test_any_coefficients_come_back_in_runs_split_anyhow(
+    shape: tuple[int, int],
+    closed: tuple[bool, bool],
+    tile: tuple[int, int],
+    count: int,
+    bits: int,
+    density: float,
+    seed: int,
+) -> None:
+    layout = Layout(shape, closed, tile)
+    channels = [coefficients(shape, bits, density, seed + n) for n in range(count)]
+    runs, end = random_runs(np.random.default_rng(seed), layout, channels)
+    coded = encode_runs(layout, channels, runs)
+    assert all(segment.data for segment in coded)
+    for decoded, expected in zip(decode_runs(layout, count, coded, end), channels, strict=True):
+        np.testing.assert_array_equal(decoded, expected)
+
+
+@pytest.mark.parametrize("fill", [2**28 - 1, -(2**28 - 1), 1, -1, 0])
+def test_the_largest_and_smallest_coefficients_come_back(fill: int) -> None:
+    layout = Layout((40, 33), (False, False), (4, 4))
+    values = np.full((40, 33), fill, np.int32)
+    runs, end = random_runs(np.random.default_rng(0), layout, [values])
+    coded = encode_runs(layout, [values], runs)
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, end)[0], values)
+    assert bool(coded) == bool(fill)
+
+
+def test_noise_that_cannot_be_compressed_stays_within_its_buffer() -> None:
+    layout = Layout((150, 150), (False, False), (7, 7))
+    values = np.random.default_rng(1).integers(-(2**28) + 1, 2**28, (150, 150), np.int32)
+    runs = [(tile, 0, top - 1, top) for tile, top in enumerate(planes_of(layout, values))]
+    coded = encode_runs(layout, [values], runs)
+    assert sum(len(segment.data) for segment in coded) < 1.02 * 150 * 150 * 29 / 8
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, [[0]] * len(layout.tiles))[0], values)
+
+
+def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
+    layout = Layout((33, 33), (False, True), (3, 3))
+    values = coefficients((33, 33), 12, 1.0, 7)
+    tops = planes_of(layout, values)
+    for plane in (0, 1, 4, 11):
+        runs = [(tile, 0, top - 1, top - plane) for tile, top in enumerate(tops) if top > plane]
+        known = decode_runs(layout, 1, encode_runs(layout, [values], runs), [[plane]] * len(tops))[0]
+        high = np.abs(values) >> plane
+        middle = np.where(high > 0, (high << plane) + reconstruction_point(plane), 0)
+        np.testing.assert_array_equal(known, np.sign(values) * middle)
+        assert reconstruction_point(plane) <= (1 << plane) // 2
+        assert np.abs(known - values).max() < 2**plane
+
+
+def test_planes_known_beyond_a_state_do_not_show_in_it() -> None:
+    layout = Layout((20, 20), (False, False), (3, 3))
+    values = coefficients((20, 20), 10, 1.0, 8)
+    tops = planes_of(layout, values)
+    coarse = [(tile, 0, top - 1, top - 5) for tile, top in enumerate(tops) if top > 5]
+    fine = [(tile, 0, min(top, 5) - 1, min(top, 5)) for tile, top in enumerate(tops) if top]
+    coded = encode_runs(layout, [values], coarse + fine)
+    state = [[min(top, 5)] for top in tops]
+    before = decode_runs(layout, 1, coded[: len(coarse)], state)[0]
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, state)[0], before)
+
+
+def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None:
+    layout = Layout((30, 30), (False, False), (4, 4))
+    values = coefficients((30, 30), 9, 0.5, 9)
+    runs = [(tile, 0, top - 1, top) for tile, top in enumerate(planes_of(layout, values)) if top]
+    coded = encode_runs(layout, [values], runs)
+    end = [[0]] * len(layout.tiles)
+    padded = [Coded(s.tile, s.channel, s.first, s.planes, s.data + bytes(9), 0) for s in coded]
+    np.testing.assert_array_equal(decode_runs(layout, 1, padded, end)[0], values)
+    for seed, data in enumerate([b"", b"\xff", b"\xff" * 3000, b"\x00" * 3000, bytes(range(256)) * 9]):
+        other = [Coded(s.tile, s.channel, s.first, s.planes, data, seed) for s in coded]
+        decoded = decode_runs(layout, 1, other, end)[0]
+        assert np.abs(decoded.astype(np.int64)).max() < 2**COEFFICIENT_BITS
+
+
+def test_gains_are_the_squared_errors_of_what_is_known() -> None:
+    layout = Layout((25, 18), (False, False), (3, 3))
+    table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
+    flat = gather(table, values)
+    for tile, top in enumerate(planes_of(layout, values)):
+        rows = table.of_tile(tile)
+        weights = np.arange(1.0, len(rows) + 1)
+        gains = np.zeros(top + 1)
+        plane_gains(rows, weights, top, flat, gains)
+        for plane in range(top + 1):
+            expected = 0.0
+            for weight, band in zip(weights, layout.tiles[tile].bands, strict=True):
+                true = np.abs(values[slice(*band.rows), slice(*band.columns)].astype(np.int64))
+                high = true >> plane
+                known = np.where(high > 0, (high << plane) + reconstruction_point(plane), 0)
+                expected += weight * float(((true - known) ** 2).sum())
+            assert gains[plane] == pytest.approx(expected)
+
+
+def digest() -> str:
+    """Names the bytes that the coder makes of some tiles, and the surfaces that it reads from them."""
+    digest = hashlib.sha256()
+    for seed, (shape, closed) in enumerate(
+        [((9, 14), (False, True)), ((1, 21), (False, False)), ((17, 3), (True, True))]
+    ):
+        layout = Layout(shape, closed, (2, 3))
+        channels = [coefficients(shape, 13, 0.6, seed), coefficients(shape, 28, 1.0, seed + 50)]
+        runs, end = random_runs(np.random.default_rng(seed), layout, channels)
+        coded = encode_runs(layout, channels, runs)
+        for segment in coded:
+            digest.update(segment.data)
+        for decoded in decode_runs(layout, 2, coded, end):
+            digest.update(decoded.astype("<i4").tobytes())
+    return digest.hexdigest()
+
+
+def test_compiled_and_uncompiled_the_coder_makes_the_same_bytes() -> None:
+    assert uncompiled("from tests.core.test_bitplanes import digest; print(digest())").strip() == digest()
