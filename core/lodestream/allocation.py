@@ -53,7 +53,7 @@ def hull_slopes(curve: TileCurve) -> NDArray[np.float64]:
     return np.array(slopes[::-1])
 
 
-def assign_layers(curves: list[TileCurve], layout: Layout) -> list[NDArray[np.int8]]:
+def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> list[NDArray[np.int8]]:
     """The state after each layer.
 
     Parameters
@@ -61,13 +61,14 @@ def assign_layers(curves: list[TileCurve], layout: Layout) -> list[NDArray[np.in
     curves : list of TileCurve
         One for each tile and channel that has a bit-plane.
     layout : Layout
+    channels : int
+        Of the surface; one whose coefficients are all 0 has no curve.
 
     Returns
     -------
     list of int8 arrays, shape (tile, channel)
         Passes that remain after the layer.
     """
-    channels = 1 + max((curve.channel for curve in curves), default=0)
     top = np.zeros((len(layout.tiles), channels), np.int8)
     slopes: dict[tuple[int, int], NDArray[np.float64]] = {}
     for curve in curves:

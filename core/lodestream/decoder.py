@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .container import sections
 from .container.frames import Frame, FrameReader, section_extent
 from .container.model import ByteRange, Header, Index
-from .container.reader import index_from, read_metadata
+from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .errors import CorruptStreamError, OptionError, TruncatedStreamError
 from .reconstruction import Coded, Progress, Reconstruction
@@ -207,7 +207,8 @@ class Decoder:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
         else:
             place = ByteRange(frame.offset, frame.end - frame.offset)
-            self.index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
+            index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
+            self.index = replace(with_level_bytes(index), metadata_values=self.metadata or {})
 
     def _take_header(self, frame: Frame) -> None:
         if self.header is not None:
@@ -253,7 +254,19 @@ class Decoder:
         whole = self.header is not None and (complete or number == self.header.layer_count - 1 and level == self.header.levels)
         length, state = self._reconstruction.length, self._progress.snapshot(whole)
         self.layers.append(
-            View(number, level, held, rms, max_error, complete, self._reconstruction, length, state, corrected, self._values)
+            View(
+                number,
+                level,
+                held,
+                rms,
+                max_error,
+                complete,
+                self._reconstruction,
+                length,
+                state,
+                corrected,
+                self._values,
+            )
         )
 
     def _take_loose(self, offset: int, data: Bytes) -> None:
@@ -266,7 +279,7 @@ class Decoder:
         kind, place = run[0], ByteRange(start, len(run))
         if kind not in (sections.INDEX, sections.METADATA):
             raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
-        extent = section_extent(run)
+        extent = section_extent(run, start)
         if extent is None or len(run) < extent[1]:
             return
         if len(run) > extent[1]:
@@ -277,6 +290,8 @@ class Decoder:
         elif self.header is not None:
             self.index = index_from(bytes(run), place, self.header)
             self._slices = Slices(self.index)
+            if (state := self._slices.state()) is not None:
+                self._show(*state)
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None

@@ -108,7 +108,7 @@ class _Encoding:
             channels.append(channel)
         self.channels = channels
         self.progress(0.1)
-        states = assign_layers(self._curves(), self.layout)
+        states = assign_layers(self._curves(), self.layout, len(channels))
         self.progress(0.4)
         self.header = Header(
             dtype=self.points.dtype,

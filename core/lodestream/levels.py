@@ -1,6 +1,7 @@
 """The hierarchy in floating point: every coarser level the least-squares best grid of its size.
 
-The same filter as `lifting`, with 24 taps and without rounding; it agrees with the dense optimum to 1e-12 of the scale.
+The same filter as `lifting`, without rounding and with all of its taps that matter; it agrees with the dense optimum to
+1e-12 of the scale.
 The paper's own solver is in `paper`.
 """
 
@@ -16,10 +17,15 @@ from .surface import Closed
 
 __all__ = ["coarsen", "hierarchy"]
 
+# sum_j h_j (d_{k+j} + d_{k-1-j}) = _GAIN (w_k + w_{k-1}), where w is d run through 1 / ((1 - r z)(1 - r / z)).
 _RATIO = 2.0 * np.sqrt(2.0) - 3.0
-_FIRST_TAP = 1.0 - 1.0 / np.sqrt(2.0)
-_REACH = 24
-_STRIP = 64
+_GAIN = (1.0 - 1.0 / np.sqrt(2.0)) * (1.0 - _RATIO)
+# Along rows the series is a product, 1 / (1 - r z) = (1 + r z)(1 + r^2 z^2)(1 + r^4 z^4) ..., and each factor times its
+# mirror image is 1 + r^2n times 1 + p (z^n + z^-n).
+_P1, _P2, _P4, _P8, _P16 = (_RATIO**n / (1.0 + _RATIO ** (2 * n)) for n in (1, 2, 4, 8, 16))
+_ROW_GAIN = _GAIN * float(np.prod([1.0 + _RATIO ** (2 * n) for n in (1, 2, 4, 8, 16)]))
+_REACH = 32
+_STRIP = 128  # columns worked on together
 
 
 def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.float64]:
@@ -52,51 +58,55 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
     >>> coarsen([[0.0], [1.0], [2.0], [3.0], [4.0]]).ravel()
     array([0., 2., 4.])
     """
-    return _coarsen(_checked(points), closed)
+    return _coarsen(_as_floats(points), closed)
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArray[np.float64]]:
     """Every level of a surface, coarsest first, the input (as float64) last; see `coarsen`."""
-    levels = [_checked(points)]
+    levels = [_as_floats(points)]
     while (coarser := _coarsen(levels[-1], closed)).shape != levels[-1].shape:
         levels.append(coarser)
     return levels[::-1]
 
 
-def _checked(points: ArrayLike) -> NDArray[np.float64]:
+def _as_floats(points: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(points)
     if array.ndim not in (2, 3) or array.size == 0 or array.dtype.kind not in "iuf":
         raise InputError(
             f"expected real numbers of shape (H, W) or (H, W, C), got {array.dtype} of shape {array.shape}"
         )
-    array = np.ascontiguousarray(array, np.float64)
-    if not np.isfinite(array).all():
-        raise InputError(f"expected finite values, got {int((~np.isfinite(array)).sum())} that are not")
-    return array
+    return np.ascontiguousarray(array, np.float64)
 
 
 def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]:
     rows, columns = (axis_step(n, c) for n, c in zip(points.shape[:2], closed, strict=True))
-    planes = points.reshape(*points.shape[:2], -1)
-    width, channels = planes.shape[1], planes.shape[2]
+    channels = points.shape[2] if points.ndim == 3 else 1
     # Channels lie next to each other, so that along axis 0 they are only more columns.
-    half = _along(planes.reshape(planes.shape[0], width * channels), rows)
-    coarse = np.empty((rows.coarse, columns.coarse, channels))
-    for channel in range(channels):
-        plane = half.reshape(rows.coarse, width, channels)[..., channel]
-        coarse[..., channel] = _along(plane.T, columns).T
-    return coarse.reshape(*coarse.shape[:2], *points.shape[2:])
+    lines = points.reshape(points.shape[0], -1)
+    if columns.midpoints:
+        fine, lines = lines, np.empty((lines.shape[0], columns.coarse * channels))
+        table = columns.extension(_REACH)
+        _coarsen_rows(fine, lines, channels, columns.midpoints, columns.run, columns.wraps, table)
+    if rows.midpoints:
+        fine, lines = lines, np.empty((rows.coarse, lines.shape[1]))
+        _coarsen_columns(fine, lines, rows.midpoints, rows.run, rows.wraps, rows.extension(_REACH))
+    # Whatever is not finite in the input leaves its mark on the coarser level, which takes less time to look through.
+    if not np.isfinite(lines).all() and not np.isfinite(points).all():
+        raise InputError(f"expected finite values, got {int((~np.isfinite(points)).sum())} that are not")
+    if not (rows.midpoints or columns.midpoints):
+        lines = lines.copy()
+    return lines.reshape(rows.coarse, columns.coarse, *points.shape[2:])
 
 
-def _along(lines: NDArray[np.float64], step: AxisStep) -> NDArray[np.float64]:
-    """Coarsen axis 0; the result has the strides of a C-contiguous array transposed like the input."""
-    if not step.midpoints:
-        return lines.copy(order="K")
-    shape = (step.coarse, lines.shape[1])
-    transposed = abs(lines.strides[0]) < abs(lines.strides[1])
-    out = np.empty(shape[::-1]).T if transposed else np.empty(shape)
-    _coarsen_columns(lines, out, step.midpoints, step.run, step.wraps, step.extension(_REACH))
-    return out
+@kernel
+def _detail(
+    x: NDArray[np.float64], k: int, wraps: bool, midpoints: int, start: int, stop: int, out: NDArray[np.float64]
+) -> None:
+    """Detail k of the columns of a strip."""
+    right = 0 if wraps and k == midpoints - 1 else 2 * k + 2
+    before, middle, after = x[2 * k, start:stop], x[2 * k + 1, start:stop], x[right, start:stop]
+    for i in range(middle.size):
+        out[i] = middle[i] - 0.5 * (before[i] + after[i])
 
 
 @kernel
@@ -110,40 +120,94 @@ def _coarsen_columns(
 ) -> None:
     """Nodes of the least-squares optimum along axis 0, strip by strip.
 
-    The filter's two halves are geometric series: each is one recursion over the details, started 24 details outside,
-    where what is left out weighs less than 1e-18.
+    w is one recursion down the details and one back up, both started 32 details outside, where what is left out weighs
+    less than 1e-24.
     """
     length, columns = x.shape
-    details = np.empty((midpoints + 2 * _REACH, _STRIP))
-    after = np.empty((run, _STRIP))
-    state = np.empty(_STRIP)
+    causal = np.zeros((midpoints + 2 * _REACH, _STRIP))
+    detail, state = np.zeros(_STRIP), np.zeros(_STRIP)
     for start in range(0, columns, _STRIP):
-        width = min(_STRIP, columns - start)
-        for k in range(midpoints):
+        stop = min(start + _STRIP, columns)
+        state[:] = 0.0
+        for place in range(midpoints + 2 * _REACH):
+            k, sign = place - _REACH, 1.0
+            if k < 0 or k >= midpoints:
+                side = place if k < 0 else place - midpoints
+                k, sign = table[side, 0], float(table[side, 1])
+            _detail(x, k, wraps, midpoints, start, stop, detail)
+            w = causal[place]
+            for i in range(_STRIP):
+                state[i] = sign * detail[i] + _RATIO * state[i]
+                w[i] = state[i]
+        state[:] = 0.0
+        for place in range(run + 2 * _REACH - 2, _REACH - 2, -1):
+            # state: w_k of the node k = place - _REACH + 1
+            w = causal[place]
+            node = place - _REACH + 1
+            if node < run:
+                fine, coarse = x[2 * node, start:stop], out[node, start:stop]
+                for i in range(fine.size):
+                    coarse[i] = fine[i] + _GAIN * (w[i] + (1.0 + _RATIO) * state[i])
+            for i in range(_STRIP):
+                state[i] = w[i] + _RATIO * state[i]
+        if run < out.shape[0]:
+            out[run, start:stop] = x[length - 1, start:stop]
+
+
+@kernel
+def _spread_sum(source: NDArray[np.float64], target: NDArray[np.float64], reach: int, weight: float) -> None:
+    """Add the neighbours on both sides, weighted; what is within ``reach`` of an end is left alone."""
+    inner = source.size - 2 * reach
+    before, middle, after = source[:inner], source[reach : reach + inner], source[2 * reach :]
+    out = target[reach : reach + inner]
+    for i in range(inner):
+        out[i] = middle[i] + weight * (before[i] + after[i])
+
+
+@kernel
+def _coarsen_rows(
+    x: NDArray[np.float64],
+    out: NDArray[np.float64],
+    channels: int,
+    midpoints: int,
+    run: int,
+    wraps: bool,
+    table: NDArray[np.int64],
+) -> None:
+    """Nodes of the least-squares optimum along axis 1, row by row; samples of a channel stand ``channels`` apart."""
+    outside = _REACH * channels
+    details = np.zeros(midpoints * channels + 2 * outside)
+    other = np.zeros(details.size)
+    for row in range(x.shape[0]):
+        samples, coarse = x[row], out[row]
+        inner = details[outside : outside + midpoints * channels]
+        if channels == 1:
+            for k in range(midpoints - 1):
+                inner[k] = samples[2 * k + 1] - 0.5 * (samples[2 * k] + samples[2 * k + 2])
+        first = midpoints - 1 if channels == 1 else 0
+        for k in range(first, midpoints):
             right = 0 if wraps and k == midpoints - 1 else 2 * k + 2
-            for i in range(width):
-                details[k + _REACH, i] = x[2 * k + 1, start + i] - 0.5 * (x[2 * k, start + i] + x[right, start + i])
+            for c in range(channels):
+                ends = samples[2 * k * channels + c] + samples[right * channels + c]
+                inner[k * channels + c] = samples[(2 * k + 1) * channels + c] - 0.5 * ends
         for side in range(2 * _REACH):
             source, sign = table[side, 0] + _REACH, float(table[side, 1])
             target = side if side < _REACH else midpoints + side
-            for i in range(width):
-                details[target, i] = sign * details[source, i]
-        state[:] = 0.0
-        for k in range(midpoints + 2 * _REACH - 1, _REACH - 1, -1):
-            for i in range(width):
-                state[i] = _FIRST_TAP * details[k, i] + _RATIO * state[i]
-            if k - _REACH < run:
-                for i in range(width):
-                    after[k - _REACH, i] = state[i]
-        state[:] = 0.0
-        for k in range(run + _REACH):
-            # state: the series of d_{k-1}, d_{k-2}, ... for node k
-            if k >= _REACH:
-                node = k - _REACH
-                for i in range(width):
-                    out[node, start + i] = x[2 * node, start + i] + after[node, i] + state[i]
-            for i in range(width):
-                state[i] = _FIRST_TAP * details[k, i] + _RATIO * state[i]
-        if run < out.shape[0]:
-            for i in range(width):
-                out[run, start + i] = x[length - 1, start + i]
+            for c in range(channels):
+                details[target * channels + c] = sign * details[source * channels + c]
+        _spread_sum(details, other, channels, _P1)
+        _spread_sum(other, details, 2 * channels, _P2)
+        _spread_sum(details, other, 4 * channels, _P4)
+        _spread_sum(other, details, 8 * channels, _P8)
+        _spread_sum(details, other, 16 * channels, _P16)
+        before, after = other[outside - channels :], other[outside:]
+        if channels == 1:
+            for k in range(run):
+                coarse[k] = samples[2 * k] + _ROW_GAIN * (before[k] + after[k])
+        else:
+            for k in range(run):
+                for c in range(channels):
+                    i = k * channels + c
+                    coarse[i] = samples[2 * k * channels + c] + _ROW_GAIN * (before[i] + after[i])
+        for i in range(run * channels, coarse.size):
+            coarse[i] = samples[samples.size - coarse.size + i]

@@ -32,7 +32,7 @@ layouts = st.builds(
 @given(layouts, st.integers(1, 3), st.integers(0, 2**32))
 def test_layers_add_every_plane_once_and_parents_never_after_children(layout: Layout, channels: int, seed: int) -> None:
     curves = curves_for(layout, channels, seed)
-    states = assign_layers(curves, layout)
+    states = assign_layers(curves, layout, channels)
     assert 1 <= len(states) <= MOST_LAYERS
     top = np.zeros(states[0].shape, np.int8)
     for curve in curves:
@@ -65,9 +65,10 @@ def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
     layout = Layout((500, 500), (False, False), (5, 5))
     rng = np.random.default_rng(0)
     curves = [
-        TileCurve(t, 0, np.full(16, 800.0), 4.0 ** (np.arange(16) + rng.random())) for t in range(len(layout.tiles))
+        TileCurve(tile, 0, np.full(16, 800.0), rng.uniform(1, 4) * 4.0 ** np.arange(16.0))
+        for tile in range(len(layout.tiles))
     ]
-    states = assign_layers(curves, layout)
+    states = assign_layers(curves, layout, 1)
     sizes = np.array([100.0 * (16 - state).sum() for state in states])
     ratios = (sizes[1:] / sizes[:-1])[sizes[:-1] > 10_000]
     assert len(states) > MOST_LAYERS / 2
@@ -76,6 +77,7 @@ def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
 
 def test_nothing_to_send_is_one_layer() -> None:
     layout = Layout((5, 5), (False, False), (7, 7))
-    states = assign_layers([], layout)
+    states = assign_layers([], layout, 3)
     assert len(states) == 1
+    assert states[0].shape == (len(layout.tiles), 3)
     assert not states[0].any()

@@ -80,4 +80,6 @@ class FieldReader:
     def end(self) -> None:
         """Raises `CorruptStreamError` unless every byte was taken."""
         if self.place != len(self.data):
-            raise CorruptStreamError(f"expected the end of the section, got {len(self.data) - self.place} more bytes", self.at)
+            raise CorruptStreamError(
+                f"expected the end of the section, got {len(self.data) - self.place} more bytes", self.at
+            )

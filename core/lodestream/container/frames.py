@@ -72,7 +72,7 @@ class FrameReader:
     def _next(self) -> Frame | None:
         if not self._started and not self._start():
             return None
-        extent = section_extent(self._data)
+        extent = section_extent(self._data, self._offset)
         if extent is None or len(self._data) < extent[1]:
             return None
         start, length = extent
@@ -96,8 +96,11 @@ class FrameReader:
         return True
 
 
-def section_extent(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told."""
+def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | None:
+    """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told.
+
+    ``offset`` is the section's place in the container.
+    """
     length, shift = 0, 0
     for place in range(1, min(len(data), 10)):
         length |= (data[place] & 127) << shift
@@ -105,7 +108,7 @@ def section_extent(data: bytes | bytearray) -> tuple[int, int] | None:
         if data[place] < 128:
             return place + 1, place + 1 + length + 4
     if len(data) >= 10:
-        raise CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", 0)
+        raise CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", offset)
     return None
 
 
@@ -129,9 +132,7 @@ def whole_section(data: bytes, offset: int, kind: int) -> Frame:
     CorruptStreamError
         When it is not one whole section of that kind.
     """
-    extent = section_extent(data[:10])
+    extent = section_extent(data[:10], offset)
     if extent is None or extent[1] != len(data) or data[0] != kind:
         raise CorruptStreamError(f"expected one whole section of kind {kind}, got other bytes", offset)
     return checked(data, kind, offset, extent[0])
-
-

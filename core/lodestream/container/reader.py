@@ -11,7 +11,7 @@ from . import sections
 from .frames import FrameReader, whole_section
 from .model import ByteRange, Header, Index
 
-__all__ = ["describe", "index_from", "read_index", "read_metadata"]
+__all__ = ["describe", "index_from", "read_index", "read_metadata", "with_level_bytes"]
 
 _FIRST_READ = 512
 
@@ -105,9 +105,7 @@ def describe(index: Index) -> dict[str, Any]:
             {"level": r.level, "shape": list(r.shape), "bytes": r.bytes, "rms": r.rms, "max": r.max_error}
             for r in index.levels
         ],
-        "layers": [
-            {"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers
-        ],
+        "layers": [{"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers],
         "bytes": index.size,
         "exact": header.exact,
         "metadata": dict(index.metadata_values),

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from ..errors import CorruptStreamError, UnsupportedVersionError
+from ..errors import CorruptStreamError, InputError, UnsupportedVersionError
 from ..lattice import Lattice
 from ..layout import Layout
 from ..transform import COEFFICIENT_BITS, default_predictors, fitted_steps
@@ -111,17 +111,22 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     fields = FieldReader(payload, offset)
     flags, code = fields.byte(), fields.byte()
     if flags > 31 or code >= len(_DTYPES):
-        raise CorruptStreamError(f"expected flags below 32 and a type below {len(_DTYPES)}, got {flags} and {code}", offset)
+        raise CorruptStreamError(
+            f"expected flags below 32 and a type below {len(_DTYPES)}, got {flags} and {code}", offset
+        )
     shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
     channels, layer_count = fields.varint(2**16), fields.varint(2**16)
+    points = shape[0] * shape[1]
     few = channels == 0 or layer_count == 0 or (flags & 4 and channels != 1)
-    if few or not 2 <= shape[0] * shape[1] <= LARGEST_SURFACE:
+    if few or points < 2 or points * channels > LARGEST_SURFACE:
         raise CorruptStreamError(
             f"expected points, channels and layers, got {shape[0]} x {shape[1]} x {channels}, {layer_count}", offset
         )
     exponents = fields.byte()
     tile = exponents & 15, exponents >> 4
-    if sum(tile) != TILE_BITS or min(tile) < 1:
+    # Tiles across a narrow surface would be many, and nearly empty.
+    count = max(1, shape[0] >> tile[0]) * max(1, shape[1] >> tile[1])
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + (points >> (TILE_BITS - 1)):
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
     fraction = fields.byte()
     if fraction > MOST_FRACTION:
@@ -194,7 +199,7 @@ def serialize_layer(rms: float, max_error: float, entries: Sequence[Entry], chan
 def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[float, float, list[Entry], int]:
     """Errors, entries (``top`` is 0 where an earlier layer told it) and where in the payload the segments start."""
     fields = FieldReader(payload, offset)
-    rms, max_error = fields.unpack("dd")
+    rms, max_error = _figures(fields)
     units = len(header.layout.tiles) * header.channels
     entries, unit = [], 0
     for _ in range(fields.varint(units)):
@@ -217,9 +222,21 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[float
     return rms, max_error, entries, fields.place
 
 
+def _figures(fields: FieldReader) -> tuple[float, float]:
+    """RMS and maximum error."""
+    start = fields.at
+    rms, max_error = fields.unpack("dd")
+    if not (0 <= rms < math.inf and 0 <= max_error < math.inf):
+        raise CorruptStreamError(f"expected errors of 0 or more, got {rms} and {max_error}", start)
+    return rms, max_error
+
+
 def serialize_metadata(values: dict[str, Any]) -> bytes:
     """A MessagePack map."""
-    return bytes(msgpack.packb(values, use_bin_type=True))
+    try:
+        return bytes(msgpack.packb(values, use_bin_type=True))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"expected metadata that MessagePack can hold: {error}") from None
 
 
 def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
@@ -268,7 +285,7 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
     place, level = header.length, 0
     for number in range(fields.varint(len(payload))):
         length = fields.varint(_LARGEST_FILE)
-        rms, max_error = fields.unpack("dd")
+        rms, max_error = _figures(fields)
         members, unit = [], 0
         for _ in range(fields.varint(units)):
             unit += fields.varint(units)
@@ -276,18 +293,22 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
             size = fields.varint(length)
             (crc,) = fields.unpack("I")
             if unit >= units or not 1 <= passes < 2 * top <= 2 * COEFFICIENT_BITS or size == 0:
-                raise CorruptStreamError(f"expected one of {units} tiles and its passes, got {unit}, {passes}", fields.at)
+                raise CorruptStreamError(
+                    f"expected one of {units} tiles and its passes, got {unit}, {passes}", fields.at
+                )
             members.append((*divmod(unit, header.channels), top, passes, size, int(crc)))
             unit += 1
         # Segments fill the end of a layer's payload, before its CRC.
         at = place + length - 4 - sum(member[4] for member in members)
+        if at < place:
+            raise CorruptStreamError(f"expected segments within their layer of {length} bytes, got more", fields.at)
         for tile, channel, top, passes, size, crc in members:
             segments.append(Segment(number, tile, channel, top, passes, ByteRange(at, size), crc))
             at += size
             level = max(level, header.layout.tiles[tile].level)
         layers.append(LayerRecord(number, place, place + length, level, rms, max_error))
         place += length
-    figures = [fields.unpack("dd") for _ in range(header.levels + 1)]
+    figures = [_figures(fields) for _ in range(header.levels + 1)]
     exactness, metadata = fields.varint(_LARGEST_FILE), fields.varint(_LARGEST_FILE)
     fields.end()
     filled = place + exactness + metadata == index_range.offset

@@ -82,6 +82,10 @@ class Slices:
         self._bytes += segment.range.length
         self._by_layer.hold(segment.layer)
         self._by_level.hold(self._index.header.layout.tiles[segment.tile].level)
+        return self.state()
+
+    def state(self) -> State | None:
+        """The state that is complete now, if its errors are known; the first ones may need no segment at all."""
         layer = self._by_layer.whole(self._held)
         if layer is not None:
             record = self._index.layers[layer]
