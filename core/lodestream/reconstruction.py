@@ -182,7 +182,7 @@ def channel_picture(
     coefficients = allocate(layout.shapes[level])
     for number in range(layout.tiles_of(level).stop):
         finer = fraction if layout.tiles[number].level > whole else 0
-        tiles.spread(number, int(state[number]), finer, coefficients)
+        tiles.spread(number, int(state[number]), coefficients, finer)
     inverse(coefficients, layout, header.predictors[channel], level, whole, fraction)
     return coefficients, fraction
 

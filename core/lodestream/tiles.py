@@ -91,7 +91,7 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, remaining: int, fraction: int, coefficients: NDArray[np.int32]) -> None:
+    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32], fraction: int = 0) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
 
         Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown. The
