@@ -1,8 +1,7 @@
 """The hierarchy in floating point: every coarser level the least-squares best grid of its size.
 
 The same filter as `lifting`, without rounding and with all of its taps that matter; it agrees with the dense optimum to
-1e-12 of the scale.
-The paper's own solver is in `paper`.
+1e-12 of the scale. The paper's own solver is in `paper`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .axis import AxisStep, axis_step
+from .axis import axis_step
 from .errors import InputError
 from .kernels import kernel
 from .surface import Closed
@@ -41,8 +40,8 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
     Returns
     -------
     float64 array
-        Of an open axis of N >= 3 samples (N + 1) // 2 remain where N is odd, N // 2 + 1 where it is even; of a closed one
-        of N >= 5, (N + 1) // 2; shorter axes stay as they are (always a new array).
+        Of an open axis of N >= 3 samples (N + 1) // 2 remain where N is odd, N // 2 + 1 where it is even; of a closed
+        one of N >= 5, (N + 1) // 2; shorter axes stay as they are (always a new array).
 
     Raises
     ------
@@ -58,7 +57,8 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
     >>> coarsen([[0.0], [1.0], [2.0], [3.0], [4.0]]).ravel()
     array([0., 2., 4.])
     """
-    return _coarsen(_as_floats(points), closed)
+    array = _as_floats(points)
+    return _checked(array, _coarsen(array, closed))
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArray[np.float64]]:
@@ -66,6 +66,7 @@ def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArra
     levels = [_as_floats(points)]
     while (coarser := _coarsen(levels[-1], closed)).shape != levels[-1].shape:
         levels.append(coarser)
+    _checked(levels[0], levels[min(1, len(levels) - 1)])
     return levels[::-1]
 
 
@@ -76,6 +77,13 @@ def _as_floats(points: ArrayLike) -> NDArray[np.float64]:
             f"expected real numbers of shape (H, W) or (H, W, C), got {array.dtype} of shape {array.shape}"
         )
     return np.ascontiguousarray(array, np.float64)
+
+
+def _checked(points: NDArray[np.float64], coarser: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Whatever is not finite in the input leaves its mark on the coarser level, which takes less time to look through.
+    if not np.isfinite(coarser).all() and not np.isfinite(points).all():
+        raise InputError(f"expected finite values, got {int((~np.isfinite(points)).sum())} that are not")
+    return coarser
 
 
 def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]:
@@ -90,9 +98,6 @@ def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]
     if rows.midpoints:
         fine, lines = lines, np.empty((rows.coarse, lines.shape[1]))
         _coarsen_columns(fine, lines, rows.midpoints, rows.run, rows.wraps, rows.extension(_REACH))
-    # Whatever is not finite in the input leaves its mark on the coarser level, which takes less time to look through.
-    if not np.isfinite(lines).all() and not np.isfinite(points).all():
-        raise InputError(f"expected finite values, got {int((~np.isfinite(points)).sum())} that are not")
     if not (rows.midpoints or columns.midpoints):
         lines = lines.copy()
     return lines.reshape(rows.coarse, columns.coarse, *points.shape[2:])

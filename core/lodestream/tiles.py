@@ -121,16 +121,17 @@ def _spread(
     begun = remaining >> 1  # the plane whose first pass is the last one known, if half
     plane = begun + half
     middle, middle_begun = reconstruction_point(plane), (1 << begun) + reconstruction_point(begun)
+    width = out.shape[1]
     for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            at = offset + i * stride + j
-            high = known[at] >> plane
-            if high:
-                out[i, j] = int(sign[at]) * ((high << plane) + middle) << fraction
-            elif half and early[at] == begun + 1 and known[at] >> begun:
-                out[i, j] = int(sign[at]) * middle_begun << fraction
-            else:
-                out[i, j] = 0
+        start = offset + i * stride
+        magnitudes, signs, marks = known[start : start + width], sign[start : start + width], early[start : start + width]
+        row = out[i]
+        for j in range(width):
+            high = np.int32((magnitudes[j] >> plane) << plane)
+            value = np.int32(high + middle) if high else np.int32(0)
+            if half and not high and marks[j] == begun + 1 and magnitudes[j] >> begun:
+                value = np.int32(middle_begun)
+            row[j] = (np.int32(signs[j]) * value) << fraction
 
 
 def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -138,7 +139,7 @@ def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int3
     flat = np.zeros(table.size, np.int32)
     for number, tile in enumerate(table.layout.tiles):
         for band, row in zip(tile.bands, table.of_tile(number), strict=True):
-            place, stride, height, width = (int(x) for x in row[:4])
+            place, stride, height = (int(x) for x in row[:3])
             start = place - stride - 1
             frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
             frame[1:-1, 1:-1] = _window(coefficients, band)

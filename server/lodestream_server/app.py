@@ -79,6 +79,10 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         # What the framework assumes of validation errors is not what is answered.
         for name in ("HTTPValidationError", "ValidationError"):
             components.pop(name, None)
+        for operations in schema["paths"].values():
+            for operation in operations.values():
+                if "422" in operation["responses"]:
+                    operation["responses"]["422"] = problems.responses(422)[422]
         components["Problem"] = examples.PROBLEM_SCHEMA
         app.openapi_schema = schema
     return app.openapi_schema

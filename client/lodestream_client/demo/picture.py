@@ -22,8 +22,8 @@ _ACCENT = "#e9b44c"
 _TERRAIN = ["#2f6b52", "#4c8a5b", "#86a563", "#c9b978", "#d9b98a", "#e6d3b8", "#fbf7f0"]
 _TORUS = ["#1c2f5c", "#2a6f97", "#4fb3a5", "#e9c46a", "#e76f51"]
 
-_WIDTH = 620
-_HEIGHT = 430
+_WIDTH = 500
+_HEIGHT = 347
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def draw(rows: Sequence[Sequence[Moment]], path: Path) -> None:
     from matplotlib.figure import Figure
 
     across = max(map(len, rows))
-    figure = Figure(figsize=(across * 4.0, len(rows) * 3.35), dpi=125, facecolor=_PAPER)
+    figure = Figure(figsize=(across * 4.0, len(rows) * 3.35), dpi=100, facecolor=_PAPER)
     FigureCanvasAgg(figure)
     panels = figure.subplots(len(rows), across, squeeze=False)
     figure.subplots_adjust(left=0.008, right=0.992, top=0.995, bottom=0.09 / len(rows) * 2, wspace=0.02, hspace=0.22)
@@ -58,7 +58,7 @@ def draw(rows: Sequence[Sequence[Moment]], path: Path) -> None:
             panel.text(
                 0.5, -0.105, moment.caption, transform=panel.transAxes, ha="center", va="top", color=_DIM, fontsize=10.5
             )
-    figure.savefig(path, facecolor=_PAPER)
+    figure.savefig(path, facecolor=_PAPER, pil_kwargs={"optimize": True})
 
 
 def _pictures(states: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:

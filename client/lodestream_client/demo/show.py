@@ -148,8 +148,11 @@ def _compare(run: _Run, out: Console) -> bool:
     view, model = run.last, run.model
     found = model.errors(view.points)
     pairs = [(f"{told:.9g}", f"{seen:.9g}") for told, seen in zip((view.rms, view.max_error), found, strict=True)]
-    why = "stopped at an RMS error of 1e-3 of the extent" if run.ended == "rms" else f"went on to its end ({run.ended})"
-    out.print(f"\n[bold]{model.title.split(',')[0]}[/bold] {why} after {run.arrivals[-1].seconds:.1f} s")
+    goal = "1e-3 of the extent"
+    why = (
+        f"stopped at an RMS error of {goal}" if run.ended == "rms" else f"came whole: no state before is within {goal}"
+    )
+    out.print(f"\n[bold]{model.title.split(',')[0]}[/bold] {why}; {run.arrivals[-1].seconds:.1f} s")
     for name, (told, seen) in zip(("RMS error", "maximum"), pairs, strict=True):
         verdict = "agree" if told == seen else "DIFFER"
         out.print(f"  {name:9}  told {told:>13} {model.unit:2} found {seen:>13} {model.unit:2} {verdict}")
