@@ -50,14 +50,15 @@ class Channel:
         """Code all planes of all tiles; returns what is known after that, and the bytes written."""
         tiles, count = Tiles(self.table), 0
         for number, (top, data) in enumerate(zip(self.planes, self.room, strict=True)):
-            count += bitplanes.code_planes(
+            count += bitplanes.code_passes(
                 decoding,
                 self.table.of_tile(number),
-                top - 1,
+                bitplanes.pass_count(top) - 1,
                 0,
                 tiles.known,
                 tiles.sign,
                 tiles.flags,
+                tiles.early,
                 self.coefficients,
                 bitplanes.new_model(),
                 data,

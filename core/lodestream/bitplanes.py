@@ -1,8 +1,10 @@
 """The embedded coder: one tile of one channel, bit-plane by bit-plane, through an adaptive binary range coder.
 
-A plane goes through the tile's bands, and each band through its blocks of 8 x 8 coefficients in raster order. A block
-without a significant coefficient so far sends one flag: does it get one in this plane? In a block that has, each
-coefficient sends its bit of the plane and, with the first 1, its sign. ``docs/format.md`` specifies every context.
+A plane takes two passes. Each goes through the tile's bands, and each band through its blocks of 8 x 8 coefficients in
+raster order. The first pass visits only insignificant coefficients with a significant neighbour, for these are the bits
+that lower the error most; the second visits all others. There, a block without a significant coefficient so far sends
+one flag: does it get one in this plane? In a block that has, each coefficient sends its bit of the plane and, with the
+first 1, its sign. ``docs/format.md`` specifies every context.
 
 What a context sees of a coefficient are the bits known so far: of this plane for coefficients coded before it, of the
 planes above for those that come later, and of the planes at and above this one for its parent.
@@ -15,7 +17,15 @@ from numpy.typing import NDArray
 
 from .kernels import kernel
 
-__all__ = ["BAND_FIELDS", "CONTEXTS", "code_planes", "new_model", "plane_gains"]
+__all__ = [
+    "BAND_FIELDS",
+    "CONTEXTS",
+    "code_passes",
+    "new_model",
+    "pass_count",
+    "pass_gains",
+    "reconstruction_point",
+]
 
 #: Columns of the table that describes a tile's bands to the kernels, see `code_planes`.
 BAND_FIELDS = 9
@@ -50,6 +60,11 @@ _SUM_CLASS = np.array(
 #: Shifts by which a context's two probabilities move, by the number of bits that it has seen.
 _FAST = np.array([1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4] + [4] * 240, np.int64)
 _SLOW = np.array([1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4, 5, 5, 5, 5] + [5] * 16 + [6] * 32 + [7] * 192, np.int64)
+
+
+def pass_count(planes: int) -> int:
+    """Coding passes of so many bit-planes: two each, but the highest has no first pass."""
+    return 2 * planes - 1 if planes else 0
 
 
 def new_model() -> NDArray[np.int32]:
@@ -139,7 +154,7 @@ def _finish(low: int, width: int, place: int, data: NDArray[np.uint8]) -> int:
 
 
 @kernel
-def code_planes(
+def code_passes(
     decoding: bool,
     bands: NDArray[np.int64],
     first: int,
@@ -147,12 +162,13 @@ def code_planes(
     known: NDArray[np.int32],
     sign: NDArray[np.int8],
     flags: NDArray[np.uint8],
+    early: NDArray[np.uint8],
     true: NDArray[np.int32],
     model: NDArray[np.int32],
     data: NDArray[np.uint8],
     costs: NDArray[np.float64],
 ) -> int:
-    """Code the planes ``first`` down to ``last`` of one tile of one channel.
+    """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
 
     Parameters
     ----------
@@ -168,14 +184,16 @@ def code_planes(
         -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
     flags : uint8, flat
         Whether a block has a significant coefficient; updated.
+    early : uint8, flat
+        1 + the plane in whose first pass a coefficient was coded last; updated.
     true : int32, flat
         The coefficients with their signs, where writing; not looked at where reading.
     model : int32, see `new_model`
         Updated.
     data : uint8
-        Bytes of this run of planes; where writing, long enough (see `encode_bound`).
+        Bytes of this run of passes; where writing, long enough (see `encode_bound`).
     costs : float64, at least ``first + 1`` long
-        Where writing, the bits written when each plane ended. May be empty.
+        Where writing, the bits written when each pass ended. May be empty.
 
     Returns
     -------
@@ -187,7 +205,8 @@ def code_planes(
         for place in range(4):
             low = (low << 8) | (int(data[place]) if place < data.size else 0)
         place = 4
-    for plane in range(first, last - 1, -1):
+    for number in range(first, last - 1, -1):
+        plane, begins = number >> 1, (number & 1) == 1
         unit = 1 << plane
         for band in range(bands.shape[0]):
             offset, stride = bands[band, _OFFSET], bands[band, _STRIDE]
@@ -201,6 +220,8 @@ def code_planes(
                     right = min(left + 8, columns)
                     block = first_flag + (top >> 3) * (across + 1) + (left >> 3)
                     if flags[block & _INDEX] == 0:
+                        if begins:
+                            continue
                         family = known[(parent + (top >> row_shift) * parent_stride + (left >> column_shift)) & _INDEX]
                         context = _FIRST_FLAG + 2 * (
                             int(flags[(block - 1) & _INDEX]) + int(flags[(block - across - 1) & _INDEX])
@@ -229,35 +250,41 @@ def code_planes(
                             ahead = int(known[(north + 1) & _INDEX]) + int(known[(south + 1) & _INDEX])
                             east = int(known[(at + 1) & _INDEX])
                             total = (behind + 2 * (here + west + east) + ahead) >> plane
-                            own = value >> (plane + 1)
-                            family = known[(family_row + (j >> column_shift)) & _INDEX] >> plane
-                            context = (
-                                (min(own, 2) if own < 4 else 3) * 12 + int(_SUM_CLASS[min(total, 63)])
-                            ) * 3 + min(family, 2)
-                            if not decoding:
-                                bit = (abs(int(true[at & _INDEX])) >> plane) & 1
-                            bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
-                            if bit:
-                                value += unit
-                                known[at & _INDEX] = value
-                                if own == 0:
-                                    side = int(sign[(at - 1) & _INDEX]) + int(sign[(at + 1) & _INDEX])
-                                    rise = int(sign[north & _INDEX]) + int(sign[south & _INDEX])
-                                    context = _FIRST_SIGN + 3 * (min(max(side, -1), 1) + 1)
-                                    context += min(max(rise, -1), 1) + 1
-                                    if not decoding:
-                                        bit = 1 if true[at & _INDEX] < 0 else 0
-                                    bit, low, width, place = _code(
-                                        decoding, bit, low, width, place, data, model, context
-                                    )
-                                    sign[at & _INDEX] = -1 if bit else 1
+                            if begins:
+                                visits = value == 0 and total != 0
+                                early[at & _INDEX] = plane + 1 if visits else early[at & _INDEX]
+                            else:
+                                visits = early[at & _INDEX] != plane + 1
+                            if visits:
+                                own = value >> (plane + 1)
+                                family = known[(family_row + (j >> column_shift)) & _INDEX] >> plane
+                                context = (
+                                    (min(own, 2) if own < 4 else 3) * 12 + int(_SUM_CLASS[min(total, 63)])
+                                ) * 3 + min(family, 2)
+                                if not decoding:
+                                    bit = (abs(int(true[at & _INDEX])) >> plane) & 1
+                                bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
+                                if bit:
+                                    value += unit
+                                    known[at & _INDEX] = value
+                                    if own == 0:
+                                        side = int(sign[(at - 1) & _INDEX]) + int(sign[(at + 1) & _INDEX])
+                                        rise = int(sign[north & _INDEX]) + int(sign[south & _INDEX])
+                                        context = _FIRST_SIGN + 3 * (min(max(side, -1), 1) + 1)
+                                        context += min(max(rise, -1), 1) + 1
+                                        if not decoding:
+                                            bit = 1 if true[at & _INDEX] < 0 else 0
+                                        bit, low, width, place = _code(
+                                            decoding, bit, low, width, place, data, model, context
+                                        )
+                                        sign[at & _INDEX] = -1 if bit else 1
                             west, value = value, east
                             behind, here = here, ahead
                             at += 1
                             north += 1
                             south += 1
         if costs.size:
-            costs[plane] = 8.0 * place + 32.0 - np.log2(float(width))
+            costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
     if not decoding and low > _MASK:
         low &= _MASK
         _carry(place, data)
@@ -265,40 +292,50 @@ def code_planes(
 
 
 @kernel
-def plane_gains(
+def pass_gains(
     bands: NDArray[np.int64],
     weights: NDArray[np.float64],
-    top: int,
+    passes: int,
     true: NDArray[np.int32],
-    gains: NDArray[np.float64],
+    early: NDArray[np.uint8],
+    errors: NDArray[np.float64],
 ) -> None:
-    """Weighted squared error of a tile whose planes are known down to p, into ``gains[p]``; ``gains[top]``: none known.
+    """Weighted squared error of a tile by the passes that remain, into ``errors``, of length passes + 1.
 
-    ``weights`` are the squared norms of the bands' synthesis functions, one a band.
+    ``weights`` are the squared norms of the bands' synthesis functions, one a band; ``early`` is that of the whole
+    tile coded.
     """
-    gains[: top + 1] = 0.0
+    errors[:] = 0.0
     for band in range(bands.shape[0]):
-        sums = np.zeros(top + 1, np.float64)
+        sums = np.zeros(passes + 2, np.float64)
         offset, stride = bands[band, _OFFSET], bands[band, _STRIDE]
         for i in range(bands[band, _ROWS]):
             for j in range(bands[band, _COLUMNS]):
-                value = abs(int(true[offset + i * stride + j]))
+                at = offset + i * stride + j
+                value = abs(int(true[at]))
                 if value == 0:
                     continue
-                plane = top
-                square = float(value) * float(value)
+                remaining = passes
+                plane = (passes + 1) >> 1
                 while (value >> plane) == 0:
-                    sums[plane] += square
                     plane -= 1
-                while plane > 0:
-                    error = float((value & ((1 << plane) - 1)) - reconstruction_point(plane))
-                    sums[plane] += error * error
-                    plane -= 1
-        for plane in range(top + 1):
-            gains[plane] += weights[band] * sums[plane]
+                # Nothing is known until the pass that finds the coefficient significant, in its highest plane.
+                found = 2 * plane + 1 if early[at] == plane + 1 else 2 * plane
+                square = float(value) * float(value)
+                while remaining > found:
+                    sums[remaining] += square
+                    remaining -= 1
+                while remaining > 0:
+                    # The first pass of a lower plane tells nothing about a coefficient that is significant already.
+                    known = min((remaining + 1) >> 1, plane)
+                    error = float((value & ((1 << known) - 1)) - reconstruction_point(known))
+                    sums[remaining] += error * error
+                    remaining -= 1
+        for remaining in range(passes + 1):
+            errors[remaining] += weights[band] * sums[remaining]
 
 
 @kernel
 def reconstruction_point(plane: int) -> int:
     """What is added to a significant magnitude whose bits below ``plane`` are unknown."""
-    return (3 << plane) >> 3
+    return (7 << plane) >> 4

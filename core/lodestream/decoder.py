@@ -226,9 +226,9 @@ class Decoder:
         segments = []
         for entry in entries:
             place = frame.payload_offset + start
-            first = self._progress.advance(entry.tile, entry.channel, entry.top, entry.planes, place)
+            first = self._progress.advance(entry.tile, entry.channel, entry.top, entry.passes, place)
             data = bytes(frame.payload[start : start + entry.length])
-            segments.append(Coded(entry.tile, entry.channel, first, entry.planes, data, place))
+            segments.append(Coded(entry.tile, entry.channel, first, entry.passes, data, place))
             start += entry.length
             self._level = max(self._level, header.layout.tiles[entry.tile].level)
         for segment in segments:
@@ -251,7 +251,8 @@ class Decoder:
 
     def _show(self, number: int, level: int, held: int, rms: float, max_error: float, complete: bool) -> None:
         corrected = complete and self.header is not None and self.header.corrected
-        length, state = self._reconstruction.length, self._progress.state.copy()
+        whole = self.header is not None and (complete or number == self.header.layer_count - 1 and level == self.header.levels)
+        length, state = self._reconstruction.length, self._progress.snapshot(whole)
         self.layers.append(
             View(
                 number,
@@ -301,9 +302,9 @@ class Decoder:
                 raise CorruptStreamError("expected a segment to match its CRC, got other bytes", segment.range.offset)
             known = bool(self._progress.top[segment.tile, segment.channel])
             top = 0 if known else segment.top
-            first = self._progress.advance(segment.tile, segment.channel, top, segment.planes, segment.range.offset)
+            first = self._progress.advance(segment.tile, segment.channel, top, segment.passes, segment.range.offset)
             self._reconstruction.add(
-                Coded(segment.tile, segment.channel, first, segment.planes, payload, segment.range.offset)
+                Coded(segment.tile, segment.channel, first, segment.passes, payload, segment.range.offset)
             )
             if (state := self._slices.hold(segment)) is not None:
                 self._show(*state)

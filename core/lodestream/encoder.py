@@ -11,21 +11,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import exactness
 from .allocation import TileCurve, assign_layers
-from .bitplanes import code_planes, new_model, plane_gains
+from .bitplanes import code_passes, new_model, pass_count, pass_gains
 from .container.model import Header
-from .container.sections import TILE_BITS
+from .container.sections import MOST_FRACTION, TILE_BITS
 from .container.writer import CodedLayer, CodedSegment, write_container
-from .lattice import Lattice
+from .lattice import LATTICE_BITS, Lattice
 from .layout import Layout
 from .measure import distances, extent_of
 from .quantise import channel_of, choose_lattices
-from .reconstruction import to_points
+from .reconstruction import channel_picture, initial_state, to_points
 from .surface import Surface
 from .target import Tolerance
 from .tiles import Tiles, TileTable, gather
-from .transform import COEFFICIENT_BITS, allocate, forward, inverse, synthesis_norms
+from .transform import COEFFICIENT_BITS, allocate, forward, synthesis_norms
 
 __all__ = ["encode"]
+
+#: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
+#: whose tiles are all known is inverted without errors of rounding.
+_ROUNDING = 0.2
 
 Figures = tuple[float, float]
 State = NDArray[np.int8]
@@ -93,6 +97,7 @@ class _Encoding:
         tile = tile_exponents(surface.shape)
         self.layout = Layout(surface.shape, surface.closed, tile)
         self.table = TileTable.of(self.layout)
+        self.bits = 0
         self.lattices = choose_lattices(self.points, self.geometric, self.precision)
 
     def run(self) -> bytes:
@@ -113,6 +118,8 @@ class _Encoding:
             lattices=tuple(self.lattices),
             predictors=predictors,
             extent=self.extent,
+            empty=tuple(self._empty_levels(channel.top) for channel in channels),
+            fraction=max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits)),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
@@ -120,9 +127,9 @@ class _Encoding:
         )
         states, figures = self._measured(states)
         self.progress(0.7)
+        correction = self._correction()
         levels = self._level_figures(figures[-1])
         self.progress(0.8)
-        correction = self._correction(figures[-1])
         if correction or figures[-1] == (0.0, 0.0):
             levels[-1] = (0.0, 0.0)
         coded = self._coded(states, figures)
@@ -142,6 +149,7 @@ class _Encoding:
         for fit in (True, False):
             values = allocate(self.surface.shape)
             values[:] = lattice.coordinates(channel_of(self.points, number))
+            self.bits = max(self.bits, max(int(values.max()), -int(values.min())).bit_length())
             predictors = forward(values, self.layout, fit)
             if max(int(values.max()), -int(values.min())) < 1 << COEFFICIENT_BITS:
                 break
@@ -158,6 +166,11 @@ class _Encoding:
         top = np.array([self._top(true, number) for number in range(len(self.layout.tiles))], np.int8)
         return _Channel(true, weights, top), predictors
 
+    def _empty_levels(self, top: NDArray[np.int8]) -> int:
+        """The levels without a coefficient other than 0, as bits."""
+        levels = range(self.layout.levels + 1)
+        return sum(1 << level for level in levels if not top[self.layout.tiles_of(level)].any())
+
     def _top(self, true: NDArray[np.int32], tile: int) -> int:
         """Bit-planes of a tile."""
         rows = self.table.of_tile(tile)
@@ -168,44 +181,44 @@ class _Encoding:
         return largest.bit_length()
 
     def _curves(self) -> list[TileCurve]:
-        """Cost and gain of every plane, by coding each tile once as a whole."""
-        coder = _TileCoder(self.table, self.channels)
+        """Cost and gain of every pass, by coding each tile once as a whole."""
+        coder = self._whole = _TileCoder(self.table, self.channels)
         curves = []
         for tile in range(len(self.layout.tiles)):
             for number, channel in enumerate(self.channels):
                 top = int(channel.top[tile])
                 if top:
-                    costs = np.zeros(top, np.float64)
-                    coder.code(tile, number, top, top, costs)
-                    bits = np.diff(costs[::-1], prepend=32.0 - 32.0)[::-1]
-                    gains = np.zeros(top + 1, np.float64)
+                    passes = pass_count(top)
+                    costs = np.zeros(passes, np.float64)
+                    coder.code(tile, number, passes, passes, costs)
+                    bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+                    errors = np.zeros(passes + 1, np.float64)
                     first, last = self.table.first[tile], self.table.first[tile + 1]
-                    plane_gains(self.table.bands[first:last], channel.weights[first:last], top, channel.true, gains)
-                    curves.append(TileCurve(tile, number, bits, -np.diff(gains[::-1])[::-1]))
+                    early, weights = coder.tiles[number].early, channel.weights[first:last]
+                    rows = self.table.of_tile(tile)
+                    pass_gains(rows, weights, passes, channel.true, early, errors)
+                    gains = np.diff(errors)
+                    gains[0] += _ROUNDING * float((weights * rows[:, 2] * rows[:, 3]).sum())
+                    curves.append(TileCurve(tile, number, bits, gains))
         return curves
 
-    def _picture(self, state: State, level: int | None = None) -> NDArray[Any]:
-        """What a receiver shows that knows this state: of all levels, or up to one and nothing finer."""
-        pictures = []
-        for number, channel in enumerate(self.channels):
-            tiles = Tiles(self.table)
-            np.abs(channel.true, out=tiles.known)
-            np.sign(channel.true, out=tiles.sign, casting="unsafe")
-            coefficients = allocate(self.surface.shape)
-            for tile, place in enumerate(self.layout.tiles):
-                if level is None or place.level <= level:
-                    tiles.spread(tile, int(state[tile, number]), coefficients)
-            inverse(coefficients, self.layout, self.header.predictors[number], self.layout.levels)
-            pictures.append(coefficients)
-        return to_points(self.header, pictures)
+    def _figures(self, state: State) -> Figures:
+        """RMS and maximum error of what a receiver shows in this state, see `reconstruction.Reconstruction`."""
+        pictures = [
+            channel_picture(self.header, number, tiles, state[:, number], self.layout.levels)
+            for number, tiles in enumerate(self._whole.tiles)
+        ]
+        self._last = to_points(self.header, pictures)
+        return distances(self.points, self._last, self.geometric)
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
         """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
         kept: list[State] = []
         figures: list[Figures] = []
         for state in states:
-            self._last = self._picture(state)
-            measured = distances(self.points, self._last, self.geometric)
+            announced = state < self._all_passes()
+            shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
+            measured = self._figures(shown.astype(np.int8))
             while figures and measured[0] > figures[-1][0]:
                 kept.pop()
                 figures.pop()
@@ -215,31 +228,39 @@ class _Encoding:
 
     def _level_figures(self, last: Figures) -> list[Figures]:
         """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
-        complete = np.zeros((len(self.layout.tiles), len(self.channels)), np.int8)
-        return [
-            distances(self.points, self._picture(complete, level), self.geometric)
-            for level in range(self.layout.levels)
-        ] + [last]
+        passes = self._all_passes()
+        start = initial_state(self.header)
+        announced = np.where(passes > 0, 0, start).astype(np.int8)
+        figures = []
+        for level in range(self.layout.levels):
+            state = start.copy()
+            known = slice(0, self.layout.tiles_of(level).stop)
+            state[known] = announced[known]
+            figures.append(self._figures(state))
+        return [*figures, last]
 
-    def _correction(self, last: Figures) -> bytes:
+    def _all_passes(self) -> State:
+        """Passes of every tile and channel."""
+        return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
+
+    def _correction(self) -> bytes:
         """The exactness section's payload; empty where the lattice is exact or a precision was asked for."""
         delta = exactness.difference(self.points, self._last)
         self._exact_already = not delta
         return b"" if self.precision is not None else delta
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
-        """Code the planes that each layer adds."""
+        """Code the passes that each layer adds."""
         coder = _TileCoder(self.table, self.channels)
-        before = np.stack([channel.top for channel in self.channels], axis=1)
-        top = before
+        before = start = self._all_passes()
         layers = []
         for state, (rms, worst) in zip(states, figures, strict=True):
             segments = []
             for tile, number in np.argwhere(state < before):
                 first, last = int(before[tile, number]), int(state[tile, number])
                 data = coder.code(int(tile), int(number), first, first - last)
-                started = int(top[tile, number])
-                segments.append(CodedSegment(int(tile), int(number), started, first - last, first == started, data))
+                top, begins = int(self.channels[number].top[tile]), first == start[tile, number]
+                segments.append(CodedSegment(int(tile), int(number), top, first - last, bool(begins), data))
             layers.append(CodedLayer(rms, worst, segments))
             before = state
         return layers
@@ -251,24 +272,27 @@ class _TileCoder:
     def __init__(self, table: TileTable, channels: list[_Channel]) -> None:
         self._table = table
         self._channels = channels
-        self._tiles = [Tiles(table) for _ in channels]
+        self.tiles = [Tiles(table) for _ in channels]
         self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
-    def code(self, tile: int, channel: int, first: int, planes: int, costs: NDArray[np.float64] | None = None) -> bytes:
-        """The bytes of ``planes`` planes below ``first`` of a tile."""
+    def code(
+        self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None
+    ) -> bytes:
+        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
         model = self._models.setdefault((tile, channel), new_model())
-        tiles, rows = self._tiles[channel], self._table.of_tile(tile)
+        tiles, rows = self.tiles[channel], self._table.of_tile(tile)
         coefficients = int((rows[:, 2] * rows[:, 3]).sum())
         # A decision takes at most 11 bits (a chance of 32 in 2**16); a coefficient decides twice in a plane at the most.
-        data = np.empty(64 + 3 * planes * coefficients, np.uint8)
-        length = code_planes(
+        data = np.empty(64 + 3 * passes * coefficients, np.uint8)
+        length = code_passes(
             False,
             rows,
             first - 1,
-            first - planes,
+            first - passes,
             tiles.known,
             tiles.sign,
             tiles.flags,
+            tiles.early,
             self._channels[channel].true,
             model,
             data,

@@ -33,9 +33,10 @@ class Lattice:
     origin: float
     step: float
 
-    def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Values of lattice coordinates, any shape, in the given dtype."""
+    def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any], fraction: int = 0) -> NDArray[Any]:
+        """Values of lattice coordinates over 2**fraction, any shape, in the given dtype."""
         q = coordinates.astype(np.float64)
+        q *= 2.0**-fraction
         if self.rule == "decimal":
             q += self.origin
             q /= self.step

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import exactness
-from .bitplanes import code_planes, new_model
+from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
 from .errors import CorruptStreamError
-from .tiles import Tiles, TileTable
-from .transform import COEFFICIENT_BITS, allocate, inverse
+from .tiles import UNANNOUNCED, Tiles, TileTable
+from .transform import allocate, inverse
 
-__all__ = ["Coded", "Progress", "Reconstruction", "to_points"]
+__all__ = ["Coded", "Progress", "Reconstruction", "channel_picture", "initial_state", "to_points"]
 
 _NO_COSTS = np.zeros(0, np.float64)
 _NO_TRUTH = np.zeros(0, np.int32)
@@ -25,12 +25,12 @@ _NO_TRUTH = np.zeros(0, np.int32)
 
 @dataclass(frozen=True)
 class Coded:
-    """A segment with its bytes: ``planes`` planes of a tile down from ``first``; ``offset`` is its place."""
+    """A segment with its bytes: ``passes`` passes of a tile down from ``first``; ``offset`` is its place."""
 
     tile: int
     channel: int
     first: int
-    planes: int
+    passes: int
     data: bytes
     offset: int
 
@@ -38,8 +38,8 @@ class Coded:
 class Reconstruction:
     """Decodes segments when a picture asks for them, in the order in which they were added.
 
-    A *state* is the lowest plane known of every tile and channel: int8, shape (tile, channel); where nothing is known, the
-    tile's ``top`` or more. States that lie behind what was decoded are pictures too: bits below a state's planes are ignored.
+    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
+    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes told is ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -75,15 +75,10 @@ class Reconstruction:
         """
         with self._lock:
             self._decode(length)
-            table = self._layout_table()
-            channels = []
-            for channel, tiles in enumerate(self._tiles):
-                coefficients = allocate(self.header.layout.shapes[level])
-                for number, tile in enumerate(table.layout.tiles):
-                    if tile.level <= level:
-                        tiles.spread(number, int(state[number, channel]), coefficients)
-                inverse(coefficients, table.layout, self.header.predictors[channel], level)
-                channels.append(coefficients)
+            channels = [
+                channel_picture(self.header, channel, tiles, state[:, channel], level)
+                for channel, tiles in enumerate(self._tiles)
+            ]
         points = to_points(self.header, channels)
         if corrected and self._correction is not None:
             points = exactness.restore(points, *self._correction)
@@ -102,65 +97,101 @@ class Reconstruction:
             key = segment.tile, segment.channel
             tiles = self._tiles[segment.channel]
             model = self._models.setdefault(key, new_model())
-            code_planes(
+            code_passes(
                 True,
                 table.of_tile(segment.tile),
                 segment.first,
-                segment.first - segment.planes + 1,
+                segment.first - segment.passes + 1,
                 tiles.known,
                 tiles.sign,
                 tiles.flags,
+                tiles.early,
                 _NO_TRUTH,
                 model,
                 np.frombuffer(segment.data, np.uint8).copy(),
                 _NO_COSTS,
             )
-            if segment.first < segment.planes:
+            if segment.first < segment.passes:
                 del self._models[key]
-            self._queue[self._taken] = Coded(*key, segment.first, segment.planes, b"", segment.offset)
+            self._queue[self._taken] = Coded(*key, segment.first, segment.passes, b"", segment.offset)
             self._taken += 1
 
 
 class Progress:
-    """Which planes of each tile have been announced so far, and whether a segment continues them."""
+    """Which passes of each tile have been announced so far, and whether a segment continues them."""
 
     def __init__(self, header: Header) -> None:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
-        # Above every plane: a state holds nothing of a tile that comes later.
-        self.state = np.full(shape, COEFFICIENT_BITS, np.int8)
+        self.state = initial_state(header)
 
-    def advance(self, tile: int, channel: int, top: int, planes: int, offset: int) -> int:
-        """Note a segment; returns the first of its planes.
+    def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
+        """Note a segment; returns the first of its passes.
 
         Parameters
         ----------
         top : int
-            Planes of the tile, told with its first segment; 0 with the others.
+            Bit-planes of the tile, told with its first segment; 0 with the others.
 
         Raises
         ------
         CorruptStreamError
-            When the tile was not announced, was announced already, or has not so many planes left.
+            When the tile was not announced, was announced already, or has not so many passes left.
         """
         known = int(self.top[tile, channel])
+        if not known and self.state[tile, channel] == 0:
+            raise CorruptStreamError(f"expected no segment of tile {tile}, whose level has zeros only", offset)
         if bool(top) == bool(known):
             problem = "told again" if known else "not told"
             raise CorruptStreamError(f"expected the planes of tile {tile} once, with its first segment: {problem}", offset)
         if top:
-            self.top[tile, channel] = self.state[tile, channel] = top
+            self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
         below = int(self.state[tile, channel])
-        if planes > below:
-            raise CorruptStreamError(f"expected at most {below} more planes of tile {tile}, got {planes}", offset)
-        self.state[tile, channel] = below - planes
+        if passes > below:
+            raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
+        self.state[tile, channel] = below - passes
         return below - 1
 
+    def snapshot(self, whole: bool) -> NDArray[np.int8]:
+        """The present state; a tile that no layer announces has nothing but zeros, which the ``whole`` of them tells."""
+        return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
 
-def to_points(header: Header, channels: Sequence[NDArray[np.int32]]) -> NDArray[Any]:
-    """Values of lattice coordinates, one array (row, column) a channel, in the surface's dtype and axes."""
+
+def initial_state(header: Header) -> NDArray[np.int8]:
+    """The state before the first layer: of the levels without a coefficient other than 0 everything is known."""
+    levels = np.array([tile.level for tile in header.layout.tiles])
+    known = (np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1
+    return np.where(known.astype(bool), 0, UNANNOUNCED).astype(np.int8)
+
+
+def channel_picture(
+    header: Header, channel: int, tiles: Tiles, state: NDArray[np.int8], level: int
+) -> tuple[NDArray[np.int32], int]:
+    """One channel of the grid of ``level`` in a state.
+
+    Returns
+    -------
+    (int32 array, shape (row, column), int)
+        Lattice coordinates over two to the power of the second.
+    """
+    layout = header.layout
+    whole = 0
+    while whole < level and not state[layout.tiles_of(whole + 1)].any():
+        whole += 1
+    fraction = header.fraction if whole < level else 0
+    coefficients = allocate(layout.shapes[level])
+    for number in range(layout.tiles_of(level).stop):
+        finer = fraction if layout.tiles[number].level > whole else 0
+        tiles.spread(number, int(state[number]), coefficients, finer)
+    inverse(coefficients, layout, header.predictors[channel], level, whole, fraction)
+    return coefficients, fraction
+
+
+def to_points(header: Header, channels: Sequence[tuple[NDArray[np.int32], int]]) -> NDArray[Any]:
+    """Values of each `channel_picture`, in the surface's dtype and axes."""
     if header.flat:
-        return header.lattices[0].values(channels[0], header.dtype)
-    points = np.empty((*channels[0].shape, len(channels)), header.dtype)
-    for number, (lattice, coordinates) in enumerate(zip(header.lattices, channels, strict=True)):
-        points[..., number] = lattice.values(coordinates, header.dtype)
+        return header.lattices[0].values(channels[0][0], header.dtype, channels[0][1])
+    points = np.empty((*channels[0][0].shape, len(channels)), header.dtype)
+    for number, (lattice, (coordinates, fraction)) in enumerate(zip(header.lattices, channels, strict=True)):
+        points[..., number] = lattice.values(coordinates, header.dtype, fraction)
     return points

@@ -1,4 +1,4 @@
-"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat, each band in a frame of zeros."""
+"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, each band in a frame of zeros."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from .bitplanes import BAND_FIELDS, reconstruction_point
 from .kernels import kernel
 from .layout import Band, Layout
 
-__all__ = ["TileTable", "Tiles"]
+__all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
 
+#: Passes that remain of a tile that was not announced: more than any tile has.
+UNANNOUNCED = 57
 _NO_SHIFT = 31  # takes any row or column to 0, where a band without a parent finds a zero
 
 
@@ -80,22 +82,24 @@ class TileTable:
 
 
 class Tiles:
-    """Magnitudes, signs and block flags of one channel."""
+    """Magnitudes, signs, block flags and marks of first passes of one channel, see `bitplanes.code_passes`."""
 
     def __init__(self, table: TileTable) -> None:
         self.table = table
         self.known = np.zeros(table.size, np.int32)
         self.sign = np.zeros(table.size, np.int8)
         self.flags = np.zeros(table.blocks, np.uint8)
+        self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, plane: int, coefficients: NDArray[np.int32]) -> None:
-        """Put a tile's coefficients, as far as they are known down to ``plane``, into the array of all coefficients.
+    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32], fraction: int = 0) -> None:
+        """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
 
-        Unknown bits are replaced by the reconstruction point; planes below ``plane`` count as unknown even where they
-        are known.
+        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown. The
+        numbers are multiplied by 2**fraction.
         """
         for band, row in zip(self.table.layout.tiles[tile].bands, self.table.of_tile(tile), strict=True):
-            _spread(self.known, self.sign, row[0], row[1], plane, _window(coefficients, band))
+            window = _window(coefficients, band)
+            _spread(self.known, self.sign, self.early, row[0], row[1], remaining, fraction, window)
 
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
@@ -104,16 +108,30 @@ def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
 
 @kernel
 def _spread(
-    known: NDArray[np.int32], sign: NDArray[np.int8], offset: int, stride: int, plane: int, out: NDArray[np.int32]
+    known: NDArray[np.int32],
+    sign: NDArray[np.int8],
+    early: NDArray[np.uint8],
+    offset: int,
+    stride: int,
+    remaining: int,
+    fraction: int,
+    out: NDArray[np.int32],
 ) -> None:
-    middle = reconstruction_point(plane)
+    half = remaining & 1
+    begun = remaining >> 1  # the plane whose first pass is the last one known, if half
+    plane = begun + half
+    middle, middle_begun = reconstruction_point(plane), (1 << begun) + reconstruction_point(begun)
     width = out.shape[1]
     for i in range(out.shape[0]):
         start = offset + i * stride
-        magnitudes, signs, row = known[start : start + width], sign[start : start + width], out[i]
+        magnitudes, signs, marks = known[start : start + width], sign[start : start + width], early[start : start + width]
+        row = out[i]
         for j in range(width):
             high = np.int32((magnitudes[j] >> plane) << plane)
-            row[j] = np.int32(signs[j]) * np.int32(high + middle) if high else 0
+            value = np.int32(high + middle) if high else np.int32(0)
+            if half and not high and marks[j] == begun + 1 and magnitudes[j] >> begun:
+                value = np.int32(middle_begun)
+            row[j] = (np.int32(signs[j]) * value) << fraction
 
 
 def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:

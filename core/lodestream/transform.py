@@ -73,9 +73,24 @@ def forward(values: NDArray[np.int32], layout: Layout, fit: bool = True) -> NDAr
     return predictors
 
 
-def inverse(coefficients: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], level: int) -> None:
-    """Turn coefficients into the grid of ``level``, in place, in the first rows and columns of the array."""
+def inverse(
+    coefficients: NDArray[np.int32],
+    layout: Layout,
+    predictors: NDArray[np.int8],
+    level: int,
+    whole: int | None = None,
+    fraction: int = 0,
+) -> None:
+    """Turn coefficients into the grid of ``level``, in place, in the first rows and columns of the array.
+
+    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count lattice steps, those above count steps over 2**fraction; so does the
+    result where ``whole`` is less than ``level``. Where all details are known, rounding to whole steps undoes that of
+    the forward transform; where they are not, it would only add errors of its own from level to level.
+    """
     for finer in range(1, level + 1):
+        if whole is not None and finer == whole + 1:
+            rows, columns = layout.shapes[whole]
+            coefficients[:rows, :columns] <<= fraction
         rows, columns = layout.shapes[finer]
         corner = coefficients[:rows, :columns]
         steps = layout.steps(finer)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream
+from lodestream.bitplanes import pass_count
 from lodestream.container import Header
 from lodestream.encoder import _Channel, _TileCoder
 from lodestream.lattice import Lattice
@@ -22,10 +23,10 @@ from lodestream.layout import Layout
 from lodestream.reconstruction import Coded, Reconstruction
 from lodestream.tiles import TileTable, gather
 
-__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "planes_of", "uncompiled"]
+__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "uncompiled"]
 
 Ints = NDArray[np.int32]
-#: (tile, channel, first plane, planes), in coding order.
+#: (tile, channel, first pass, passes), in coding order.
 Runs = Iterable[tuple[int, int, int, int]]
 
 
@@ -39,8 +40,13 @@ def planes_of(layout: Layout, coefficients: Ints) -> list[int]:
     ]
 
 
+def passes_of(layout: Layout, coefficients: Ints) -> list[int]:
+    """Coding passes of every tile."""
+    return [pass_count(planes) for planes in planes_of(layout, coefficients)]
+
+
 def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]:
-    """Code runs of planes, one after another."""
+    """Code runs of passes, one after another."""
     table = TileTable.of(layout)
     bands = np.ones(len(table.bands))
     coder = _TileCoder(
@@ -48,8 +54,8 @@ def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]
         [_Channel(gather(table, c), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
     )
     return [
-        Coded(tile, channel, first, planes, coder.code(tile, channel, first + 1, planes), 0)
-        for tile, channel, first, planes in runs
+        Coded(tile, channel, first, passes, coder.code(tile, channel, first + 1, passes), 0)
+        for tile, channel, first, passes in runs
     ]
 
 
@@ -63,6 +69,8 @@ def header_for(layout: Layout, channels: int) -> Header:
         lattices=(Lattice("affine", 0.0, 1.0),) * channels,
         predictors=np.zeros((channels, layout.levels, 2, 2), np.int8),
         extent=1.0,
+        fraction=0,
+        empty=(0,) * channels,
         tile=layout.tile,
         exact=False,
         corrected=False,
@@ -71,7 +79,7 @@ def header_for(layout: Layout, channels: int) -> Header:
 
 
 def decode_runs(layout: Layout, channels: int, coded: Iterable[Coded], state: list[list[int]]) -> list[Ints]:
-    """Coefficients after the runs, as far as planes are known down to ``state[tile][channel]``."""
+    """Coefficients after the runs, as they are known when ``state[tile][channel]`` passes remain."""
     reader = Reconstruction(header_for(layout, channels))
     for segment in coded:
         reader.add(segment)

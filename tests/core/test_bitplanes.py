@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream.bitplanes import plane_gains, reconstruction_point
+from lodestream.bitplanes import pass_count, pass_gains, reconstruction_point
 from lodestream.layout import Layout
-from lodestream.reconstruction import Coded
+from lodestream.reconstruction import Coded, Reconstruction
 from lodestream.tiles import TileTable, gather
 from lodestream.transform import COEFFICIENT_BITS
 
-from .coding import decode_runs, encode_runs, planes_of, uncompiled
+from .coding import decode_runs, encode_runs, header_for, passes_of, planes_of, uncompiled
 
 Ints = NDArray[np.int32]
 
@@ -31,14 +31,15 @@ def coefficients(shape: tuple[int, int], bits: int, density: float, seed: int) -
 def random_runs(
     rng: np.random.Generator, layout: Layout, channels: list[Ints]
 ) -> tuple[list[tuple[int, int, int, int]], list[list[int]]]:
-    """All planes in runs of random lengths, in an order in which what contexts may see comes first."""
-    tops = [planes_of(layout, c) for c in channels]
+    """All passes in runs of random lengths, in an order in which what contexts may see comes first."""
+    counts = [passes_of(layout, c) for c in channels]
     left = {
-        (tile, c): tops[c][tile] for tile in range(len(layout.tiles)) for c in range(len(channels)) if tops[c][tile]
+        (tile, c): counts[c][tile] for tile in range(len(layout.tiles)) for c in range(len(channels)) if counts[c][tile]
     }
     runs = []
     for threshold in sorted(
-        {int(n) for n in rng.integers(0, COEFFICIENT_BITS, rng.integers(0, 8))} | {0}, reverse=True
+        # A plane of a parent must be known whole before a child's: thresholds are even, or runs of a pass each follow.
+        {2 * int(n) for n in rng.integers(0, COEFFICIENT_BITS, rng.integers(0, 8))} | {0}, reverse=True
     ):
         for (tile, channel), known in sorted(left.items()):
             if known > threshold:
@@ -87,7 +88,7 @@ def test_the_largest_and_smallest_coefficients_come_back(fill: int) -> None:
 def test_noise_that_cannot_be_compressed_stays_within_its_buffer() -> None:
     layout = Layout((150, 150), (False, False), (7, 7))
     values = np.random.default_rng(1).integers(-(2**28) + 1, 2**28, (150, 150), np.int32)
-    runs = [(tile, 0, top - 1, top) for tile, top in enumerate(planes_of(layout, values))]
+    runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values))]
     coded = encode_runs(layout, [values], runs)
     assert sum(len(segment.data) for segment in coded) < 1.02 * 150 * 150 * 29 / 8
     np.testing.assert_array_equal(decode_runs(layout, 1, coded, [[0]] * len(layout.tiles))[0], values)
@@ -98,8 +99,10 @@ def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
     values = coefficients((33, 33), 12, 1.0, 7)
     tops = planes_of(layout, values)
     for plane in (0, 1, 4, 11):
-        runs = [(tile, 0, top - 1, top - plane) for tile, top in enumerate(tops) if top > plane]
-        known = decode_runs(layout, 1, encode_runs(layout, [values], runs), [[plane]] * len(tops))[0]
+        runs = [
+            (tile, 0, pass_count(top) - 1, pass_count(top) - 2 * plane) for tile, top in enumerate(tops) if top > plane
+        ]
+        known = decode_runs(layout, 1, encode_runs(layout, [values], runs), [[2 * plane]] * len(tops))[0]
         high = np.abs(values) >> plane
         middle = np.where(high > 0, (high << plane) + reconstruction_point(plane), 0)
         np.testing.assert_array_equal(known, np.sign(values) * middle)
@@ -107,14 +110,15 @@ def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
         assert np.abs(known - values).max() < 2**plane
 
 
-def test_planes_known_beyond_a_state_do_not_show_in_it() -> None:
+@pytest.mark.parametrize("cut", [9, 10])
+def test_passes_known_beyond_a_state_do_not_show_in_it(cut: int) -> None:
     layout = Layout((20, 20), (False, False), (3, 3))
     values = coefficients((20, 20), 10, 1.0, 8)
-    tops = planes_of(layout, values)
-    coarse = [(tile, 0, top - 1, top - 5) for tile, top in enumerate(tops) if top > 5]
-    fine = [(tile, 0, min(top, 5) - 1, min(top, 5)) for tile, top in enumerate(tops) if top]
+    counts = passes_of(layout, values)
+    coarse = [(tile, 0, count - 1, count - cut) for tile, count in enumerate(counts) if count > cut]
+    fine = [(tile, 0, min(count, cut) - 1, min(count, cut)) for tile, count in enumerate(counts) if count]
     coded = encode_runs(layout, [values], coarse + fine)
-    state = [[min(top, 5)] for top in tops]
+    state = [[min(count, cut)] for count in counts]
     before = decode_runs(layout, 1, coded[: len(coarse)], state)[0]
     np.testing.assert_array_equal(decode_runs(layout, 1, coded, state)[0], before)
 
@@ -122,13 +126,13 @@ def test_planes_known_beyond_a_state_do_not_show_in_it() -> None:
 def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None:
     layout = Layout((30, 30), (False, False), (4, 4))
     values = coefficients((30, 30), 9, 0.5, 9)
-    runs = [(tile, 0, top - 1, top) for tile, top in enumerate(planes_of(layout, values)) if top]
+    runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values)) if count]
     coded = encode_runs(layout, [values], runs)
     end = [[0]] * len(layout.tiles)
-    padded = [Coded(s.tile, s.channel, s.first, s.planes, s.data + bytes(9), 0) for s in coded]
+    padded = [Coded(s.tile, s.channel, s.first, s.passes, s.data + bytes(9), 0) for s in coded]
     np.testing.assert_array_equal(decode_runs(layout, 1, padded, end)[0], values)
     for seed, data in enumerate([b"", b"\xff", b"\xff" * 3000, b"\x00" * 3000, bytes(range(256)) * 9]):
-        other = [Coded(s.tile, s.channel, s.first, s.planes, data, seed) for s in coded]
+        other = [Coded(s.tile, s.channel, s.first, s.passes, data, seed) for s in coded]
         decoded = decode_runs(layout, 1, other, end)[0]
         assert np.abs(decoded.astype(np.int64)).max() < 2**COEFFICIENT_BITS
 
@@ -136,20 +140,25 @@ def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None
 def test_gains_are_the_squared_errors_of_what_is_known() -> None:
     layout = Layout((25, 18), (False, False), (3, 3))
     table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
-    flat = gather(table, values)
-    for tile, top in enumerate(planes_of(layout, values)):
+    counts = passes_of(layout, values)
+    reader = Reconstruction(header_for(layout, 1))
+    for segment in encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n]):
+        reader.add(segment)
+    reader._decode(reader.length)
+    for tile, count in enumerate(counts):
+        if not count:
+            continue
         rows = table.of_tile(tile)
         weights = np.arange(1.0, len(rows) + 1)
-        gains = np.zeros(top + 1)
-        plane_gains(rows, weights, top, flat, gains)
-        for plane in range(top + 1):
-            expected = 0.0
-            for weight, band in zip(weights, layout.tiles[tile].bands, strict=True):
-                true = np.abs(values[slice(*band.rows), slice(*band.columns)].astype(np.int64))
-                high = true >> plane
-                known = np.where(high > 0, (high << plane) + reconstruction_point(plane), 0)
-                expected += weight * float(((true - known) ** 2).sum())
-            assert gains[plane] == pytest.approx(expected)
+        errors = np.zeros(count + 1)
+        pass_gains(rows, weights, count, gather(table, values), reader._tiles[0].early, errors)
+        for remaining in range(count + 1):
+            known = np.zeros(layout.shape, np.int32)
+            reader._tiles[0].spread(tile, remaining, known)
+            squares = (values.astype(np.int64) - known) ** 2
+            bands = layout.tiles[tile].bands
+            expected = [w * squares[slice(*b.rows), slice(*b.columns)].sum() for w, b in zip(weights, bands, strict=True)]
+            assert errors[remaining] == pytest.approx(float(sum(expected)))
 
 
 def digest() -> str:

@@ -46,6 +46,10 @@ class Header:
         The third step's (a, b) of the step from ``level`` to ``level + 1`` along each axis.
     extent : float
         Range of the heights, or diagonal of the box of the points; what ``1e-3d`` refers to.
+    fraction : int
+        Binary places between lattice steps in which pictures of incomplete levels are computed.
+    empty : tuple of int
+        For each channel the levels, as bits, that have no coefficient other than 0.
     tile : (int, int)
         Exponents of two: rows and columns of a tile, in coefficients of one band.
     exact : bool
@@ -65,6 +69,8 @@ class Header:
     lattices: tuple[Lattice, ...]
     predictors: NDArray[np.int8]
     extent: float
+    fraction: int
+    empty: tuple[int, ...]
     tile: tuple[int, int]
     exact: bool
     corrected: bool
@@ -122,7 +128,7 @@ class LevelRecord:
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of ``planes`` bit-planes that one tile of one channel adds in one layer.
+    """A run of ``passes`` coding passes that one tile of one channel adds in one layer.
 
     ``top`` is the number of bit-planes of the tile, told with its first segment and repeated here.
     """
@@ -131,7 +137,7 @@ class Segment:
     tile: int
     channel: int
     top: int
-    planes: int
+    passes: int
     range: ByteRange
     crc: int
 

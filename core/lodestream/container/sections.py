@@ -26,6 +26,7 @@ __all__ = [
     "LAYER",
     "MAGIC",
     "METADATA",
+    "MOST_FRACTION",
     "OPTIONAL",
     "TILE_BITS",
     "VERSION",
@@ -57,6 +58,8 @@ LARGEST_SURFACE = 2**31
 #: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
 _LARGEST_FILE = 2**62
+#: Most binary places between lattice steps.
+MOST_FRACTION = 6
 _DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 _RULES = ("affine", "decimal")
 
@@ -67,7 +70,7 @@ class Entry(NamedTuple):
     tile: int
     channel: int
     top: int
-    planes: int
+    passes: int
     length: int
 
 
@@ -89,10 +92,13 @@ def serialize_header(header: Header) -> bytes:
     for number in (*header.shape, header.channels, header.layer_count):
         out.varint(number)
     out.byte(header.tile[0] | header.tile[1] << 4)
+    out.byte(header.fraction)
     out.pack("d", header.extent)
     for lattice in header.lattices:
         out.byte(_RULES.index(lattice.rule))
         out.pack("dd", lattice.origin, lattice.step)
+    for levels in header.empty:
+        out.varint(levels)
     fitted = fitted_steps(header.layout)
     for predictors in header.predictors:
         for level, axis in fitted:
@@ -122,6 +128,9 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     count = max(1, shape[0] >> tile[0]) * max(1, shape[1] >> tile[1])
     if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + (points >> (TILE_BITS - 1)):
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
+    fraction = fields.byte()
+    if fraction > MOST_FRACTION:
+        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
     (extent,) = fields.unpack("d")
     lattices = []
     for _ in range(channels):
@@ -134,6 +143,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     closed = bool(flags & 1), bool(flags & 2)
     layout = Layout(shape, closed, tile)
+    empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
     fitted = fitted_steps(layout)
     predictors = np.stack([default_predictors(layout)] * channels)
     for channel in range(channels):
@@ -150,6 +160,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         lattices=tuple(lattices),
         predictors=predictors,
         extent=extent,
+        fraction=fraction,
+        empty=empty,
         tile=tile,
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
@@ -161,7 +173,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
 def serialize_layer(rms: float, max_error: float, entries: Sequence[Entry], channels: int) -> bytes:
     """A layer's errors and table; the segments follow it in the section's payload.
 
-    Each entry starts with a byte: planes - 1 in the low three bits (7: a varint of planes - 8 follows), and in the
+    Each entry starts with a byte: passes - 1 in the low three bits (7: a varint of passes - 8 follows), and in the
     high five the tiles passed over since the last (31: a varint of the number - 31 follows).
     """
     out = FieldWriter()
@@ -170,13 +182,13 @@ def serialize_layer(rms: float, max_error: float, entries: Sequence[Entry], chan
     unit = 0
     for entry in entries:
         place = entry.tile * channels + entry.channel
-        skip, planes = place - unit, entry.planes - 1
-        out.byte(min(planes, 7) | min(skip, 31) << 3)
-        if planes >= 7:
-            out.varint(planes - 7)
+        skip, passes = place - unit, entry.passes - 1
+        out.byte(min(passes, 7) | min(skip, 31) << 3)
+        if passes >= 7:
+            out.varint(passes - 7)
         if skip >= 31:
             out.varint(skip - 31)
-        # The top is told once: with the run of planes that starts at it.
+        # The top is told once: with the run of passes that starts at it.
         out.varint(entry.length << 1 | (entry.top > 0))
         if entry.top:
             out.byte(entry.top)
@@ -192,18 +204,18 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[float
     entries, unit = [], 0
     for _ in range(fields.varint(units)):
         start, first = fields.at, fields.byte()
-        planes = (first & 7) + 1
-        if planes == 8:
-            planes += fields.varint(COEFFICIENT_BITS)
+        passes = (first & 7) + 1
+        if passes == 8:
+            passes += fields.varint(2 * COEFFICIENT_BITS)
         skip = first >> 3
         if skip == 31:
             skip += fields.varint(units)
         length = fields.varint(_LARGEST_FILE)
         top = fields.byte() if length & 1 else 0
         unit += skip
-        if unit >= units or max(top, planes) > COEFFICIENT_BITS or length < 2:
+        if unit >= units or top > COEFFICIENT_BITS or length < 2:
             raise CorruptStreamError(f"expected one of {units} tiles and at most 28 planes, got {unit}, {top}", start)
-        entries.append(Entry(*divmod(unit, header.channels), top, planes, length >> 1))
+        entries.append(Entry(*divmod(unit, header.channels), top, passes, length >> 1))
         unit += 1
     if sum(entry.length for entry in entries) != len(payload) - fields.place:
         raise CorruptStreamError("expected segments as long as the layer's table says, got another length", offset)
@@ -253,7 +265,7 @@ def serialize_index(index: Index) -> bytes:
         for segment in members:
             place = segment.tile * index.header.channels + segment.channel
             out.varint(place - unit)
-            out.byte(segment.planes)
+            out.byte(segment.passes)
             out.byte(segment.top)
             out.varint(segment.range.length)
             out.pack("I", segment.crc)
@@ -277,21 +289,21 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
         members, unit = [], 0
         for _ in range(fields.varint(units)):
             unit += fields.varint(units)
-            planes, top = fields.byte(), fields.byte()
+            passes, top = fields.byte(), fields.byte()
             size = fields.varint(length)
             (crc,) = fields.unpack("I")
-            if unit >= units or not 1 <= planes <= top <= COEFFICIENT_BITS or size == 0:
+            if unit >= units or not 1 <= passes < 2 * top <= 2 * COEFFICIENT_BITS or size == 0:
                 raise CorruptStreamError(
-                    f"expected one of {units} tiles and its planes, got {unit}, {planes}", fields.at
+                    f"expected one of {units} tiles and its passes, got {unit}, {passes}", fields.at
                 )
-            members.append((*divmod(unit, header.channels), top, planes, size, int(crc)))
+            members.append((*divmod(unit, header.channels), top, passes, size, int(crc)))
             unit += 1
         # Segments fill the end of a layer's payload, before its CRC.
         at = place + length - 4 - sum(member[4] for member in members)
         if at < place:
             raise CorruptStreamError(f"expected segments within their layer of {length} bytes, got more", fields.at)
-        for tile, channel, top, planes, size, crc in members:
-            segments.append(Segment(number, tile, channel, top, planes, ByteRange(at, size), crc))
+        for tile, channel, top, passes, size, crc in members:
+            segments.append(Segment(number, tile, channel, top, passes, ByteRange(at, size), crc))
             at += size
             level = max(level, header.layout.tiles[tile].level)
         layers.append(LayerRecord(number, place, place + length, level, rms, max_error))

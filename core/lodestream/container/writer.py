@@ -15,12 +15,12 @@ __all__ = ["CodedLayer", "CodedSegment", "write_container"]
 
 @dataclass(frozen=True)
 class CodedSegment:
-    """A run of planes of a tile with its bytes; ``top`` planes in all, ``begins`` with the highest of them."""
+    """A run of passes of a tile with its bytes; ``top`` bit-planes in all, ``begins`` with the first pass."""
 
     tile: int
     channel: int
     top: int
-    planes: int
+    passes: int
     begins: bool
     data: bytes
 
@@ -64,7 +64,7 @@ def write_container(
     records, segments, finest = [], [], 0
     for number, layer in enumerate(layers):
         entries = [
-            sections.Entry(s.tile, s.channel, s.top if s.begins else 0, s.planes, len(s.data)) for s in layer.segments
+            sections.Entry(s.tile, s.channel, s.top if s.begins else 0, s.passes, len(s.data)) for s in layer.segments
         ]
         table = sections.serialize_layer(layer.rms, layer.max_error, entries, header.channels)
         body = b"".join(s.data for s in layer.segments)
@@ -73,7 +73,7 @@ def write_container(
         place = len(out) - 4 - len(body)
         for s in layer.segments:
             where = ByteRange(place, len(s.data))
-            segments.append(Segment(number, s.tile, s.channel, s.top, s.planes, where, zlib.crc32(s.data)))
+            segments.append(Segment(number, s.tile, s.channel, s.top, s.passes, where, zlib.crc32(s.data)))
             place += len(s.data)
             finest = max(finest, header.layout.tiles[s.tile].level)
         records.append(LayerRecord(number, start, len(out), finest, layer.rms, layer.max_error))
