@@ -2,7 +2,8 @@
 
 A *node* is a sample that the coarser level keeps a value for, a *midpoint* one that is predicted from the nodes on
 either side. Nodes and midpoints alternate along a *run*. An interval between nodes that has no midpoint is a *gap*; it
-decouples the least-squares system, so both of its sides are free ends (design of the hierarchy: ``docs/mathematics.md``).
+decouples the least-squares system, so both of its sides are free ends, see
+``docs/mathematics.md``.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from .container.model import ByteRange, Header, Index
 from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .errors import CorruptStreamError, OptionError, TruncatedStreamError
+from .georeference import level_geotransform
 from .reconstruction import Coded, Progress, Reconstruction
 from .surface import Surface
 
@@ -73,9 +75,25 @@ class View:
         corrected = self._corrected and level == header.levels
         return self._reconstruction.points(self._length, self._state, level, corrected)
 
-    def surface(self) -> Surface:
-        """The full-resolution picture as a surface, with its metadata as far as they have come."""
-        return Surface(self.points, self._reconstruction.header.closed, metadata=self._metadata)
+    def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
+        """The full-resolution picture as a surface, or the grid of a coarser level.
+
+        Parameters
+        ----------
+        level : int, optional
+            Of a coarser level of heights the geotransform spans what the surface spans.
+        metadata : mapping, optional
+            In place of the container's own, which are there only as far as they have come.
+        """
+        header = self._reconstruction.header
+        values = dict(self._metadata if metadata is None else metadata)
+        if level is None or level == header.levels:
+            return Surface(self.points, header.closed, metadata=values)
+        points = self.points_at(level)
+        if header.channels == 1:
+            coarse = points.shape[0], points.shape[1]
+            values["geotransform"] = level_geotransform(values.get("geotransform"), header.shape, coarse, header.closed)
+        return Surface(points, header.closed, metadata=values)
 
 
 class Decoder:
@@ -166,9 +184,9 @@ class Decoder:
             raise TruncatedStreamError("expected at least one whole layer, got less")
         return self.layers[-1]
 
-    def surface(self) -> Surface:
-        """The current state as a surface, see `view`."""
-        return self.view().surface()
+    def surface(self, level: int | None = None) -> Surface:
+        """The current state as a surface, see `View.surface`."""
+        return self.view().surface(level)
 
     def points_at(self, level: int) -> NDArray[Any]:
         """The current grid of a level, see `View.points_at`."""
@@ -251,7 +269,9 @@ class Decoder:
 
     def _show(self, number: int, level: int, held: int, rms: float, max_error: float, complete: bool) -> None:
         corrected = complete and self.header is not None and self.header.corrected
-        whole = self.header is not None and (complete or number == self.header.layer_count - 1 and level == self.header.levels)
+        whole = self.header is not None and (
+            complete or (number == self.header.layer_count - 1 and level == self.header.levels)
+        )
         length, state = self._reconstruction.length, self._progress.snapshot(whole)
         self.layers.append(
             View(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,12 +17,13 @@ from .container.writer import CodedLayer, CodedSegment, write_container
 from .lattice import LATTICE_BITS, Lattice
 from .layout import Layout
 from .measure import distances, extent_of
+from .predictors import COEFFICIENT_BITS
 from .quantise import channel_of, choose_lattices
 from .reconstruction import channel_picture, initial_state, to_points
 from .surface import Surface
 from .target import Tolerance
 from .tiles import Tiles, TileTable, gather
-from .transform import COEFFICIENT_BITS, allocate, forward, synthesis_norms
+from .transform import allocate, forward, synthesis_norms
 
 __all__ = ["encode"]
 
@@ -275,9 +275,7 @@ class _TileCoder:
         self.tiles = [Tiles(table) for _ in channels]
         self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
-    def code(
-        self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None
-    ) -> bytes:
+    def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
         model = self._models.setdefault((tile, channel), new_model())
         tiles, rows = self.tiles[channel], self._table.of_tile(tile)

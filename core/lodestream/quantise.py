@@ -38,7 +38,7 @@ def choose_lattices(points: NDArray[Any], geometric: int, precision: float | Non
     Returns
     -------
     list of Lattice
-        The channels' own lattices where there are such (attributes: always when found; coordinates: unless the precision
+        The channels' own lattices where found (attributes: always when found; coordinates: unless the precision
         allows a coarser one), otherwise one step for all coordinates.
     """
     count = 1 if points.ndim == 2 else points.shape[2]

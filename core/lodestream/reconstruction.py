@@ -1,4 +1,4 @@
-"""Segments into points: the state of a surface that is being refined, and pictures of any state it has passed through."""
+"""Segments into points: the state of a surface that is being refined, and pictures of any state that it passed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ class Reconstruction:
     """Decodes segments when a picture asks for them, in the order in which they were added.
 
     A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
-    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes told is ignored.
+    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes
+    told is ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -143,7 +144,9 @@ class Progress:
             raise CorruptStreamError(f"expected no segment of tile {tile}, whose level has zeros only", offset)
         if bool(top) == bool(known):
             problem = "told again" if known else "not told"
-            raise CorruptStreamError(f"expected the planes of tile {tile} once, with its first segment: {problem}", offset)
+            raise CorruptStreamError(
+                f"expected the planes of tile {tile} once, at its first segment: {problem}", offset
+            )
         if top:
             self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
         below = int(self.state[tile, channel])
@@ -153,7 +156,7 @@ class Progress:
         return below - 1
 
     def snapshot(self, whole: bool) -> NDArray[np.int8]:
-        """The present state; a tile that no layer announces has nothing but zeros, which the ``whole`` of them tells."""
+        """The present state; once ``whole``, a tile that no layer has announced is known to have nothing but zeros."""
         return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
 
 

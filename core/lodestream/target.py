@@ -40,7 +40,7 @@ class Tolerance:
         try:
             return cls(float(number), relative)
         except ValueError:
-            raise OptionError(f"expected a number such as 0.5, or 1e-3d for a fraction of the extent, got {text!r}") from None
+            raise OptionError(f"expected a number such as 0.5, or 1e-3d (times the extent), got {text!r}") from None
 
     def absolute(self, extent: float) -> float:
         """The tolerance in the surface's unit, for a surface of this extent."""

@@ -124,7 +124,11 @@ def _spread(
     width = out.shape[1]
     for i in range(out.shape[0]):
         start = offset + i * stride
-        magnitudes, signs, marks = known[start : start + width], sign[start : start + width], early[start : start + width]
+        magnitudes, signs, marks = (
+            known[start : start + width],
+            sign[start : start + width],
+            early[start : start + width],
+        )
         row = out[i]
         for j in range(width):
             high = np.int32((magnitudes[j] >> plane) << plane)

@@ -9,23 +9,15 @@ from .axis import AxisStep
 from .kernels import kernel
 from .layout import Layout
 from .lifting import REACH, TAPS, forward_step, inverse_step
+from .predictors import FOUR_POINT, default_predictors, fitted_steps
 
 __all__ = [
-    "COEFFICIENT_BITS",
     "allocate",
-    "default_predictors",
-    "fitted_steps",
     "forward",
     "inverse",
     "synthesis_norms",
 ]
 
-#: A coefficient has at most so many magnitude bits.
-COEFFICIENT_BITS = 28
-#: The third step where the axis is too short to fit one: the four-point rule.
-FOUR_POINT = (16, 0)
-#: Nodes that an axis needs for an (a, b) of its own.
-FIT_NODES = 24
 #: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
 _CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
 _SAMPLE_LINES = 96
@@ -83,9 +75,10 @@ def inverse(
 ) -> None:
     """Turn coefficients into the grid of ``level``, in place, in the first rows and columns of the array.
 
-    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count lattice steps, those above count steps over 2**fraction; so does the
-    result where ``whole`` is less than ``level``. Where all details are known, rounding to whole steps undoes that of
-    the forward transform; where they are not, it would only add errors of its own from level to level.
+    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
+    lattice steps, those above count steps over 2**fraction; so does the result where ``whole`` is less than ``level``.
+    Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
+    would only add errors of its own from level to level.
     """
     for finer in range(1, level + 1):
         if whole is not None and finer == whole + 1:
@@ -97,25 +90,6 @@ def inverse(
         for axis in (1, 0):
             a, b = (int(x) for x in predictors[finer - 1, axis])
             inverse_step(corner, axis, steps[axis], (a, b))
-
-
-def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
-    """(coarser level, axis) of every step along an axis that is long enough for an (a, b) of its own."""
-    return [
-        (level, axis)
-        for level in range(layout.levels)
-        for axis, step in enumerate(layout.steps(level + 1))
-        if step.midpoints and step.run >= FIT_NODES
-    ]
-
-
-def default_predictors(layout: Layout) -> NDArray[np.int8]:
-    """The (a, b) that no container carries: the four-point rule on short axes, (0, 0) where one may be fitted."""
-    predictors = np.zeros((layout.levels, 2, 2), np.int8)
-    predictors[:, :] = FOUR_POINT
-    for level, axis in fitted_steps(layout):
-        predictors[level, axis] = 0
-    return predictors
 
 
 def _fit(lines: NDArray[np.int32], step: AxisStep) -> tuple[int, int]:
@@ -199,9 +173,7 @@ def _line_norm(layout: Layout, predictors: NDArray[np.int8], axis: int, level: i
 
 
 @kernel
-def _synthesis_line(
-    nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int
-) -> NDArray[np.float64]:
+def _synthesis_line(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
     """One inverse step of a closed line without rounding."""
     n = nodes.size
     details = np.empty(n)

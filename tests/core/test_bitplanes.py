@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lodestream.bitplanes import pass_count, pass_gains, reconstruction_point
 from lodestream.layout import Layout
+from lodestream.predictors import COEFFICIENT_BITS
 from lodestream.reconstruction import Coded, Reconstruction
 from lodestream.tiles import TileTable, gather
-from lodestream.transform import COEFFICIENT_BITS
 
 from .coding import decode_runs, encode_runs, header_for, passes_of, planes_of, uncompiled
 
@@ -39,7 +39,8 @@ def random_runs(
     runs = []
     for threshold in sorted(
         # A plane of a parent must be known whole before a child's: thresholds are even, or runs of a pass each follow.
-        {2 * int(n) for n in rng.integers(0, COEFFICIENT_BITS, rng.integers(0, 8))} | {0}, reverse=True
+        {2 * int(n) for n in rng.integers(0, COEFFICIENT_BITS, rng.integers(0, 8))} | {0},
+        reverse=True,
     ):
         for (tile, channel), known in sorted(left.items()):
             if known > threshold:
@@ -157,7 +158,9 @@ def test_gains_are_the_squared_errors_of_what_is_known() -> None:
             reader._tiles[0].spread(tile, remaining, known)
             squares = (values.astype(np.int64) - known) ** 2
             bands = layout.tiles[tile].bands
-            expected = [w * squares[slice(*b.rows), slice(*b.columns)].sum() for w, b in zip(weights, bands, strict=True)]
+            expected = [
+                w * squares[slice(*b.rows), slice(*b.columns)].sum() for w, b in zip(weights, bands, strict=True)
+            ]
             assert errors[remaining] == pytest.approx(float(sum(expected)))
 
 

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from lodestream.layout import Layout
 from lodestream.lifting import CLAMP
+from lodestream.predictors import COEFFICIENT_BITS, default_predictors, fitted_steps
 from lodestream.transform import (
-    COEFFICIENT_BITS,
     allocate,
-    default_predictors,
-    fitted_steps,
     forward,
     inverse,
     synthesis_norms,

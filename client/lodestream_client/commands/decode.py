@@ -17,7 +17,7 @@ from lodestream.target import Target
 
 from .arguments import Subparsers, add_command, add_json_option, add_target_options, target_of
 from .inputs import input_files
-from .outcome import Outcome, check_out, note_unmet, surface_of
+from .outcome import Outcome, check_out, note_unmet
 from .output import note, progress_bar
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     assert job.decoder.header is not None, "there is a view, so there is a header"
     note_unmet(target, job.ended, view.rms, view.max_error, job.decoder.header.extent)
     outcome = Outcome(
-        surface_of(job.decoder, view, target.level, job.metadata),
+        view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
         job.read_bytes,
         view.level,

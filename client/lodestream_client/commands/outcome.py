@@ -6,7 +6,7 @@ import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lodestream.errors import OptionError
 from lodestream.target import Target
@@ -14,10 +14,9 @@ from lodestream.target import Target
 from .output import human_size, note, print_json, require_folder
 
 if TYPE_CHECKING:
-    from lodestream.decoder import Decoder, View
     from lodestream.surface import Surface
 
-__all__ = ["Outcome", "check_out", "note_unmet", "surface_of"]
+__all__ = ["Outcome", "check_out", "note_unmet"]
 
 
 def check_out(args: argparse.Namespace) -> None:
@@ -42,44 +41,6 @@ def check_out(args: argparse.Namespace) -> None:
         raise OptionError(
             f"{path}: expected a name that ends in one of {', '.join(known)}, got {path.suffix or 'none'!r}"
         )
-
-
-def surface_of(decoder: Decoder, view: View, level: int | None, metadata: dict[str, Any] | None = None) -> Surface:
-    """The surface as a view shows it, or the grid of one level's shape.
-
-    Parameters
-    ----------
-    decoder : Decoder
-    view : View
-    level : int or None
-        None for the full resolution.
-    metadata : dict or None
-        In place of the decoder's own, which comes last and may not have come.
-    """
-    from lodestream.surface import Surface
-
-    header = decoder.header
-    assert header is not None, "there is a view, so there is a header"
-    values = dict(decoder.metadata or metadata or {})
-    if level is None or level == header.levels:
-        return Surface(view.points, header.closed, metadata=values)
-    points = view.points_at(level)
-    if header.channels == 1:
-        values["geotransform"] = _spread(values.get("geotransform"), header.shape, points.shape, header.closed)
-    return Surface(points, header.closed, metadata=values)
-
-
-def _spread(transform: Any, full: tuple[int, int], coarse: tuple[int, ...], closed: tuple[bool, bool]) -> list[float]:
-    # Node j of an axis stands where the full grid has (N - 1) / (n - 1) j: exactly so without a gap, and within one
-    # cell of the full grid with one. Heights without a place of their own are drawn over their indices.
-    x0, xc, xr, y0, yc, yr = transform or (-0.5, 1.0, 0.0, -0.5, 0.0, 1.0)
-    down, across = (
-        n_full / n if wraps else (n_full - 1) / max(n - 1, 1)
-        for n_full, n, wraps in zip(full, coarse[:2], closed, strict=True)
-    )
-    x0 += 0.5 * xc * (1 - across) + 0.5 * xr * (1 - down)
-    y0 += 0.5 * yc * (1 - across) + 0.5 * yr * (1 - down)
-    return [x0, xc * across, xr * down, y0, yc * across, yr * down]
 
 
 def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent: float) -> None:

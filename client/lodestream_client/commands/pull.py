@@ -19,7 +19,7 @@ from .arguments import (
     target_of,
     token_of,
 )
-from .outcome import Outcome, check_out, note_unmet, surface_of
+from .outcome import Outcome, check_out, note_unmet
 from .output import human_size, note, progress_bar
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     assert header is not None, "there is a view, so there is a header"
     assert ended is not None, "the iteration has ended"
     note_unmet(target, ended, view.rms, view.max_error, header.extent)
-    surface = surface_of(decoder, view, target.level, metadata)
+    surface = view.surface(target.level, metadata)
     outcome = Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, seconds, ended)
     outcome.write(args.out)
     outcome.report(args.json)

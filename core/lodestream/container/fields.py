@@ -16,7 +16,7 @@ class FieldWriter:
         self.data = bytearray()
 
     def varint(self, number: int) -> None:
-        """A whole number of 0 or more: seven bits a byte, least significant first, the eighth bit says that more follow."""
+        """A whole number of 0 or more: seven bits a byte, least significant first; the eighth bit: more follow."""
         while number > 127:
             self.data.append(number & 127 | 128)
             number >>= 7

@@ -17,7 +17,7 @@ _KNOWN = {sections.HEADER, sections.LAYER, sections.EXACTNESS, sections.METADATA
 
 @dataclass(frozen=True)
 class Frame:
-    """A section whose CRC holds: ``payload`` stands at ``payload_offset``, the whole section at ``offset`` to ``end``."""
+    """A section whose CRC holds: its payload stands at ``payload_offset``, all of it at ``offset`` to ``end``."""
 
     kind: int
     offset: int

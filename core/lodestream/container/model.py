@@ -1,4 +1,4 @@
-"""What a container says of itself: header, layers, levels, segments and where they lie. `docs/format.md` has the bytes."""
+"""What a container says of itself: header, layers, levels, segments and their places. `docs/format.md` has the bytes."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class LayerRecord:
 
 @dataclass(frozen=True)
 class LevelRecord:
-    """The state that holds all of the levels up to this one and nothing finer; ``bytes`` is what `plan` sends for it."""
+    """The state that holds all of the levels up to one and nothing finer; ``bytes`` is what `plan` sends for it."""
 
     level: int
     shape: tuple[int, int]
@@ -146,7 +146,7 @@ class Segment:
 class Index:
     """Where everything lies in a complete container.
 
-    ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it. ``size`` is that of the file.
+    ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``size`` is the file's.
     """
 
     header: Header

@@ -1,4 +1,4 @@
-"""The bytes of each section: one pair of functions a section, writing and reading. `docs/format.md` is their specification."""
+"""The bytes of each section, by a pair of functions that write and read it. `docs/format.md` specifies them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import CorruptStreamError, InputError, UnsupportedVersionError
 from ..lattice import Lattice
 from ..layout import Layout
-from ..transform import COEFFICIENT_BITS, default_predictors, fitted_steps
+from ..predictors import COEFFICIENT_BITS, default_predictors, fitted_steps
 from .fields import FieldReader, FieldWriter
 from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
 
