@@ -37,16 +37,17 @@ def main(folder: Path, arguments: list[str]) -> int:
     listed = folder / "constraints.txt"
     listed.write_text("\n".join(constraints(project)) + "\n")
     print(listed.read_text(), end="", flush=True)
-    environment = folder / ".venv"
+    environment = folder.resolve() / ".venv"
     venv.create(environment, with_pip=True, clear=True)
     python = str(environment / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "--upgrade", "pip>=25.1"], check=True)
     group = ["--group", f"{ROOT}/pyproject.toml:test"]
     subprocess.run([*pip, "--constraint", str(listed), "--editable", f"{ROOT}[all]", *group], check=True)
-    kernels = str((folder / "kernels").resolve())
+    variables = {**os.environ, "NUMBA_CACHE_DIR": str((folder / "kernels").resolve())}
+    subprocess.run([python, "-c", "from lodestream_server.worker import warm; warm()"], env=variables, check=True)
     command = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", *arguments]
-    return subprocess.run(command, cwd=ROOT, env={**os.environ, "NUMBA_CACHE_DIR": kernels}, check=False).returncode
+    return subprocess.run(command, cwd=ROOT, env=variables, check=False).returncode
 
 
 if __name__ == "__main__":
