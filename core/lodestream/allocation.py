@@ -75,14 +75,15 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> lis
         top[curve.tile, curve.channel] = len(curve.bits)
         slopes[curve.tile, curve.channel] = hull_slopes(curve)
     _lift_parents(slopes, layout)
-    bits = {(curve.tile, curve.channel): curve.bits for curve in curves}
+    known = {(curve.tile, curve.channel): curve for curve in curves}
     order = sorted(
         (-float(slope), tile, -number, channel)
         for (tile, channel), passes in slopes.items()
         for number, slope in enumerate(passes)
     )
-    sizes = np.cumsum([bits[tile, channel][-number] / 8 for _, tile, number, channel in order])
-    ends = _layer_ends(sizes)
+    sizes = np.cumsum([known[tile, channel].bits[-number] / 8 for _, tile, number, channel in order])
+    gains = np.cumsum([known[tile, channel].gains[-number] for _, tile, number, channel in order])
+    ends = _layer_ends(sizes, gains)
     states, state = [], top.copy()
     start = 0
     for end in ends:
@@ -107,15 +108,31 @@ def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: La
         parent[:] = np.maximum.accumulate(parent)
 
 
-def _layer_ends(sizes: NDArray[np.float64]) -> list[int]:
-    """How many passes are known after each layer, from the bytes that the passes add up to."""
+def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64]) -> list[int]:
+    """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
+
+    Within a bit-plane the error falls faster at first than later, so some places between passes are better to stop at
+    than others. A layer ends at the best place around its share of the bytes: where the error lies furthest below a
+    line, in the logarithms of both, from one end of the neighbourhood to the other.
+    """
     if sizes.size == 0:
         return []
     total = float(sizes[-1])
     first = min(_FIRST_LAYER, total)
     count = min(MOST_LAYERS, 1 + int(np.log(total / first) / np.log(_LEAST_GROWTH)))
     # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
-    targets = np.append(np.geomspace(first, max(first, _LAST_LOSSY * total), max(count - 1, 1)), total)
-    ends = np.searchsorted(sizes, targets * (1 - 1e-12)) + 1
-    ends[-1] = sizes.size
+    targets = np.geomspace(first, max(first, _LAST_LOSSY * total), max(count - 1, 1))
+    borders = np.sqrt(targets[1:] * targets[:-1])
+    starts = np.searchsorted(sizes, borders)
+    errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
+    lengths = np.log(np.maximum(sizes, 1.0))
+    ends = []
+    for target, start, stop in zip(targets, [0, *starts], [*starts, sizes.size - 1], strict=True):
+        middle = int(np.searchsorted(sizes, target * (1 - 1e-12)))
+        start, stop = min(start, middle), min(max(stop, middle + 1), sizes.size)
+        run = lengths[stop - 1] - lengths[start]
+        slope = (errors[stop - 1] - errors[start]) / run if run > 0 else 0.0
+        place = start + int(np.argmin(errors[start:stop] - slope * lengths[start:stop]))
+        ends.append((place if start > 0 and stop < sizes.size - 1 else middle) + 1)
+    ends.append(sizes.size)
     return [int(end) for end in np.unique(np.minimum(ends, sizes.size))]
