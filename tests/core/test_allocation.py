@@ -80,13 +80,14 @@ def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
 
 
 def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
-    # Passes of 20 bytes; of ten in a row the first five take away most of what is left.
-    left = np.cumprod(np.tile([0.7] * 5 + [0.98] * 5, 60))
-    sizes, gains = 20.0 * np.arange(1, 601), 1 - left
-    ends = np.array(_layer_ends(sizes, gains))
-    inner = ends[(ends > 100) & (ends < 400)]
-    assert len(inner) >= 4
-    assert (inner % 10 == 5).all()
+    # The error falls as a power of the bytes, faster in the first fifth of each step of 1.4 in the bytes.
+    sizes = 20.0 * np.arange(1, 20_001)
+    step = np.log(sizes) / np.log(1.4) % 1
+    left = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
+    ends = np.array(_layer_ends(sizes, left[0] - left))
+    inner = ends[(ends > 100) & (ends < 15_000)]
+    assert len(inner) > 10
+    assert np.abs(step[inner - 1] - 0.2).max() < 0.03
 
 
 def test_nothing_to_send_is_one_layer() -> None:
