@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lodestream as ls
+
+SOURCE = Path(ls.__file__)
+
+
+def test_every_public_name_is_there_sorted_and_from_where_it_is_said_to_be() -> None:
+    assert sorted(ls.__all__, key=str.lower) == sorted(ls._HOMES, key=str.lower)
+    assert len(set(ls.__all__)) == len(ls.__all__)
+    for name in ls.__all__:
+        home = importlib.import_module(f"lodestream.{ls._HOMES[name]}")
+        assert name in home.__all__
+        assert getattr(ls, name) is getattr(home, name)
+
+
+def test_what_type_checkers_see_is_what_is_loaded() -> None:
+    tree = ast.parse(SOURCE.read_text())
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level == 1]
+    seen = {alias.name: node.module for node in imports for alias in node.names}
+    assert seen == ls._HOMES
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.parent.glob("*.py")), ids=lambda path: path.stem)
+def test_every_module_says_what_it_exports(path: Path) -> None:
+    module = importlib.import_module("lodestream" if path.stem == "__init__" else f"lodestream.{path.stem}")
+    assert module.__doc__
+    for name in module.__all__:
+        # An alias of types may be there for type checkers only.
+        assert hasattr(module, name) or f"    {name}: TypeAlias = " in path.read_text()
+
+
+def test_importing_the_package_loads_neither_the_compiler_nor_numbers_nor_readers() -> None:
+    script = (
+        "import sys; before = set(sys.modules); import lodestream; dir(lodestream); lodestream.CorruptStreamError;"
+        "print(sorted({name.partition('.')[0] for name in set(sys.modules) - before}"
+        " & {'numba', 'llvmlite', 'numpy', 'rasterio', 'msgpack', 'scipy'}))"
+    )
+    assert run(script) == "[]"
+
+
+def test_targets_and_errors_need_no_compiler() -> None:
+    script = "import lodestream as ls; ls.Target(level=1); ls.Tolerance.parse('1d'); print('numba' in sys.modules)"
+    assert run(script) == "False"
+
+
+def test_names_that_are_not_there_are_refused_and_those_that_are_listed() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        ls.nothing  # noqa: B018 - looking it up is the test
+    assert set(ls.__all__) <= set(dir(ls))
+    assert ls.__version__
+
+
+def run(script: str) -> str:
+    """What a script prints in a fresh interpreter."""
+    command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(SOURCE.parents[1])!r}); {script}"]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=100).stdout.strip()

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from lodestream import OptionError, Target, Tolerance
+
+
+@pytest.mark.parametrize(
+    ("text", "tolerance"),
+    [
+        ("0.5", Tolerance(0.5)),
+        ("1e-3d", Tolerance(1e-3, relative=True)),
+        ("0", Tolerance(0.0)),
+        (" 2 d", Tolerance(2.0, relative=True)),
+    ],
+)
+def test_an_error_is_in_the_unit_or_a_fraction(text: str, tolerance: Tolerance) -> None:
+    assert Tolerance.parse(text) == tolerance
+    assert tolerance.absolute(200.0) == tolerance.value * (200.0 if tolerance.relative else 1.0)
+
+
+@pytest.mark.parametrize("text", ["", "d", "fine", "-1", "nan", "inf", "1e-3dd", "1 m"])
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(OptionError, match="expected"):
+        Tolerance.parse(text)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"level": -1},
+        {"level": 1, "max_bytes": 100},
+        {"level": 0, "seconds": 1.0},
+        {"level": 0, "until_rms": Tolerance(1.0)},
+        {"level": 0, "until_max": Tolerance(1.0)},
+        {"max_bytes": 0},
+        {"seconds": 0.0},
+        {"seconds": float("nan")},
+        {"order": "best"},
+    ],
+)
+def test_targets_that_make_no_sense_are_refused(limits: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match="expected"):
+        Target(**limits)
+
+
+def test_a_target_without_limits_is_the_whole_surface() -> None:
+    assert Target() == Target(order="quality")
+    assert Target().level is None
