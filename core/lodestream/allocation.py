@@ -19,6 +19,7 @@ __all__ = ["MOST_LAYERS", "TileCurve", "assign_layers", "hull_slopes"]
 MOST_LAYERS = 24
 _FIRST_LAYER = 48  # bytes of coefficients in the first layer
 _LEAST_GROWTH = 1.2
+_LEAST_LAYER = 40  # bytes: a layer's frame takes about 25
 _LAST_LOSSY = 0.92
 
 
@@ -108,6 +109,23 @@ def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: La
         parent[:] = np.maximum.accumulate(parent)
 
 
+def _targets(first: float, last: float) -> NDArray[np.float64]:
+    """Bytes after each layer but the complete one, evenly spaced in the logarithm as far as layers are worth a table."""
+    growth = _LEAST_GROWTH
+    while True:
+        targets = [first]
+        while targets[-1] < last:
+            targets.append(max(targets[-1] * growth, targets[-1] + _LEAST_LAYER))
+        if len(targets) < MOST_LAYERS:
+            break
+        growth **= 1.02
+    if len(targets) > 1:
+        # Whole steps rarely end at the last one: all shrink a little.
+        scale = np.log(last / first) / np.log(targets[-1] / first)
+        return np.asarray(first * np.power(np.array(targets) / first, scale))
+    return np.array(targets)
+
+
 def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64]) -> list[int]:
     """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
 
@@ -119,9 +137,8 @@ def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64]) -> list[
         return []
     total = float(sizes[-1])
     first = min(_FIRST_LAYER, total)
-    count = min(MOST_LAYERS, 1 + int(np.log(total / first) / np.log(_LEAST_GROWTH)))
     # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
-    targets = np.geomspace(first, max(first, _LAST_LOSSY * total), max(count - 1, 1))
+    targets = _targets(first, max(first, _LAST_LOSSY * total))
     borders = np.sqrt(targets[1:] * targets[:-1])
     starts = np.searchsorted(sizes, borders)
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
