@@ -22,6 +22,8 @@ __all__ = ["LATTICE_BITS", "Lattice", "find_lattice", "precision_lattice"]
 #: Lattice coordinates of valid values are below two to this power in magnitude.
 LATTICE_BITS = 24
 _MOST_DECIMALS = 9
+#: Values that were computed from coded integers, 0.1 k or -10000 + 0.1 k (Mapbox's terrain), are no rounded decimals.
+_CODED_ORIGINS = (0.0, -10000.0)
 _SAMPLE = 4096
 
 
@@ -78,8 +80,8 @@ def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
 def find_lattice(values: NDArray[Any]) -> Lattice | None:
     """The lattice on which the values already lie, or None.
 
-    Tried are integers (any step that divides all differences), scaled powers of two, and decimals of up to nine places,
-    each with fewer than 2**24 steps between the least and the largest value. What is returned restores every value bit
+    Tried are integers (any step that divides all differences), scaled powers of two, and decimals of up to nine places
+    (rounded correctly, or computed as ``origin + step * k``), each with fewer than 2**24 steps between the least and the largest value. What is returned restores every value bit
     for bit, except that -0.0 is taken for 0.0.
     """
     flat = values.ravel()
@@ -131,6 +133,11 @@ def _decimal_lattices(sample: NDArray[np.float64], low: float, high: float) -> l
         error = np.abs(np.rint(sample * scale) / scale - sample)
         if np.all(error <= np.abs(sample) * 2.0**-23):
             found.append(_centred("decimal", float(np.rint(float(low) * scale)), scale, int(np.rint(steps))))
+            found += [
+                Lattice("affine", origin, 1 / scale)
+                for origin in _CODED_ORIGINS
+                if max(abs(float(low) - origin), abs(float(high) - origin)) * scale < 2**LATTICE_BITS
+            ]
     return [lattice for lattice in found if lattice is not None]
 
 

@@ -172,3 +172,13 @@ def test_float32_pictures_that_overshoot_stay_finite() -> None:
     values = to_dtype(np.array([1e39, -1e39, 3.4028235e38]), np.dtype(np.float32))
     largest = np.finfo(np.float32).max
     np.testing.assert_array_equal(values, np.array([largest, -largest, largest], np.float32))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("origin", [0.0, -10000.0])
+def test_values_computed_from_coded_integers_are_found(dtype: type[np.floating[Any]], origin: float) -> None:
+    codes = np.random.default_rng(3).integers(100_000, 137_000, 5000)
+    values = (origin + 0.1 * codes).astype(dtype)
+    lattice = find_lattice(values)
+    assert lattice is not None
+    assert lattice.values(lattice.coordinates(values), values.dtype).tobytes() == values.tobytes()
