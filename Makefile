@@ -1,6 +1,7 @@
 # Everything happens in .venv, which the first target that needs it makes: Python 3.11 or newer and make are enough.
 PYTHON ?= python3
 VENV := .venv
+PEERS := .venv-peers
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
@@ -10,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-lowest lint format bench wheel clean
+.PHONY: help demo test test-lowest lint format bench bench-peers wheel clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -37,11 +38,14 @@ format: $(STAMP) ## let ruff lay out the code and sort its imports
 bench: $(STAMP) ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
 	@$(BIN)/python -m benchmarks $(ARGS)
 
+bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other coders; ARGS="--only ours" or "--tables"
+	@$(PEERS)/bin/python -m benchmarks.peers $(ARGS)
+
 wheel: $(STAMP) ## build dist/*.whl
 	@$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
 
 clean: ## remove the environment and everything else that can be made again
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(PEERS) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is written last, so an installation that was interrupted is taken up again by the next make.
@@ -52,4 +56,12 @@ $(STAMP): pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
 	@$(BIN)/python -m pip install --quiet --editable '.[all]' --group dev
+	@touch $@
+
+# An environment of its own: nothing else needs what it needs.
+$(PEERS)/.installed: pyproject.toml benchmarks/peers/requirements.txt
+	@echo "Installing into $(PEERS); this happens once and takes a minute or two" >&2
+	@$(PYTHON) -m venv $(PEERS)
+	@$(PEERS)/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	@$(PEERS)/bin/python -m pip install --quiet --editable '.[formats]' --requirement benchmarks/peers/requirements.txt
 	@touch $@

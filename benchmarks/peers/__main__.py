@@ -1,0 +1,149 @@
+"""Measure this project and its peers: ``python -m benchmarks.peers``.
+
+What was measured stays in ``build/peers.json``; a coder is run again on a surface only where the surface changed, where
+it is named, or where it is this project.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..__main__ import processor
+from ..arrays import ROOT
+from . import report
+from .registry import OURS, PEERS, versions
+from .surfaces import BUILD, catalogue, prepare, specimen
+
+RESULTS = ROOT / "build" / "peers.json"
+LIMIT = 1200.0  # seconds for one coder on one surface
+
+
+def main() -> int:
+    """Run what is asked for, and write the tables."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+    parser.add_argument("--only", help="coders whose name contains one of these, separated by commas; run again")
+    parser.add_argument("--surfaces", help="surfaces whose name contains one of these, separated by commas")
+    parser.add_argument("--again", action="store_true", help="measure again what is known")
+    parser.add_argument("--tables", action="store_true", help="write the tables and figures of what is known")
+    options = parser.parse_args()
+    results = _known()
+    if not options.tables:
+        try:
+            _measure(results, options)
+        except KeyboardInterrupt:
+            print("stopped; what was measured is kept")
+            return 130
+    if options.tables or not (options.only or options.surfaces):
+        for path in report.write(results):
+            print(f"wrote {path.relative_to(ROOT)}")
+    return 0
+
+
+def _known() -> dict[str, Any]:
+    if RESULTS.exists():
+        known: dict[str, Any] = json.loads(RESULTS.read_text())
+        return known
+    return {"surfaces": {}, "runs": {}, "skipped": []}
+
+
+def _measure(results: dict[str, Any], options: argparse.Namespace) -> None:
+    start = time.perf_counter()
+    if not (options.only and catalogue()):
+        skipped = prepare()
+        names = catalogue()
+
+        def prepared(results: dict[str, Any]) -> None:
+            results["skipped"] = skipped
+            results["surfaces"] = {name: results["surfaces"][name] for name in names if name in results["surfaces"]}
+
+        _keep(results, prepared)
+    coders = [name for name in (*PEERS, OURS) if _chosen(name, options.only)]
+    if not coders:
+        sys.exit(f"expected one of {', '.join((*PEERS, 'ours'))}, got {options.only}")
+    for name in catalogue():
+        if not _chosen(name, options.surfaces):
+            continue
+        surface = specimen(name)
+        facts = {
+            "group": surface.group,
+            "source": surface.source,
+            "shape": list(surface.points.shape),
+            "dtype": surface.points.dtype.name,
+            "closed": list(surface.closed),
+            "lattice": surface.lattice is not None,
+        }
+        for coder in coders:
+            key = f"{name}|{coder}"
+            old = results["runs"].get(key, {}).get("fingerprint")
+            if old == surface.fingerprint and not (options.again or options.only or coder == OURS):
+                continue
+            run = _run(name, coder) | {"fingerprint": surface.fingerprint, "date": date.today().isoformat()}
+            print(f"{time.perf_counter() - start:6.0f} s  {name}, {coder}: {len(run['rows'])} rows", flush=True)
+            for note in run["notes"]:
+                print(f"          {note}", flush=True)
+            _keep(results, partial(_add, name=name, facts=facts, key=key, run=run))
+
+    def finished(results: dict[str, Any]) -> None:
+        if any(coder != OURS for coder in coders):
+            results["versions"] = versions()
+        results["machine"] = {
+            "processor": processor(),
+            "system": platform.system(),
+            "python": platform.python_version(),
+        }
+
+    _keep(results, finished)
+
+
+def _add(results: dict[str, Any], name: str, facts: dict[str, Any], key: str, run: dict[str, Any]) -> None:
+    results["surfaces"][name] = facts
+    results["runs"][key] = run
+
+
+def _chosen(name: str, words: str | None) -> bool:
+    if words is None:
+        return True
+    return any(
+        (word == "ours" and name == OURS) or word in name.lower() for word in map(str.strip, words.lower().split(","))
+    )
+
+
+def _run(surface: str, coder: str) -> dict[str, Any]:
+    """A process of its own: what a coder does to memory, or its crash, touches no other."""
+    out = BUILD / f"run-{os.getpid()}.json"
+    out.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "benchmarks.peers.worker", surface, coder, str(out)]
+    try:
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT)
+    except subprocess.TimeoutExpired:
+        return {"rows": [], "notes": [f"not done after {LIMIT:.0f} s"], "seconds": LIMIT}
+    if done.returncode or not out.exists():
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1][:200]
+        return {"rows": [], "notes": [f"failed with exit code {done.returncode}: {last}"], "seconds": 0.0}
+    result: dict[str, Any] = json.loads(out.read_text())
+    out.unlink()
+    return result
+
+
+def _keep(results: dict[str, Any], change: Callable[[dict[str, Any]], None]) -> None:
+    """Change what is known, in memory and in the file, which another run may have added to meanwhile."""
+    results.update(_known())
+    change(results)
+    part = Path(f"{RESULTS}.{os.getpid()}")
+    part.write_text(json.dumps(results))
+    part.replace(RESULTS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,36 @@
+"""The words of ``docs/benchmarks.md`` that do not depend on what was measured."""
+
+from __future__ import annotations
+
+__all__ = ["LOSSLESS", "MEMORY", "RULES", "SPEED"]
+
+RULES = """\
+- A cell is one error on one surface. Errors are relative to the range of heights or to the diagonal of the box, of
+  distances in space for x, y, z, and measured on what was decoded, ours like the peers'.
+- A peer counts at the best of its settings, and the best peer of each cell is compared. Ours counts at the best of the
+  exact stream and of streams with a precision; a stream counts with all its layers. The exact stream alone stands
+  beside it.
+- Bytes are interpolated between settings, or between the layers of one stream, in log-log on the lower envelope. An
+  error below the last lossy one costs the lossless stream. A peer's stream that does not itself say shape, type and how
+  its numbers become values counts 32 bytes more.
+- Planes of x, y, z are coded one after another where a peer takes planes, with the same absolute error in each. Coders
+  of whole numbers are given the values' own lattice where there is one and, for larger errors, values quantised with
+  the very step that meets the error. Coders of floating point are given float32, and for lossless the type itself.
+- Surfaces of more than four million samples are tried at fewer settings, ours too.
+- A ratio below 1 says that ours needs fewer bytes; **bold**: it loses. Means are geometric, over cells where the best
+  peer needs 4 KB or more."""
+
+SPEED = """
+MB are those of the samples as float32, whatever their type; geometric means over the surfaces, without the tiny ones;
+one core. *At 1e-4*: the setting whose RMS error is nearest, where one is within a factor of 3; for streams of layers or
+prefixes encoding is that of the whole stream. Ours is the exact stream: encoding measures the errors of every layer
+and level, decoding at 1e-4 is that of a prefix. Times are the best of three where they are short, else single."""
+
+MEMORY = """
+Peak above what the process held with the surface loaded, largest over the settings, as a multiple of the samples as
+float32. The way from values to whole numbers and back, as float64, is the peer's where it is needed. What a process had
+freed before and kept may hide a part of a peak."""
+
+LOSSLESS = """
+Every value comes back bit for bit. *Ours* is what a receiver gets until then; the whole file also has metadata and the
+index. A dash: the peer cannot, since the values lie on no lattice of 16 bits."""

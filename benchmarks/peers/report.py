@@ -1,0 +1,233 @@
+"""``docs/benchmarks.md``: tables of everything that was measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import lodestream
+
+from ..arrays import ROOT
+from . import figures
+from .curves import Cell, Results, geometric_mean
+from .prose import LOSSLESS, MEMORY, RULES, SPEED
+from .registry import OURS, PEERS
+from .remarks import REMARKS
+from .speed import memory_table, speed_table
+from .surfaces import GROUPS
+from .trial import TARGETS
+
+__all__ = ["write"]
+
+PAGE = ROOT / "docs" / "benchmarks.md"
+AIMS = {"rough terrain": 0.95, "smooth": 0.75, "xyz": 0.75}
+KINDS = {"rms": "RMS error", "max": "Maximum error"}
+#: Surfaces larger than 64 x 64 that the aims are about.
+LARGER = ("rough terrain", "smooth", "xyz")
+
+
+def write(data: dict[str, Any]) -> list[Path]:
+    """Write the page and its figures; returns their paths."""
+    results = Results(data)
+    drawn = figures.draw(results, ROOT / "docs" / "benchmarks")
+    PAGE.write_text("\n".join(_page(results, drawn)) + "\n")
+    return [PAGE, *drawn.values()]
+
+
+def _page(results: Results, drawn: dict[str, Path]) -> Iterator[str]:
+    yield from _head(results)
+    for kind, title in KINDS.items():
+        yield f"\n## {title}\n"
+        yield from _summary(results, kind)
+        for group in GROUPS:
+            cells = results.cells(results.group(group), kind)
+            if cells:
+                yield f"\n### {title}: {group}\n"
+                yield from _cells(cells)
+                if kind == "rms" and group in drawn:
+                    yield f"\n![Bytes against RMS error: {group}]({drawn[group].relative_to(PAGE.parent)})"
+    yield "\n## Lossless\n"
+    yield from _lossless(results)
+    yield "\n## Speed\n"
+    yield from _table(*speed_table(results))
+    yield SPEED
+    yield "\n## Memory\n"
+    yield from _table(*memory_table(results))
+    yield MEMORY
+    yield from _losses(results)
+    yield from _left_out(results)
+
+
+def _head(results: Results) -> Iterator[str]:
+    machine = results.data.get("machine", {})
+    runs = results.data["runs"].values()
+    dates = sorted({run["date"] for run in runs})
+    took = sum(run["seconds"] for run in runs)
+    yield "# Bytes, speed and memory beside the peers\n"
+    yield "This page and its figures are written by\n"
+    yield "    make bench-peers\n"
+    yield "in an environment of its own (layers of JPEG 2000 need Debian's OpenJPEG: `apt-get install libopenjp2-7`),"
+    yield f"which took {took / 60:.0f} minutes of measuring, on one core of {machine.get('processor', 'an unknown processor')} "
+    when = " to ".join(sorted({dates[0], dates[-1]}))
+    yield f"({machine.get('system', '')}, Python {machine.get('python', '')}), {when}.\n"
+    yield f"Lodestream {lodestream.__version__}; {', '.join(results.data.get('versions', []))}.\n"
+    yield RULES
+    yield "\n| surface | group | size | type | closed | from |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for name, facts in results.surfaces.items():
+        size = " x ".join(map(str, facts["shape"]))
+        closed = (
+            ", ".join(word for word, flag in zip(("rows", "columns"), facts["closed"], strict=True) if flag) or "no"
+        )
+        yield f"| {name} | {facts['group']} | {size} | {facts['dtype']} | {closed} | {facts['source']} |"
+
+
+def _summary(results: Results, kind: str) -> Iterator[str]:
+    rows = []
+    for group in GROUPS:
+        cells = results.cells(results.group(group), kind)
+        for target in TARGETS:
+            at = [cell for cell in cells if cell.target == target]
+            if not at:
+                continue
+            large = [cell for cell in at if cell.counts]
+            mean = geometric_mean([cell.ratio for cell in large])
+            alone = geometric_mean([cell.exact / cell.peer_bytes for cell in large])
+            worst = max((cell.ratio for cell in large), default=math.nan)
+            over = max((cell.ours - cell.peer_bytes for cell in at if not cell.counts), default=math.nan)
+            aim = AIMS.get(group) if kind == "rms" else None
+            lost = sum(cell.ratio > 1 for cell in at)
+            rows.append(
+                [
+                    f"{group}, {target:.0e}",
+                    f"{len(large)} of {len(at)}",
+                    _bold(mean, aim or 1.0),
+                    f"{aim}" if aim else "",
+                    _number(alone),
+                    _bold(worst, 1.0),
+                    "" if math.isnan(over) else f"{over:+,.0f}",
+                    str(lost),
+                ]
+            )
+    head = [
+        "group, error",
+        "cells of 4 KB",
+        "mean ratio",
+        "aim",
+        "exact stream",
+        "worst",
+        "worst below 4 KB, bytes",
+        "lost",
+    ]
+    yield from _table(head, rows)
+    if kind == "rms":
+        yield "\nBold here: worse than the aim, or than 1 where there is none."
+
+
+def _cells(cells: Sequence[Cell]) -> Iterator[str]:
+    rows = [
+        [
+            f"{cell.surface}, {cell.target:.0e}",
+            cell.peer,
+            f"{cell.peer_bytes:,.0f}",
+            f"{cell.ours:,.0f}",
+            _bold(cell.ratio, 1.0),
+            cell.stream.replace("precision extent / ", ""),
+            f"{cell.exact:,.0f}",
+            _bold(cell.exact / cell.peer_bytes, 1.0),
+        ]
+        for cell in cells
+    ]
+    yield from _table(
+        ["surface, error", "best peer", "bytes", "ours", "ratio", "setting", "exact stream", "ratio"], rows
+    )
+
+
+def _lossless(results: Results) -> Iterator[str]:
+    gates = ("JPEG XL, effort 9", "pcodec", "SZ3")
+    rows: list[list[str]] = []
+    ratios: dict[str, dict[str, list[float]]] = {"whole numbers, heights": {}, "float32 x, y, z": {}}
+    for name, facts in results.surfaces.items():
+        ours = results.lossless(name, OURS)
+        if ours is None:
+            continue
+        found = {peer: row["bytes"] for peer in PEERS if (row := results.lossless(name, peer))}
+        best = min(found, key=found.__getitem__, default=None)
+        cells = []
+        for peer in gates:
+            ratio = ours["bytes"] / found[peer] if peer in found else math.nan
+            cells += [f"{found[peer]:,}" if peer in found else "-", _bold(ratio, 1.0)]
+            kind = "float32 x, y, z" if facts["shape"][2:] == [3] else "whole numbers, heights"
+            counted = facts["group"] != "tiny" and (kind.startswith("float32") or facts["lattice"])
+            if counted and not math.isnan(ratio):
+                ratios[kind].setdefault(peer, []).append(ratio)
+        last = [best, f"{found[best]:,}", _bold(ours["bytes"] / found[best], 1.0)] if best else ["-", "-", ""]
+        rows.append([name, f"{ours['bytes']:,}", f"{ours['file']:,}", *cells, *last])
+    head = [
+        "surface",
+        "ours",
+        "whole file",
+        *(word for peer in gates for word in (peer, "ratio")),
+        "best peer",
+        "bytes",
+        "ratio",
+    ]
+    yield from _table(head, rows)
+    yield ""
+    for kind, by_peer in ratios.items():
+        means = ", ".join(
+            f"{_bold(geometric_mean(values), 1.0)} of {peer} ({len(values)})" for peer, values in by_peer.items()
+        )
+        yield f"- {kind}, larger than 64 x 64, geometric means (surfaces): {means or 'nothing measured'}."
+    yield LOSSLESS
+
+
+def _losses(results: Results) -> Iterator[str]:
+    lost: dict[str, list[str]] = {}
+    for kind, title in KINDS.items():
+        for cell in results.cells(list(results.surfaces), kind):
+            if cell.ratio > 1:
+                text = (
+                    f"{title.lower()} {cell.target:.0e}: {cell.ratio:.3f} of {cell.peer} ({cell.peer_bytes:,.0f} bytes)"
+                )
+                lost.setdefault(cell.surface, []).append(text)
+    yield "\n## Cells that lose\n"
+    if not lost:
+        yield "None."
+    for surface, texts in lost.items():
+        remark = f" {REMARKS[surface]}" if surface in REMARKS else ""
+        yield f"- {surface}: {'; '.join(texts)}.{remark}"
+
+
+def _left_out(results: Results) -> Iterator[str]:
+    yield "\n## Left out\n"
+    for note in results.data.get("skipped", []):
+        yield f"- {note}"
+    told: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+    for key, run in results.data["runs"].items():
+        surface, coder = key.split("|")
+        if surface in results.surfaces:
+            for note in run["notes"]:
+                coders, surfaces = told.setdefault(note, ({}, {}))
+                coders[coder] = surfaces[surface] = None
+    for note, (coders, surfaces) in sorted(told.items()):
+        where = f"{len(surfaces)} surfaces" if len(surfaces) > 4 else ", ".join(surfaces)
+        yield f"- {', '.join(coders)}: {note} ({where})"
+
+
+def _bold(value: float, limit: float) -> str:
+    text = _number(value)
+    return f"**{text}**" if value > limit else text
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    yield f"| {' | '.join(head)} |"
+    yield f"| --- |{' ---: |' * (len(head) - 1)}"
+    for row in rows:
+        yield f"| {' | '.join(row)} |"
