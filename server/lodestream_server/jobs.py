@@ -126,7 +126,7 @@ class Builder:
             return result is not None
         finally:
             self._running.pop(record.id, None)
-            await asyncio.to_thread(remove, folder)
+            await _discard(folder)
 
     def _schedule(self, job: worker.Job) -> ProcessFuture[worker.Built | worker.Refused]:
         return self._pool.schedule(worker.build, args=(job,), timeout=self._settings.build_seconds)
@@ -170,3 +170,13 @@ class Builder:
             max_vertices=self._settings.max_vertices,
             folder=folder,
         )
+
+
+async def _discard(folder: Path) -> None:
+    # A process that is just being killed may still write into the folder while it is emptied.
+    for _ in range(50):
+        await asyncio.to_thread(remove, folder)
+        if not folder.exists():
+            return
+        await asyncio.sleep(0.1)
+    _log.warning("%s could not be removed; the next start of the server will", folder)

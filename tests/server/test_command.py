@@ -7,6 +7,7 @@ import asyncio
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -18,7 +19,6 @@ from typing import Any
 import httpx
 import pytest
 import uvicorn
-from websockets.sync.client import connect
 
 import lodestream_server
 from lodestream.errors import LodestreamError, OptionError
@@ -222,8 +222,14 @@ def test_the_server_blocks_when_a_client_does_not_read(tmp_path: Path) -> None:
     thread.start()
     assert listening.wait(PATIENCE)
     try:
-        # The library reads ahead into a queue of so many messages, and then no more.
-        with connect(addresses[0].replace("http", "ws", 1), max_queue=1, proxy=None, close_timeout=0.1):
+        # A bare socket: a library would read ahead.
+        host, port = addresses[0].removeprefix("http://").rsplit(":", 1)
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as client:
+            client.sendall(
+                f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            assert client.recv(12) == b"HTTP/1.1 101"
             assert not accepted.wait(1.0)
     finally:
         flooding.should_exit = True
