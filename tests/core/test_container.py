@@ -283,7 +283,11 @@ def test_an_index_that_lies_is_corrupt() -> None:
     assert_equal(index_of(with_index(index)), index)
     first, large = index.segments[0], replace(index.segments[0].range, length=10**6)
     lies = [
-        replace(index, layers=index.layers[:-1], segments=tuple(s for s in index.segments if s.layer < 9)),
+        replace(
+            index,
+            layers=index.layers[:-1],
+            segments=tuple(s for s in index.segments if s.layer < len(index.layers) - 1),
+        ),
         replace(index, segments=(replace(first, range=large), *index.segments[1:])),
         replace(index, segments=(replace(first, top=29), *index.segments[1:])),
         replace(index, segments=(replace(first, passes=0), *index.segments[1:])),
