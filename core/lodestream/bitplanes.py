@@ -4,10 +4,24 @@ A plane takes two passes. Each goes through the tile's bands, and each band thro
 raster order. The first pass visits only insignificant coefficients with a significant neighbour, for these are the bits
 that lower the error most; the second visits all others. There, a block without a significant coefficient so far sends
 one flag: does it get one in this plane? In a block that has, each coefficient sends its bit of the plane and, with the
-first 1, its sign. ``docs/format.md`` specifies every context.
+first 1, its sign.
 
 What a context sees of a coefficient are the bits known so far: of this plane for coefficients coded before it, of the
-planes above for those that come later, and of the planes at and above this one for its parent.
+planes above for those that come later, and of the planes at and above this one for its parent and what is around that.
+All of it is counted in units of the plane (bits below are shifted out); what lies outside the tile's band is 0. The
+contexts, in this order (`binary_coder` says what they are and learn, `initial_contexts` where they start):
+
+- *Across*, of a coefficient's bit: ((m 5 + h) 5 + v) 4 + kind. m is the class of its own magnitude so far, in units of
+  the next higher plane: 0, 1, 2 (for 2 and 3), 3 (for 4 and more). h and v are the sums of the two neighbours in its
+  row and of those in its column, at most 4. kind is the band's: 1 for details along the columns' axis plus 2 for
+  details along the rows' axis.
+- *Around*, (m 7 + r) 6 + f, for m = 0 and 1 only, mixed with the former with two weights for each m. r is the `_CLASS`
+  of the sum of the sixteen coefficients at distance two, the four in the same row or column counted twice; f is that of
+  four times the parent plus its four neighbours, at most 5.
+- *Signs*, a 1 is negative: (3 (x + 1) + y + 1) 4 + kind. x is the sign of the sum of the signs known of the neighbours
+  in the row, y of those in the column.
+- *Flags*: (3 b + a) 3 + f. b counts the blocks to the left and above that have a significant coefficient, a those to
+  the right and below; f is the largest of the parents of the block's coefficients, at most 2.
 """
 
 from __future__ import annotations
@@ -15,7 +29,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import kernel
+from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
+from .initial_contexts import CHANCES, SURENESS
+from .kernels import inlined, kernel
 
 __all__ = [
     "BAND_FIELDS",
@@ -27,8 +43,8 @@ __all__ = [
     "reconstruction_point",
 ]
 
-#: Columns of the table that describes a tile's bands to the kernels, see `code_planes`.
-BAND_FIELDS = 9
+#: Columns of the table that describes a tile's bands to the kernels, see `code_passes`.
+BAND_FIELDS = 10
 (
     _OFFSET,
     _STRIDE,
@@ -39,27 +55,22 @@ BAND_FIELDS = 9
     _PARENT_STRIDE,
     _ROW_SHIFT,
     _COLUMN_SHIFT,
+    _KIND,
 ) = range(BAND_FIELDS)
 
-_MAGNITUDE_CONTEXTS = 4 * 12 * 3
-_SIGN_CONTEXTS = 9
-_FLAG_CONTEXTS = 6
-CONTEXTS = _MAGNITUDE_CONTEXTS + _SIGN_CONTEXTS + _FLAG_CONTEXTS
-_FIRST_SIGN = _MAGNITUDE_CONTEXTS
-_FIRST_FLAG = _MAGNITUDE_CONTEXTS + _SIGN_CONTEXTS
+_KINDS = 4
+_ACROSS_CONTEXTS = 4 * 5 * 5 * _KINDS
+_AROUND_CONTEXTS = 2 * 7 * 6
+_SIGN_CONTEXTS = 9 * _KINDS
+_FLAG_CONTEXTS = 27
+# Behind the contexts stand the weights.
+_FIRST_AROUND = _ACROSS_CONTEXTS
+_FIRST_SIGN = _FIRST_AROUND + _AROUND_CONTEXTS
+_FIRST_FLAG = _FIRST_SIGN + _SIGN_CONTEXTS
+CONTEXTS = _FIRST_FLAG + _FLAG_CONTEXTS
 
-_MASK = 0xFFFFFFFF
-_BOTTOM = 1 << 24
-_HALF = 1 << 15
-# An index known to be positive spares the compiled loop the test for one that counts from the end.
-_INDEX = 0x7FFFFFFF
-#: Class of a sum of neighbours, in halves of the plane's unit.
-_SUM_CLASS = np.array(
-    [0, 1, 2, 3, 4, 5, 6, 7, 7, 8, 8, 8, 9, 9, 9, 9, 9, 10, 10, 10, 10, 10, 10, 10, 10, 10, 10] + [11] * 37, np.int64
-)
-#: Shifts by which a context's two probabilities move, by the number of bits that it has seen.
-_FAST = np.array([1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4] + [4] * 240, np.int64)
-_SLOW = np.array([1, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4, 5, 5, 5, 5] + [5] * 16 + [6] * 32 + [7] * 192, np.int64)
+#: Class of a sum; 17 stands for all that is more.
+_CLASS = np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 6], np.uint8)
 
 
 def pass_count(planes: int) -> int:
@@ -68,89 +79,56 @@ def pass_count(planes: int) -> int:
 
 
 def new_model() -> NDArray[np.int32]:
-    """The contexts of a tile before its first plane: int32, flat; four each: fast and slow probability, count, 0."""
-    model = np.full((CONTEXTS, 4), _HALF, np.int32)
-    model[:, 2:] = 0
-    return model.reshape(-1)
+    """The contexts of a tile before its first plane, see `binary_coder`, and the weights: int32, flat."""
+    contexts = [chance << 16 | 1 << 15 | sure for chance, sure in zip(CHANCES, SURENESS, strict=True)]
+    return np.array([*contexts, *[WEIGHT] * 4], np.int32)
 
 
-@kernel
-def _carry(place: int, data: NDArray[np.uint8]) -> None:
-    """Add 1 to the number that ends before ``place``."""
-    back = place - 1
-    while data[back] == 255:
-        data[back] = 0
-        back -= 1
-    data[back] += np.uint8(1)
+@inlined
+def _look(known: NDArray[np.int32], at: int, stride: int, sums: NDArray[np.int64]) -> None:
+    """Sums of what is known around each of the eight coefficients from ``at`` on, apart from their own row.
 
-
-@kernel
-def _code(
-    decoding: bool,
-    bit: int,
-    low: int,
-    width: int,
-    place: int,
-    data: NDArray[np.uint8],
-    model: NDArray[np.int32],
-    context: int,
-) -> tuple[int, int, int, int]:
-    """Code one bit in a context and let the context learn it; returns bit, low, width, place.
-
-    The chance of a 1 is the mean of the context's two probabilities, over 2**16, within 32 ... 2**16 - 32. Writing,
-    ``low`` is the interval's lower end and a carry runs back into bytes already written; reading, it is the distance
-    of the data from that end. Bytes past the end of the data are zeros.
+    Into ``sums``: 0-7 the two neighbours in the column; 8-15 those and the four at the corners; 16-23 the fourteen at
+    distance two, those in the column twice. Where a row has less than eight, the rest means nothing.
     """
-    slot = (context << 2) & _INDEX
-    fast, slow, count = int(model[slot]), int(model[slot | 1]), int(model[slot | 2])
-    bound = (width >> 16) * min(max((fast + slow) >> 1, 32), 65504)
-    if decoding:
-        bit = 1 if low < bound else 0
-        low = low if bit else low - bound
-    else:
-        low = low if bit else low + bound
-    width = bound if bit else width - bound
-    target = 65535 if bit else 0
-    model[slot] = fast + ((target - fast) >> int(_FAST[count & 255]))
-    model[slot | 1] = slow + ((target - slow) >> int(_SLOW[count & 255]))
-    model[slot | 2] = min(count + 1, 255)
-    if width < _BOTTOM:
-        if not decoding and low > _MASK:
-            low &= _MASK
-            _carry(place, data)
-        while width < _BOTTOM:
-            if decoding:
-                low = low << 8
-                if place < data.size:
-                    low |= int(data[place & _INDEX])
-            else:
-                data[place & _INDEX] = low >> 24
-                low = (low << 8) & _MASK
-            place += 1
-            width <<= 8
-    return bit, low, width, place
+    # Unsigned, lest an index might count from the end: the compiler then takes several of the eight at once.
+    row = np.uint64(at - 2 * stride - 2)
+    second, fourth, fifth = np.uint64(stride), np.uint64(3 * stride), np.uint64(4 * stride)
+    one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    for j in range(8):
+        a = row + np.uint64(j)
+        b, d, e = a + second, a + fourth, a + fifth
+        rise = int(known[b + two]) + int(known[d + two])
+        ring = 2 * (int(known[a + two]) + int(known[e + two]))
+        ring += int(known[a]) + int(known[a + one]) + int(known[a + three]) + int(known[a + four])
+        ring += int(known[b]) + int(known[b + four]) + int(known[d]) + int(known[d + four])
+        ring += int(known[e]) + int(known[e + one]) + int(known[e + three]) + int(known[e + four])
+        sums[np.uint64(j)] = rise
+        sums[np.uint64(j + 8)] = (
+            rise + int(known[b + one]) + int(known[b + three]) + int(known[d + one]) + int(known[d + three])
+        )
+        sums[np.uint64(j + 16)] = ring
 
 
-@kernel
-def _finish(low: int, width: int, place: int, data: NDArray[np.uint8]) -> int:
-    """Write the fewest bytes that name a number in the interval, without zeros at the end; returns the length, >= 1."""
-    for count in range(5):
-        mask = _MASK >> (8 * count)
-        value = (low + mask) & ~mask
-        if value < low + width:
-            if value > _MASK:
-                value &= _MASK
-                _carry(place, data)
-            for i in range(count):
-                data[place] = (value >> (24 - 8 * i)) & 255
-                place += 1
-            break
-    while place > 1 and data[place - 1] == 0:
-        place -= 1
-    if place == 0:
-        data[0] = 0
-        place = 1
-    return place
+@inlined
+def _all_significant(known: NDArray[np.int32], at: int, count: int) -> bool:
+    least = 1
+    for j in range(count):
+        least = min(least, int(known[np.uint64(at + j)]))
+    return least != 0
+
+
+@inlined
+def _family(known: NDArray[np.int32], at: int, stride: int, plane: int) -> int:
+    """Class of four times the parent at ``at`` plus its four neighbours."""
+    total = (
+        4 * (int(known[at & INDEX]) >> plane)
+        + (int(known[(at - 1) & INDEX]) >> plane)
+        + (int(known[(at + 1) & INDEX]) >> plane)
+        + (int(known[(at - stride) & INDEX]) >> plane)
+        + (int(known[(at + stride) & INDEX]) >> plane)
+    )
+    return min(int(_CLASS[min(total, 17)]), 5)
 
 
 @kernel
@@ -176,10 +154,11 @@ def code_passes(
         Read ``data`` rather than write it.
     bands : int64, shape (band, `BAND_FIELDS`)
         For each band: where its first coefficient stands in the flat arrays, their stride, rows, columns, where its
-        first block stands in ``flags`` (stride: blocks across + 1, with a row before), the same for the parent of the
-        first coefficient, and the shifts that take a row and a column to the parent's.
+        first block stands in ``flags`` (stride: blocks across + 1, with a row before and one behind), where the parent
+        of the first coefficient stands and its stride, the shifts that take a row and a column to the parent's, and
+        the band's kind.
     known : int32, flat
-        Magnitudes as far as they are known, of all tiles, each band in a frame of zeros; updated.
+        Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
     sign : int8, flat
         -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
     flags : uint8, flat
@@ -191,7 +170,7 @@ def code_passes(
     model : int32, see `new_model`
         Updated.
     data : uint8
-        Bytes of this run of passes; where writing, long enough (see `encode_bound`).
+        Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
     costs : float64, at least ``first + 1`` long
         Where writing, the bits written when each pass ended. May be empty.
 
@@ -200,16 +179,15 @@ def code_passes(
     int
         Bytes of the run, where writing.
     """
-    low, width, place, bit = 0, _MASK, 0, 0
+    low, width, place, bit = 0, WIDEST, 0, 0
     if decoding:
-        for place in range(4):
-            low = (low << 8) | (int(data[place]) if place < data.size else 0)
-        place = 4
+        low, place = start(data), 4
+    sums = np.zeros(24, np.int64)
     for number in range(first, last - 1, -1):
         plane, begins = number >> 1, (number & 1) == 1
         unit = 1 << plane
         for band in range(bands.shape[0]):
-            offset, stride = bands[band, _OFFSET], bands[band, _STRIDE]
+            offset, stride, kind = bands[band, _OFFSET], bands[band, _STRIDE], bands[band, _KIND]
             rows, columns = bands[band, _ROWS], bands[band, _COLUMNS]
             parent, parent_stride = bands[band, _PARENT], bands[band, _PARENT_STRIDE]
             row_shift, column_shift = bands[band, _ROW_SHIFT], bands[band, _COLUMN_SHIFT]
@@ -219,76 +197,91 @@ def code_passes(
                 for left in range(0, columns, 8):
                     right = min(left + 8, columns)
                     block = first_flag + (top >> 3) * (across + 1) + (left >> 3)
-                    if flags[block & _INDEX] == 0:
+                    if flags[block & INDEX] == 0:
                         if begins:
                             continue
-                        family = known[(parent + (top >> row_shift) * parent_stride + (left >> column_shift)) & _INDEX]
-                        context = _FIRST_FLAG + 2 * (
-                            int(flags[(block - 1) & _INDEX]) + int(flags[(block - across - 1) & _INDEX])
-                        )
-                        context += 1 if (family >> plane) != 0 else 0
+                        family = 0
+                        for i in range(top >> row_shift, ((bottom - 1) >> row_shift) + 1):
+                            for j in range(left >> column_shift, ((right - 1) >> column_shift) + 1):
+                                family |= int(known[(parent + i * parent_stride + j) & INDEX])
+                        before = int(flags[(block - 1) & INDEX]) + int(flags[(block - across - 1) & INDEX])
+                        after = int(flags[(block + 1) & INDEX]) + int(flags[(block + across + 1) & INDEX])
+                        slot = _FIRST_FLAG + (before * 3 + after) * 3 + min(family >> plane, 2)
                         if not decoding:
                             seen = 0
                             for i in range(top, bottom):
-                                start = offset + i * stride
+                                at = offset + i * stride
                                 for j in range(left, right):
-                                    seen |= abs(int(true[(start + j) & _INDEX]))
+                                    seen |= abs(int(true[(at + j) & INDEX]))
                             bit = 1 if seen >= unit else 0
-                        bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
+                        bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
                         if bit == 0:
                             continue
-                        flags[block & _INDEX] = 1
+                        flags[block & INDEX] = 1
                     for i in range(top, bottom):
                         at = offset + i * stride + left
-                        north, south = at - stride, at + stride
+                        if begins and _all_significant(known, at, right - left):
+                            continue
                         family_row = parent + (i >> row_shift) * parent_stride
-                        # Sums of the neighbours above and below, one column back and here; they move along the row.
-                        behind = int(known[(north - 1) & _INDEX]) + int(known[(south - 1) & _INDEX])
-                        here = int(known[north & _INDEX]) + int(known[south & _INDEX])
-                        west, value = int(known[(at - 1) & _INDEX]), int(known[at & _INDEX])
+                        _look(known, at, stride, sums)
+                        far_west, west = int(known[(at - 2) & INDEX]), int(known[(at - 1) & INDEX])
+                        value, east = int(known[at & INDEX]), int(known[(at + 1) & INDEX])
                         for j in range(left, right):
-                            ahead = int(known[(north + 1) & _INDEX]) + int(known[(south + 1) & _INDEX])
-                            east = int(known[(at + 1) & _INDEX])
-                            total = (behind + 2 * (here + west + east) + ahead) >> plane
+                            far_east = int(known[(at + 2) & INDEX])
+                            rise, side = int(sums[j & 7]), west + east
                             if begins:
-                                visits = value == 0 and total != 0
-                                early[at & _INDEX] = plane + 1 if visits else early[at & _INDEX]
+                                visits = value == 0 and (side + int(sums[(j & 7) + 8])) >> plane != 0
                             else:
-                                visits = early[at & _INDEX] != plane + 1
+                                visits = early[at & INDEX] != plane + 1
                             if visits:
+                                if begins:
+                                    early[at & INDEX] = plane + 1
                                 own = value >> (plane + 1)
-                                family = known[(family_row + (j >> column_shift)) & _INDEX] >> plane
-                                context = (
-                                    (min(own, 2) if own < 4 else 3) * 12 + int(_SUM_CLASS[min(total, 63)])
-                                ) * 3 + min(family, 2)
+                                slot = min(own, 2) if own < 4 else 3
                                 if not decoding:
-                                    bit = (abs(int(true[at & _INDEX])) >> plane) & 1
-                                bit, low, width, place = _code(decoding, bit, low, width, place, data, model, context)
+                                    bit = (abs(int(true[at & INDEX])) >> plane) & 1
+                                across_slot = (
+                                    (slot * 5 + min(side >> plane, 4)) * 5 + min(rise >> plane, 4)
+                                ) * 4 + kind
+                                if slot > 1:
+                                    bit, low, width, place = code_bit(
+                                        decoding, bit, low, width, place, data, model, across_slot
+                                    )
+                                else:
+                                    ring = (int(sums[(j & 7) + 16]) + 2 * (far_west + far_east)) >> plane
+                                    around = (slot * 7 + int(_CLASS[min(ring, 17)])) * 6 + _family(
+                                        known, family_row + (j >> column_shift), parent_stride, plane
+                                    )
+                                    bit, low, width, place = code_mixed_bit(
+                                        decoding,
+                                        bit,
+                                        low,
+                                        width,
+                                        place,
+                                        data,
+                                        model,
+                                        across_slot,
+                                        _FIRST_AROUND + around,
+                                        CONTEXTS + 2 * slot,
+                                    )
                                 if bit:
                                     value += unit
-                                    known[at & _INDEX] = value
+                                    known[at & INDEX] = value
                                     if own == 0:
-                                        side = int(sign[(at - 1) & _INDEX]) + int(sign[(at + 1) & _INDEX])
-                                        rise = int(sign[north & _INDEX]) + int(sign[south & _INDEX])
-                                        context = _FIRST_SIGN + 3 * (min(max(side, -1), 1) + 1)
-                                        context += min(max(rise, -1), 1) + 1
+                                        side = int(sign[(at - 1) & INDEX]) + int(sign[(at + 1) & INDEX])
+                                        rise = int(sign[(at - stride) & INDEX]) + int(sign[(at + stride) & INDEX])
+                                        slot = 3 * (min(max(side, -1), 1) + 1) + min(max(rise, -1), 1) + 1
                                         if not decoding:
-                                            bit = 1 if true[at & _INDEX] < 0 else 0
-                                        bit, low, width, place = _code(
-                                            decoding, bit, low, width, place, data, model, context
+                                            bit = 1 if true[at & INDEX] < 0 else 0
+                                        bit, low, width, place = code_bit(
+                                            decoding, bit, low, width, place, data, model, _FIRST_SIGN + 4 * slot + kind
                                         )
-                                        sign[at & _INDEX] = -1 if bit else 1
-                            west, value = value, east
-                            behind, here = here, ahead
+                                        sign[at & INDEX] = -1 if bit else 1
+                            far_west, west, value, east = west, value, east, far_east
                             at += 1
-                            north += 1
-                            south += 1
         if costs.size:
             costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
-    if not decoding and low > _MASK:
-        low &= _MASK
-        _carry(place, data)
-    return 0 if decoding else _finish(low, width, place, data)
+    return 0 if decoding else finish(low, width, place, data)
 
 
 @kernel

@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 
 import numba
 
-__all__ = ["kernel"]
+__all__ = ["inlined", "kernel"]
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
@@ -19,3 +19,8 @@ def kernel(function: _Function) -> _Function:
     fusing changes nothing, or state the tolerance that they need.
     """
     return cast(_Function, numba.njit(cache=True, nogil=True, fastmath={"contract"})(function))
+
+
+def inlined(function: _Function) -> _Function:
+    """A part of a kernel that is compiled into each place that calls it: a call would cost more than the work."""
+    return cast(_Function, numba.njit(nogil=True, fastmath={"contract"}, forceinline=True)(function))

@@ -1,4 +1,4 @@
-"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, each band in a frame of zeros."""
+"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, zeros around each band."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ __all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
 
 #: Passes that remain of a tile that was not announced: more than any tile has.
 UNANNOUNCED = 57
-_NO_SHIFT = 31  # takes any row or column to 0, where a band without a parent finds a zero
+_NO_SHIFT = 31  # takes any row or column to 0
+_NO_PARENT = 1  # where a band without a parent finds a zero between zeros
 
 
 @dataclass(frozen=True)
@@ -43,18 +44,18 @@ class TileTable:
         """Lay out the tiles of a surface."""
         rows: list[list[int]] = []
         first = [0]
-        size, blocks = 1, 0
+        size, blocks = 3, 0
         for tile in layout.tiles:
             for band in tile.bands:
                 height, width = band.shape
                 stride, across = width + 2, (width + 7) // 8
-                place = size + stride + 1
-                flags = blocks + across + 2
-                rows.append([place, stride, height, width, flags, 0, 0, _NO_SHIFT, _NO_SHIFT])
-                size += (height + 2) * stride
-                blocks += ((height + 7) // 8 + 1) * (across + 1) + 1
+                place = size + 2 * stride + 2
+                flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
+                rows.append([place, stride, height, width, flags, _NO_PARENT, 0, _NO_SHIFT, _NO_SHIFT, kind])
+                size += (height + 4) * stride + 2
+                blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
-        table = cls(layout, np.array(rows, np.int64).reshape(-1, BAND_FIELDS), first, size, blocks)
+        table = cls(layout, np.array(rows, np.int64).reshape(-1, BAND_FIELDS), first, size + 8, blocks)
         table._join_parents()
         return table
 
