@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from lodestream.allocation import MOST_LAYERS, TileCurve, _layer_ends, assign_layers, hull_slopes
 from lodestream.layout import Layout
@@ -81,10 +82,10 @@ def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
 
 def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
     # The error falls as a power of the bytes, faster in the first fifth of each step of 1.4 in the bytes.
-    sizes = 20.0 * np.arange(1, 20_001)
+    sizes: NDArray[np.float64] = 20.0 * np.arange(1.0, 20_001.0)
     step = np.log(sizes) / np.log(1.4) % 1
-    left = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
-    ends = np.array(_layer_ends(sizes, left[0] - left))
+    left: NDArray[np.float64] = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
+    ends = np.array(_layer_ends(sizes, left[0] - left), np.int64)
     inner = ends[(ends > 100) & (ends < 15_000)]
     assert len(inner) > 10
     assert np.abs(step[inner - 1] - 0.2).max() < 0.03
