@@ -49,7 +49,7 @@ def _figure(results: Results, names: list[str], path: Path) -> None:
     handles: dict[str, Artist] = {}
     for place in axes.flat:
         handles.update(dict(zip(*reversed(place.get_legend_handles_labels()), strict=True)))
-    order = [name for name in (OURS, *PEERS) if name in handles]
+    order = [name for name in (OURS, f"{OURS}, with a precision", *PEERS) if name in handles]
     figure.legend([handles[name] for name in order], order, loc="outside right upper", fontsize=8, frameon=False)
     # Neither version nor date stands in the file: the same results draw the same bytes.
     figure.savefig(path, dpi=90, metadata={"Software": None})
@@ -60,19 +60,23 @@ def _surface(results: Results, name: str, axes: Axes) -> None:
     colours = plt.get_cmap("tab20")
     for number, peer in enumerate(PEERS):
         _curve(axes, envelope(results.rows(name, peer), "rms"), peer, colours(number), 1.1)
-    for stream in results.streams(name).values():
-        _curve(axes, envelope(stream, "rms"), OURS, "black", 1.0 if len(stream) < 2 else 1.6)
+    for stream, rows in results.streams(name).items():
+        if stream != "exact":
+            _curve(axes, envelope(rows, "rms"), f"{OURS}, with a precision", "dimgrey", 0.9, "dotted")
+    _curve(axes, envelope(results.streams(name)["exact"], "rms"), OURS, "black", 2.0)
     shape = " x ".join(map(str, results.surfaces[name]["shape"]))
     axes.set(xscale="log", yscale="log", ylim=(_LEAST, _MOST), xlabel="bytes", ylabel="RMS error / extent")
     axes.set_title(f"{name}, {shape}", fontsize=10)
     axes.grid(True, which="major", linewidth=0.4, alpha=0.6)
 
 
-def _curve(axes: Axes, points: list[tuple[float, float]], name: str, colour: Any, width: float) -> None:
+def _curve(
+    axes: Axes, points: list[tuple[float, float]], name: str, colour: Any, width: float, style: str = "solid"
+) -> None:
     """A line through the lossy points; a lossless one stands as a triangle at the lower edge."""
     lossy = [(size, error) for size, error in points if _LEAST / 3 < error < _MOST * 3]
     if lossy:
-        axes.plot(*zip(*lossy, strict=True), color=colour, linewidth=width, label=name)
+        axes.plot(*zip(*lossy, strict=True), color=colour, linewidth=width, linestyle=style, label=name)
     exact = [size for size, error in points if not error]
     if exact:
         axes.plot(exact, [_LEAST * 1.15], marker="v", markersize=5, color=colour, linestyle="none", clip_on=False)

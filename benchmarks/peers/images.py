@@ -40,17 +40,27 @@ def _htj2k_decode(data: bytes) -> NDArray[Any]:
 
 
 def jpegxl(trial: Trial) -> None:
-    """Lossless, effort 9; float32 as such where there are no 16 bits of whole numbers."""
-    surface = trial.surface
-    _planes(trial, _jpegxl_encode, _jpegxl_decode)
-    if all(np.array_equal(plane, single) for plane, single in zip(surface.channels, surface.floats, strict=True)):
+    """Lossless, effort 9 (7 where a large one is quantised); float32 as such where there are no 16 bits of numbers."""
+    surface, lattice = trial.surface, trial.lattice
+    first = 7 if surface.large else 9
+    _planes(trial, lambda plane: _jpegxl_encode(plane, first), _jpegxl_decode)
+    if lattice is not None and lattice.longest <= 65535:
+        if surface.large:
+            whole = lattice.numbers.astype(np.uint16)
+            trial.case(
+                "lossless, effort 9",
+                lambda: [_jpegxl_encode(_plane(whole, i), 9) for i in _all(whole)],
+                lambda streams: lattice.points(np.stack([_jpegxl_decode(data) for data in streams], -1)),
+                SIDE,
+            )
+    elif all(np.array_equal(plane, single) for plane, single in zip(surface.channels, surface.floats, strict=True)):
         trial.each_channel(
-            "lossless float32", lambda plane, _: bytes(_jpegxl_encode(plane)), lambda data, _: _jpegxl_decode(data)
+            "lossless float32", lambda plane, _: _jpegxl_encode(plane, 9), lambda data, _: _jpegxl_decode(data)
         )
 
 
-def _jpegxl_encode(plane: NDArray[Any]) -> Any:
-    return imagecodecs.jpegxl_encode(plane, lossless=True, effort=9, numthreads=1)
+def _jpegxl_encode(plane: NDArray[Any], effort: int) -> bytes:
+    return bytes(imagecodecs.jpegxl_encode(plane, lossless=True, effort=effort, numthreads=1))
 
 
 def _jpegxl_decode(data: bytes) -> NDArray[Any]:

@@ -69,7 +69,8 @@ def _head(results: Results) -> Iterator[str]:
     yield "This page and its figures are written by\n"
     yield "    make bench-peers\n"
     yield "in an environment of its own (layers of JPEG 2000 need Debian's OpenJPEG: `apt-get install libopenjp2-7`),"
-    yield f"which took {took / 60:.0f} minutes of measuring, on one core of {machine.get('processor', 'an unknown processor')} "
+    name = machine.get("processor", "an unknown processor")
+    yield f"which took {took / 60:.0f} minutes of measuring, on one core of {name} "
     when = " to ".join(sorted({dates[0], dates[-1]}))
     yield f"({machine.get('system', '')}, Python {machine.get('python', '')}), {when}.\n"
     yield f"Lodestream {lodestream.__version__}; {', '.join(results.data.get('versions', []))}.\n"
@@ -148,7 +149,7 @@ def _cells(cells: Sequence[Cell]) -> Iterator[str]:
 def _lossless(results: Results) -> Iterator[str]:
     gates = ("JPEG XL, effort 9", "pcodec", "SZ3")
     rows: list[list[str]] = []
-    ratios: dict[str, dict[str, list[float]]] = {"whole numbers, heights": {}, "float32 x, y, z": {}}
+    ratios: dict[str, dict[str, list[float]]] = {"heights of 16 bits": {}, "float32 x, y, z": {}}
     for name, facts in results.surfaces.items():
         ours = results.lossless(name, OURS)
         if ours is None:
@@ -159,8 +160,8 @@ def _lossless(results: Results) -> Iterator[str]:
         for peer in gates:
             ratio = ours["bytes"] / found[peer] if peer in found else math.nan
             cells += [f"{found[peer]:,}" if peer in found else "-", _bold(ratio, 1.0)]
-            kind = "float32 x, y, z" if facts["shape"][2:] == [3] else "whole numbers, heights"
-            counted = facts["group"] != "tiny" and (kind.startswith("float32") or facts["lattice"])
+            kind = "float32 x, y, z" if facts["shape"][2:] == [3] else "heights of 16 bits"
+            counted = facts["group"] != "tiny" and (kind.startswith("float32") or _sixteen_bits(results, name))
             if counted and not math.isnan(ratio):
                 ratios[kind].setdefault(peer, []).append(ratio)
         last = [best, f"{found[best]:,}", _bold(ours["bytes"] / found[best], 1.0)] if best else ["-", "-", ""]
@@ -182,6 +183,12 @@ def _lossless(results: Results) -> Iterator[str]:
         )
         yield f"- {kind}, larger than 64 x 64, geometric means (surfaces): {means or 'nothing measured'}."
     yield LOSSLESS
+
+
+def _sixteen_bits(results: Results, surface: str) -> bool:
+    """Whether JPEG XL could be given whole numbers, of which it has 16 bits."""
+    row = results.lossless(surface, "JPEG XL, effort 9")
+    return row is not None and "float32" not in row["setting"]
 
 
 def _losses(results: Results) -> Iterator[str]:

@@ -142,6 +142,8 @@ class Trial:
         for target in TARGETS:
             for kind, factor in (("RMS", 2.0 if xyz else math.sqrt(12)), ("max", 2 / math.sqrt(3) if xyz else 2.0)):
                 step = factor * target * self.surface.extent
+                if kind == "max" and self.surface.large:
+                    continue
                 if self.lattice is None or step > self.lattice.step:
                     found.append((f"quantised for {kind} {target:.0e}", step))
         return found
