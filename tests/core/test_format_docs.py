@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from lodestream import binary_coder
+from lodestream.bitplanes import CONTEXTS
+from lodestream.container import sections
+from lodestream.initial_contexts import CHANCES, SURENESS
+from lodestream.lifting import TAPS
+
+TEXT = (Path(__file__).parents[2] / "docs" / "format.md").read_text()
+
+
+def numbers_after(words: str, count: int) -> list[int]:
+    """The numbers that follow some words of the page."""
+    start = TEXT.index(words) + len(words)
+    return [int(number) for number in re.findall(r"-?\d+", TEXT[start : start + 12 * count])[:count]]
+
+
+def test_the_page_has_the_tables_of_the_code() -> None:
+    assert numbers_after("c of the contexts 0 to 546:", CONTEXTS) == CHANCES
+    assert numbers_after("s of the same:", CONTEXTS) == SURENESS
+    assert numbers_after("    L = ", 33) == binary_coder._LOGISTIC
+    assert numbers_after("    h = ", len(TAPS)) == [int(tap) for tap in TAPS]
+
+
+def test_the_page_has_the_version_and_the_magic_of_the_code() -> None:
+    assert f"\nVersion {sections.VERSION}. " in TEXT
+    assert sections.MAGIC.hex(" ").upper() in TEXT
+    assert sections._FOOTER_MAGIC.hex(" ").upper() in TEXT
