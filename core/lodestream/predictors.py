@@ -1,4 +1,4 @@
-"""The third step of the lifting as the format sees it: which steps have an (a, b) of their own, and the others' (a, b)."""
+"""The third step of the lifting as the format sees it: which steps have an (a, b) of their own, which a common one."""
 
 from __future__ import annotations
 
