@@ -110,7 +110,7 @@ def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: La
 
 
 def _targets(first: float, last: float) -> NDArray[np.float64]:
-    """Bytes after each layer but the complete one, evenly spaced in the logarithm as far as layers are worth a table."""
+    """Bytes after each layer but the complete one, evenly spaced in the logarithm where layers are worth a table."""
     growth = _LEAST_GROWTH
     while True:
         targets = [first]

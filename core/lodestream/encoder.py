@@ -280,7 +280,7 @@ class _TileCoder:
         model = self._models.setdefault((tile, channel), new_model())
         tiles, rows = self.tiles[channel], self._table.of_tile(tile)
         coefficients = int((rows[:, 2] * rows[:, 3]).sum())
-        # A decision takes at most 11 bits (a chance of 32 in 2**16); a coefficient decides twice in a plane at the most.
+        # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
         data = np.empty(64 + 3 * passes * coefficients, np.uint8)
         length = code_passes(
             False,

@@ -81,8 +81,8 @@ def find_lattice(values: NDArray[Any]) -> Lattice | None:
     """The lattice on which the values already lie, or None.
 
     Tried are integers (any step that divides all differences), scaled powers of two, and decimals of up to nine places
-    (rounded correctly, or computed as ``origin + step * k``), each with fewer than 2**24 steps between the least and the
-    largest value. What is returned restores every value bit for bit, except that -0.0 is taken for 0.0.
+    (rounded correctly, or computed as ``origin + step * k``), each fewer than 2**24 steps between least and largest
+    value. What is returned restores every value bit for bit, except that -0.0 is taken for 0.0.
     """
     flat = values.ravel()
     low, high = flat.min(), flat.max()

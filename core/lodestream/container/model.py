@@ -1,4 +1,4 @@
-"""What a container says of itself: header, layers, levels, segments and their places. `docs/format.md` has the bytes."""
+"""What a container says of itself: header, layers, levels, segments, their places. `docs/format.md` has the bytes."""
 
 from __future__ import annotations
 
