@@ -85,8 +85,8 @@ def new_model() -> NDArray[np.int32]:
 
 
 @inlined
-def _look(known: NDArray[np.int32], at: int, stride: int, sums: NDArray[np.int64]) -> None:
-    """Sums of what is known around each of the eight coefficients from ``at`` on, apart from their own row.
+def _look(known: NDArray[np.int32], at: int, stride: int, sums: NDArray[np.uint32]) -> None:
+    """Sums of what is known around each of the eight coefficients from ``at`` on, apart from their own row: below 2**32.
 
     Into ``sums``: 0-7 the two neighbours in the column; 8-15 those and the four at the corners; 16-23 the fourteen at
     distance two, those in the column twice. Where a row has less than eight, the rest means nothing.
@@ -112,10 +112,20 @@ def _look(known: NDArray[np.int32], at: int, stride: int, sums: NDArray[np.int64
 
 @inlined
 def _all_significant(known: NDArray[np.int32], at: int, count: int) -> bool:
+    """Whether the first pass would find nothing to visit in a row: no insignificant coefficient in it."""
     least = 1
     for j in range(count):
         least = min(least, int(known[np.uint64(at + j)]))
     return least != 0
+
+
+@inlined
+def _nothing_near(known: NDArray[np.int32], at: int, count: int, sums: NDArray[np.uint32]) -> bool:
+    """Whether the first pass would find nothing to visit in a row: no significant coefficient in it or beside it."""
+    found = int(known[np.uint64(at - 1)]) | int(known[np.uint64(at + count)])
+    for j in range(count):
+        found |= int(known[np.uint64(at + j)]) | (int(sums[np.uint64(j + 8)]) & WIDEST)
+    return found == 0
 
 
 @inlined
@@ -182,7 +192,7 @@ def code_passes(
     low, width, place, bit = 0, WIDEST, 0, 0
     if decoding:
         low, place = start(data), 4
-    sums = np.zeros(24, np.int64)
+    sums = np.zeros(24, np.uint32)  # read through a mask, for a sum of signed and unsigned compiles to a float
     for number in range(first, last - 1, -1):
         plane, begins = number >> 1, (number & 1) == 1
         unit = 1 << plane
@@ -222,15 +232,17 @@ def code_passes(
                         at = offset + i * stride + left
                         if begins and _all_significant(known, at, right - left):
                             continue
-                        family_row = parent + (i >> row_shift) * parent_stride
                         _look(known, at, stride, sums)
+                        if begins and _nothing_near(known, at, right - left, sums):
+                            continue
+                        family_row = parent + (i >> row_shift) * parent_stride
                         far_west, west = int(known[(at - 2) & INDEX]), int(known[(at - 1) & INDEX])
                         value, east = int(known[at & INDEX]), int(known[(at + 1) & INDEX])
                         for j in range(left, right):
                             far_east = int(known[(at + 2) & INDEX])
-                            rise, side = int(sums[j & 7]), west + east
+                            rise, side = (int(sums[j & 7]) & WIDEST), west + east
                             if begins:
-                                visits = value == 0 and (side + int(sums[(j & 7) + 8])) >> plane != 0
+                                visits = value == 0 and (side + (int(sums[(j & 7) + 8]) & WIDEST)) >> plane != 0
                             else:
                                 visits = early[at & INDEX] != plane + 1
                             if visits:
@@ -248,7 +260,7 @@ def code_passes(
                                         decoding, bit, low, width, place, data, model, across_slot
                                     )
                                 else:
-                                    ring = (int(sums[(j & 7) + 16]) + 2 * (far_west + far_east)) >> plane
+                                    ring = ((int(sums[(j & 7) + 16]) & WIDEST) + 2 * (far_west + far_east)) >> plane
                                     around = (slot * 7 + int(_CLASS[min(ring, 17)])) * 6 + _family(
                                         known, family_row + (j >> column_shift), parent_stride, plane
                                     )

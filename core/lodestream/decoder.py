@@ -258,7 +258,10 @@ class Decoder:
         if len(self.layers) != header.layer_count or not header.corrected:
             raise CorruptStreamError("expected layers, got exactness", frame.offset)
         self._correct(frame)
-        self._show(len(self.layers), header.levels, frame.end, 0.0, 0.0, True)
+        # What is exact has no error; otherwise only attributes were corrected.
+        last = self.layers[-1]
+        figures = (0.0, 0.0) if header.exact else (last.rms, last.max_error)
+        self._show(len(self.layers), header.levels, frame.end, *figures, True)
 
     def _correct(self, frame: Frame) -> None:
         self._reconstruction.correct(bytes(frame.payload), frame.payload_offset)

@@ -31,6 +31,9 @@ __all__ = ["encode"]
 #: whose tiles are all known is inverted without errors of rounding.
 _ROUNDING = 0.2
 
+#: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
+_COARSER = (8, 4, 0)
+
 Figures = tuple[float, float]
 State = NDArray[np.int8]
 
@@ -65,7 +68,19 @@ def encode(
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
-    return _Encoding(surface, precision, progress or (lambda fraction: None)).run()
+    progress = progress or (lambda fraction: None)
+    container = _Encoding(surface, precision, progress).run()
+    for bits in _COARSER:
+        if precision is not None or len(container) <= longest(surface.points.nbytes):
+            break
+        # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
+        container = min(container, _Encoding(surface, precision, progress, bits).run(), key=len)
+    return container
+
+
+def longest(raw: int) -> int:
+    """Most bytes that a container takes which restores so many bytes of values."""
+    return raw + raw // 100 + 1024
 
 
 @dataclass
@@ -81,7 +96,11 @@ class _Encoding:
     """One run of the encoder; the methods stand in the order in which they are called."""
 
     def __init__(
-        self, surface: Surface, precision: float | str | Tolerance | None, progress: Callable[[float], None]
+        self,
+        surface: Surface,
+        precision: float | str | Tolerance | None,
+        progress: Callable[[float], None],
+        bits: int | None = None,
     ) -> None:
         self.surface, self.points, self.progress = surface, surface.points, progress
         count = 1 if self.points.ndim == 2 else self.points.shape[2]
@@ -98,7 +117,7 @@ class _Encoding:
         self.layout = Layout(surface.shape, surface.closed, tile)
         self.table = TileTable.of(self.layout)
         self.bits = 0
-        self.lattices = choose_lattices(self.points, self.geometric, self.precision)
+        self.lattices = choose_lattices(self.points, self.geometric, self.precision, bits)
 
     def run(self) -> bytes:
         predictors = np.zeros((len(self.lattices), self.layout.levels, 2, 2), np.int8)
@@ -127,11 +146,9 @@ class _Encoding:
         )
         states, figures = self._measured(states)
         self.progress(0.7)
-        correction = self._correction()
-        levels = self._level_figures(figures[-1])
+        correction, exact = self._correction()
+        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
         self.progress(0.8)
-        if correction or figures[-1] == (0.0, 0.0):
-            levels[-1] = (0.0, 0.0)
         coded = self._coded(states, figures)
         container = write_container(
             self.header,
@@ -139,7 +156,7 @@ class _Encoding:
             levels,
             correction,
             self.surface.metadata,
-            exact=bool(correction) or self._exact_already,
+            exact=exact,
         )
         self.progress(1.0)
         return container
@@ -243,11 +260,19 @@ class _Encoding:
         """Passes of every tile and channel."""
         return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
 
-    def _correction(self) -> bytes:
-        """The exactness section's payload; empty where the lattice is exact or a precision was asked for."""
+    def _correction(self) -> tuple[bytes, bool]:
+        """The exactness section's payload, if there is anything to correct, and whether all is exact then.
+
+        A precision is for the coordinates: attributes come back bit for bit all the same.
+        """
         delta = exactness.difference(self.points, self._last)
-        self._exact_already = not delta
-        return b"" if self.precision is not None else delta
+        if not delta or self.precision is None:
+            return delta, True
+        if self.points.ndim == 2 or self.points.shape[2] == self.geometric:
+            return b"", False
+        kept = self._last.copy()
+        kept[..., self.geometric :] = self.points[..., self.geometric :]
+        return exactness.difference(kept, self._last), not exactness.difference(self.points, kept)
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""

@@ -23,7 +23,9 @@ def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
     return points if points.ndim == 2 else points[..., channel]
 
 
-def choose_lattices(points: NDArray[Any], geometric: int, precision: float | None) -> list[Lattice]:
+def choose_lattices(
+    points: NDArray[Any], geometric: int, precision: float | None, bits: int | None = None
+) -> list[Lattice]:
     """A lattice for each channel.
 
     Parameters
@@ -34,6 +36,8 @@ def choose_lattices(points: NDArray[Any], geometric: int, precision: float | Non
     precision : float or None
         Largest distance allowed between a point and what comes back; None: whatever costs least, for what the lattice
         leaves out is stored.
+    bits : int, optional
+        Keep no more of any channel than so many bits of its range.
 
     Returns
     -------
@@ -46,6 +50,9 @@ def choose_lattices(points: NDArray[Any], geometric: int, precision: float | Non
     for channel in range(count):
         values = channel_of(points, channel)
         spans.append((float(values.min()), float(values.max())))
+    if bits is not None:
+        # With no bit at all every value is nearest to the same lattice point.
+        return [precision_lattice(low, high, max(high - low, 1e-300) * 2.0 ** -(bits or -2)) for low, high in spans]
     widest = max(high - low for low, high in spans[:geometric])
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:

@@ -14,6 +14,7 @@ from . import exactness
 from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
 from .errors import CorruptStreamError
+from .predictors import COEFFICIENT_BITS
 from .tiles import UNANNOUNCED, Tiles, TileTable
 from .transform import allocate, inverse
 
@@ -125,6 +126,7 @@ class Progress:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
         self.state = initial_state(header)
+        self._fraction = header.fraction
 
     def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
         """Note a segment; returns the first of its passes.
@@ -146,6 +148,10 @@ class Progress:
             problem = "told again" if known else "not told"
             raise CorruptStreamError(
                 f"expected the planes of tile {tile} once, at its first segment: {problem}", offset
+            )
+        if top + self._fraction > COEFFICIENT_BITS:
+            raise CorruptStreamError(
+                f"expected at most {COEFFICIENT_BITS - self._fraction} bit-planes of tile {tile}, got {top}", offset
             )
         if top:
             self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from .axis import AxisStep
 from .kernels import kernel
 from .layout import Layout
-from .lifting import REACH, TAPS, forward_step, inverse_step
+from .lifting import CLAMP, REACH, TAPS, forward_step, inverse_step
 from .predictors import FOUR_POINT, default_predictors, fitted_steps
 
 __all__ = [
@@ -83,7 +83,9 @@ def inverse(
     for finer in range(1, level + 1):
         if whole is not None and finer == whole + 1:
             rows, columns = layout.shapes[whole]
-            coefficients[:rows, :columns] <<= fraction
+            grid = coefficients[:rows, :columns]
+            np.clip(grid, -(CLAMP >> fraction), CLAMP >> fraction, out=grid)
+            grid <<= fraction
         rows, columns = layout.shapes[finer]
         corner = coefficients[:rows, :columns]
         steps = layout.steps(finer)

@@ -233,3 +233,26 @@ def test_metadata_come_back_as_they_were() -> None:
 def test_what_is_no_surface_is_refused(points: NDArray[Any]) -> None:
     with pytest.raises(InputError, match="expected"):
         ls.encode(points)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "i8", "u8", "f4", "f8"])
+@pytest.mark.parametrize("shape", [(1, 2), (16, 24), (90, 110)])
+def test_noise_is_stored_rather_than_coded_at_any_price(dtype: str, shape: tuple[int, int]) -> None:
+    size = np.dtype(dtype).itemsize * shape[0] * shape[1]
+    values = np.frombuffer(np.random.default_rng(5).bytes(size), dtype).reshape(shape).copy()
+    if values.dtype.kind == "f":
+        values[~np.isfinite(values) | (np.abs(values) > 1e30)] = 1
+    assert len(assert_comes_back(values)) <= 1.01 * size + 1024
+
+
+def test_a_precision_leaves_attributes_as_they_are() -> None:
+    rng = np.random.default_rng(6)
+    points = np.concatenate([torus(20, 31), rng.normal(size=(20, 31, 2))], axis=-1)
+    container = ls.encode(points, "1e-3d")
+    decoder = ls.Decoder()
+    decoder.feed(container)
+    decoded = decoder.surface().points
+    assert decoded[..., 3:].tobytes() == points[..., 3:].tobytes()
+    assert 0 < decoder.rms == pytest.approx(errors(decoded, points)[0], rel=1e-12)
+    assert index_of(container).levels[-1].rms == decoder.rms
+    assert not index_of(container).header.exact

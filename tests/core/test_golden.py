@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import json
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lodestream as ls
+from tests.golden.generate import FOLDER, digest, expectations, originals
+
+EXPECTED: dict[str, Any] = json.loads((FOLDER / "expected.json").read_text())
+NAMES = sorted(EXPECTED)
+
+
+def container_of(name: str) -> bytes:
+    return (FOLDER / f"{name}.lode").read_bytes()
+
+
+def test_every_golden_file_is_expected_and_the_other_way_round() -> None:
+    assert sorted(path.stem for path in FOLDER.glob("*.lode")) == NAMES == sorted(originals())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_containers_decode_to_what_they_held(name: str) -> None:
+    found = expectations(container_of(name))
+    assert found == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_containers_hold_their_originals(name: str) -> None:
+    surface, precision = originals()[name]
+    decoded = ls.decode(container_of(name))
+    assert decoded.closed == surface.closed
+    assert decoded.metadata == surface.metadata
+    assert (decoded.points.dtype, decoded.points.shape) == (surface.points.dtype, surface.points.shape)
+    if precision is None:
+        assert decoded.points.tobytes() == surface.points.tobytes()
+    else:
+        assert EXPECTED[name]["layers"][-1]["max"] > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_prefix_shows_the_last_whole_layer(name: str) -> None:
+    container, layers = container_of(name), EXPECTED[name]["layers"]
+    seen = -1
+    decoder = ls.Decoder()
+    for place in range(len(container)):
+        decoder.feed(container[place : place + 1])
+        if len(decoder.layers) - 1 != seen:
+            seen = len(decoder.layers) - 1
+            assert decoder.bytes == layers[seen]["bytes"] == place + 1
+            assert digest(decoder.surface().points) == layers[seen]["sha256"]
+    assert seen == len(layers) - 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_flipped_bit_leaves_the_layers_before_it_and_a_clear_error(name: str) -> None:
+    container, layers = container_of(name), EXPECTED[name]["layers"]
+    shuffle = random.Random(name)
+    for _ in range(64):
+        place, bit = shuffle.randrange(len(container)), shuffle.randrange(8)
+        damaged = bytearray(container)
+        damaged[place] ^= 1 << bit
+        decoder = ls.Decoder()
+        try:
+            decoder.feed(bytes(damaged))
+            decoder.finish()
+        except (ls.CorruptStreamError, ls.UnsupportedVersionError, ls.TruncatedStreamError):
+            pass
+        whole = [layer for layer in layers if layer["bytes"] <= place]
+        assert len(decoder.layers) >= len(whole)
+        for view, layer in zip(decoder.layers, layers, strict=False):
+            assert (view.bytes, view.rms, view.max_error) == (layer["bytes"], layer["rms"], layer["max"])
+        if decoder.layers:
+            assert digest(decoder.surface().points) == layers[len(decoder.layers) - 1]["sha256"]
+
+
+def test_golden_values_reach_the_corners_of_their_types() -> None:
+    hostile = ls.decode(container_of("heights-float64-hostile")).points
+    assert np.signbit(hostile[0, 0])
+    assert 0 < hostile[0, 1] < 1e-300
