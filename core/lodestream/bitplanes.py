@@ -86,7 +86,7 @@ def new_model() -> NDArray[np.int32]:
 
 @inlined
 def _look(known: NDArray[np.int32], at: int, stride: int, sums: NDArray[np.uint32]) -> None:
-    """Sums of what is known around each of the eight coefficients from ``at`` on, apart from their own row: below 2**32.
+    """Sums of what is known around each of the eight coefficients from ``at`` on, apart from their row; below 2**32.
 
     Into ``sums``: 0-7 the two neighbours in the column; 8-15 those and the four at the corners; 16-23 the fourteen at
     distance two, those in the column twice. Where a row has less than eight, the rest means nothing.
