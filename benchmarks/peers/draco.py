@@ -38,7 +38,7 @@ def edgebreaker(trial: Trial) -> None:
     vertices = np.stack(trial.surface.floats, -1).reshape(-1, 3)
     faces = _triangles(*trial.surface.shape)
     numbers = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 1)
-    for bits in (6, 8, 10, 12, 14, 16, 18) if len(vertices) > 500_000 else range(6, 20):
+    for bits in (8, 11, 14, 17) if len(vertices) > 500_000 else range(6, 20):
         options: dict[str, Any] = {"quantization_bits": bits, "compression_level": _LEVEL}
         try:
             stream, encode_seconds, encode_peak = trial.timed(
