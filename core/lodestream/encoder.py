@@ -16,14 +16,15 @@ from .container.sections import MOST_FRACTION, TILE_BITS
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .lattice import LATTICE_BITS, Lattice
 from .layout import Layout
-from .measure import distances, extent_of
+from .measure import extent_of
+from .picture import coordinate_distances
 from .predictors import COEFFICIENT_BITS
 from .quantise import channel_of, choose_lattices
 from .reconstruction import channel_picture, initial_state, to_points
 from .surface import Surface
 from .target import Tolerance
 from .tiles import Tiles, TileTable, gather
-from .transform import allocate, forward, synthesis_norms
+from .transform import PADDING, allocate, forward, synthesis_norms
 
 __all__ = ["encode"]
 
@@ -165,7 +166,7 @@ class _Encoding:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         for fit in (True, False):
             values = allocate(self.surface.shape)
-            values[:] = lattice.coordinates(channel_of(self.points, number))
+            lattice.coordinates(channel_of(self.points, number), out=values)
             self.bits = max(self.bits, max(int(values.max()), -int(values.min())).bit_length())
             predictors = forward(values, self.layout, fit)
             if max(int(values.max()), -int(values.min())) < 1 << COEFFICIENT_BITS:
@@ -219,41 +220,54 @@ class _Encoding:
                     curves.append(TileCurve(tile, number, bits, gains))
         return curves
 
-    def _figures(self, state: State) -> Figures:
+    def _figures(self, state: State, canvases: NDArray[np.int32]) -> Figures:
         """RMS and maximum error of what a receiver shows in this state, see `reconstruction.Reconstruction`."""
-        pictures = [
-            channel_picture(self.header, number, tiles, state[:, number], self.layout.levels)
-            for number, tiles in enumerate(self._whole.tiles)
-        ]
-        self._last = to_points(self.header, pictures)
-        return distances(self.points, self._last, self.geometric)
+        columns = self.surface.shape[1]
+        pictures = [self._picture(number, state, canvas[:, :columns]) for number, canvas in enumerate(canvases)]
+        fractions = [fraction for _, fraction in pictures]
+        return coordinate_distances(self.points, self.lattices[: self.geometric], canvases, fractions)
+
+    def _picture(
+        self, number: int, state: State, canvas: NDArray[np.int32] | None = None
+    ) -> tuple[NDArray[np.int32], int]:
+        tiles = self._whole.tiles[number]
+        return channel_picture(self.header, number, tiles, state[:, number], self.layout.levels, canvas)
+
+    def _canvases(self) -> NDArray[np.int32]:
+        """Room for a picture of each channel that is a coordinate."""
+        rows, columns = self.surface.shape
+        return np.empty((self.geometric, rows, columns + PADDING), np.int32)
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
         """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
+        canvases = self._canvases()
         kept: list[State] = []
         figures: list[Figures] = []
         for state in states:
             announced = state < self._all_passes()
             shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
-            measured = self._figures(shown.astype(np.int8))
+            measured = self._figures(shown.astype(np.int8), canvases)
             while figures and measured[0] > figures[-1][0]:
                 kept.pop()
                 figures.pop()
             kept.append(state)
             figures.append(measured)
+        del canvases
+        pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
+        self._last = to_points(self.header, pictures)
         return kept, figures
 
     def _level_figures(self, last: Figures) -> list[Figures]:
         """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
         passes = self._all_passes()
-        start = initial_state(self.header)
+        canvases, start = self._canvases(), initial_state(self.header)
         announced = np.where(passes > 0, 0, start).astype(np.int8)
         figures = []
         for level in range(self.layout.levels):
             state = start.copy()
             known = slice(0, self.layout.tiles_of(level).stop)
             state[known] = announced[known]
-            figures.append(self._figures(state))
+            figures.append(self._figures(state, canvases))
         return [*figures, last]
 
     def _all_passes(self) -> State:
@@ -276,6 +290,7 @@ class _Encoding:
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
+        del self._whole, self._last  # as large as what takes their place
         coder = _TileCoder(self.table, self.channels)
         before = start = self._all_passes()
         layers = []

@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 
 import numba
 
-__all__ = ["inlined", "kernel"]
+__all__ = ["inlined", "kernel", "strict_kernel"]
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
@@ -24,3 +24,8 @@ def kernel(function: _Function) -> _Function:
 def inlined(function: _Function) -> _Function:
     """A part of a kernel that is compiled into each place that calls it: a call would cost more than the work."""
     return cast(_Function, numba.njit(nogil=True, fastmath={"contract"}, forceinline=True)(function))
+
+
+def strict_kernel(function: _Function) -> _Function:
+    """Compile a plain loop like `kernel`, but round after every operation: float64 results are those of numpy."""
+    return cast(_Function, numba.njit(cache=True, nogil=True)(function))

@@ -11,6 +11,7 @@ of the type.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ _MOST_DECIMALS = 9
 #: Values that were computed from coded integers, 0.1 k or -10000 + 0.1 k (Mapbox's terrain), are no rounded decimals.
 _CODED_ORIGINS = (0.0, -10000.0)
 _SAMPLE = 4096
+_STRIP = 1 << 15  # values worked on together, so that what is in between stays in the cache
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,21 @@ class Lattice:
             q += self.origin
         return to_dtype(q, dtype)
 
-    def coordinates(self, values: NDArray[Any]) -> NDArray[np.int32]:
-        """Nearest lattice coordinates of values of any dtype."""
-        q = values.astype(np.float64)
-        if self.rule == "decimal":
-            q *= self.step
-            q -= self.origin
-        else:
-            q -= self.origin
-            q /= self.step
-        return np.rint(q, out=q).astype(np.int32)
+    def coordinates(self, values: NDArray[Any], out: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
+        """Nearest lattice coordinates of values of any dtype, into an array of their shape or a new one."""
+        if out is None:
+            out = np.empty(values.shape, np.int32)
+        height = max(1, _STRIP * len(values) // values.size)
+        for start in range(0, len(values), height):
+            q = values[start : start + height].astype(np.float64)
+            if self.rule == "decimal":
+                q *= self.step
+                q -= self.origin
+            else:
+                q -= self.origin
+                q /= self.step
+            out[start : start + height] = np.rint(q, out=q)
+        return out
 
 
 def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -100,17 +107,35 @@ def find_lattice(values: NDArray[Any]) -> Lattice | None:
 def _integer_lattice(flat: NDArray[Any], low: int, high: int) -> Lattice | None:
     if max(abs(low), abs(high)) >= 2**53:
         return None
-    step = int(np.gcd.reduce(flat.astype(np.int64) - low)) or 1
+    step = 0
+    for start in range(0, flat.size, _STRIP):
+        step = math.gcd(step, int(np.gcd.reduce(flat[start : start + _STRIP].astype(np.int64) - low)))
+        if step == 1:
+            break
+    step = step or 1
     return _centred("affine", float(low), float(step), (high - low) // step)
 
 
 def _binary_lattice(flat: NDArray[Any], sample: NDArray[np.float64], low: float, high: float) -> Lattice | None:
     """The coarsest power of two that divides all values, when it leaves fewer than 2**24 steps."""
-    if sample.any() and (high - low) / _power_of_two(sample) >= 2**LATTICE_BITS:
-        return None
-    step = _power_of_two(flat.astype(np.float64))
+    step = _power_of_two(sample) if sample.any() else np.inf
+    for start in range(0, flat.size, _STRIP):
+        if (high - low) / step >= 2**LATTICE_BITS:
+            return None
+        values = flat[start : start + _STRIP].astype(np.float64)
+        if values.any() and not _divides(step, values):
+            step = min(step, _power_of_two(values))
     steps = (high - low) / step
     return _centred("affine", low, step, int(steps)) if steps < 2**LATTICE_BITS else None
+
+
+def _divides(step: float, values: NDArray[np.float64]) -> bool:
+    """Whether the values are whole multiples of a finite power of two, as far as neither overflows."""
+    if step == np.inf:
+        return False
+    with np.errstate(over="ignore", under="ignore"):
+        multiples = values / step
+    return bool(np.isfinite(multiples).all() and np.array_equal(np.rint(multiples), multiples))
 
 
 def _power_of_two(values: NDArray[np.float64]) -> float:
@@ -150,8 +175,11 @@ def _centred(rule: str, low: float, step: float, steps: int) -> Lattice | None:
 
 
 def _checked(flat: NDArray[Any], lattice: Lattice) -> Lattice | None:
-    restored = lattice.values(lattice.coordinates(flat), flat.dtype)
-    return lattice if np.array_equal(restored, flat) else None
+    for start in range(0, flat.size, _STRIP):
+        values = flat[start : start + _STRIP]
+        if not np.array_equal(lattice.values(lattice.coordinates(values), flat.dtype), values):
+            return None
+    return lattice
 
 
 def precision_lattice(low: float, high: float, step: float) -> Lattice:

@@ -14,6 +14,7 @@ from . import exactness
 from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
 from .errors import CorruptStreamError
+from .picture import store_values
 from .predictors import COEFFICIENT_BITS
 from .tiles import UNANNOUNCED, Tiles, TileTable
 from .transform import allocate, inverse
@@ -174,9 +175,19 @@ def initial_state(header: Header) -> NDArray[np.int8]:
 
 
 def channel_picture(
-    header: Header, channel: int, tiles: Tiles, state: NDArray[np.int8], level: int
+    header: Header,
+    channel: int,
+    tiles: Tiles,
+    state: NDArray[np.int8],
+    level: int,
+    canvas: NDArray[np.int32] | None = None,
 ) -> tuple[NDArray[np.int32], int]:
     """One channel of the grid of ``level`` in a state.
+
+    Parameters
+    ----------
+    canvas : int32 array from `allocate`, optional
+        Of the shape of the level, where the picture is made; a new one otherwise.
 
     Returns
     -------
@@ -188,19 +199,16 @@ def channel_picture(
     while whole < level and not state[layout.tiles_of(whole + 1)].any():
         whole += 1
     fraction = header.fraction if whole < level else 0
-    coefficients = allocate(layout.shapes[level])
-    for number in range(layout.tiles_of(level).stop):
-        finer = fraction if layout.tiles[number].level > whole else 0
-        tiles.spread(number, int(state[number]), coefficients, finer)
+    coefficients = allocate(layout.shapes[level]) if canvas is None else canvas
+    tiles.spread_levels(level, state, coefficients, whole, fraction)
     inverse(coefficients, layout, header.predictors[channel], level, whole, fraction)
     return coefficients, fraction
 
 
 def to_points(header: Header, channels: Sequence[tuple[NDArray[np.int32], int]]) -> NDArray[Any]:
     """Values of each `channel_picture`, in the surface's dtype and axes."""
-    if header.flat:
-        return header.lattices[0].values(channels[0][0], header.dtype, channels[0][1])
-    points = np.empty((*channels[0][0].shape, len(channels)), header.dtype)
-    for number, (lattice, (coordinates, fraction)) in enumerate(zip(header.lattices, channels, strict=True)):
-        points[..., number] = lattice.values(coordinates, header.dtype, fraction)
-    return points
+    rows, columns = channels[0][0].shape
+    points = np.empty((rows, columns, len(channels)), header.dtype)
+    for number, (lattice, coordinates) in enumerate(zip(header.lattices, channels, strict=True)):
+        store_values(lattice, coordinates, points, number)
+    return points.reshape(rows, columns) if header.flat else points

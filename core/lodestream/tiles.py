@@ -31,6 +31,8 @@ class TileTable:
         Number of each tile's first band, and the number of bands at the end.
     size, blocks : int
         Lengths of the flat arrays of coefficients and of block flags.
+    windows : int64, shape (band, 3)
+        Of each band: its tile, and its first row and column in the array of coefficients.
     """
 
     layout: Layout
@@ -38,24 +40,28 @@ class TileTable:
     first: list[int]
     size: int
     blocks: int
+    windows: NDArray[np.int64]
 
     @classmethod
     def of(cls, layout: Layout) -> TileTable:
         """Lay out the tiles of a surface."""
         rows: list[list[int]] = []
+        windows: list[tuple[int, int, int]] = []
         first = [0]
         size, blocks = 3, 0
-        for tile in layout.tiles:
+        for number, tile in enumerate(layout.tiles):
             for band in tile.bands:
                 height, width = band.shape
                 stride, across = width + 2, (width + 7) // 8
                 place = size + 2 * stride + 2
                 flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
                 rows.append([place, stride, height, width, flags, _NO_PARENT, 0, _NO_SHIFT, _NO_SHIFT, kind])
+                windows.append((number, band.rows[0], band.columns[0]))
                 size += (height + 4) * stride + 2
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
-        table = cls(layout, np.array(rows, np.int64).reshape(-1, BAND_FIELDS), first, size + 8, blocks)
+        places = np.array(windows, np.int64).reshape(-1, 3)
+        table = cls(layout, np.array(rows, np.int64).reshape(-1, BAND_FIELDS), first, size + 8, blocks, places)
         table._join_parents()
         return table
 
@@ -92,15 +98,40 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32], fraction: int = 0) -> None:
+    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
 
-        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown. The
-        numbers are multiplied by 2**fraction.
+        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
         """
-        for band, row in zip(self.table.layout.tiles[tile].bands, self.table.of_tile(tile), strict=True):
-            window = _window(coefficients, band)
-            _spread(self.known, self.sign, self.early, row[0], row[1], remaining, fraction, window)
+        state = np.full(len(self.table.layout.tiles), remaining, np.int8)
+        first, last = self.table.first[tile : tile + 2]
+        self._spread(first, last, state, coefficients, 0, 0)
+
+    def spread_levels(
+        self, level: int, state: NDArray[np.int8], coefficients: NDArray[np.int32], whole: int, fraction: int
+    ) -> None:
+        """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
+
+        The coefficients of levels above ``whole`` are multiplied by 2**fraction.
+        """
+        tiles_of = self.table.layout.tiles_of
+        last = self.table.first[tiles_of(level).stop]
+        self._spread(0, last, state, coefficients, tiles_of(whole).stop, fraction)
+
+    def _spread(
+        self,
+        first: int,
+        last: int,
+        state: NDArray[np.int8],
+        coefficients: NDArray[np.int32],
+        finer: int,
+        fraction: int,
+    ) -> None:
+        arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows
+        rows, columns = coefficients.shape
+        pitch = coefficients.strides[0] // coefficients.itemsize
+        line = np.lib.stride_tricks.as_strided(coefficients, ((rows - 1) * pitch + columns,), (coefficients.itemsize,))
+        _spread(*arrays, first, last, np.ascontiguousarray(state), finer, fraction, line, pitch)
 
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
@@ -112,31 +143,65 @@ def _spread(
     known: NDArray[np.int32],
     sign: NDArray[np.int8],
     early: NDArray[np.uint8],
-    offset: int,
-    stride: int,
+    bands: NDArray[np.int64],
+    windows: NDArray[np.int64],
+    first: int,
+    last: int,
+    state: NDArray[np.int8],
+    finer: int,
+    fraction: int,
+    out: NDArray[np.int32],
+    pitch: int,
+) -> None:
+    for band in range(first, last):
+        tile, top, left = windows[band, 0], windows[band, 1], windows[band, 2]
+        passes, shift = int(state[tile]), fraction if tile >= finer else 0
+        width = bands[band, 3]
+        for i in range(bands[band, 2]):
+            start = bands[band, 0] + i * bands[band, 1]
+            target = (top + i) * pitch + left
+            _spread_row(
+                known[start : start + width],
+                sign[start : start + width],
+                early[start : start + width],
+                passes,
+                shift,
+                out[target : target + width],
+            )
+
+
+@kernel
+def _spread_row(
+    magnitudes: NDArray[np.int32],
+    signs: NDArray[np.int8],
+    marks: NDArray[np.uint8],
     remaining: int,
     fraction: int,
     out: NDArray[np.int32],
 ) -> None:
-    half = remaining & 1
-    begun = remaining >> 1  # the plane whose first pass is the last one known, if half
-    plane = begun + half
-    middle, middle_begun = reconstruction_point(plane), (1 << begun) + reconstruction_point(begun)
-    width = out.shape[1]
-    for i in range(out.shape[0]):
-        start = offset + i * stride
-        magnitudes, signs, marks = (
-            known[start : start + width],
-            sign[start : start + width],
-            early[start : start + width],
-        )
-        row = out[i]
-        for j in range(width):
-            high = np.int32((magnitudes[j] >> plane) << plane)
-            value = np.int32(high + middle) if high else np.int32(0)
-            if half and not high and marks[j] == begun + 1 and magnitudes[j] >> begun:
-                value = np.int32(middle_begun)
-            row[j] = (np.int32(signs[j]) * value) << fraction
+    begun = remaining >> 1  # the plane whose first pass is the last one known, if the number is odd
+    plane = begun + (remaining & 1)
+    shift = np.int32(fraction)
+    if remaining >= UNANNOUNCED:
+        out[:] = 0
+    elif remaining == 0:
+        for j in range(out.size):
+            out[j] = np.int32(np.int32(signs[j]) * magnitudes[j]) << shift
+    elif begun == plane:
+        low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
+        for j in range(out.size):
+            high = np.int32((magnitudes[j] >> low) << low)
+            value = np.int32(high + middle) if high != 0 else np.int32(0)
+            out[j] = np.int32(np.int32(signs[j]) * value) << shift
+    else:
+        low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
+        lower, mark = np.int32(begun), np.uint8(begun + 1)
+        middle_begun = np.int32((1 << begun) + reconstruction_point(begun))
+        for j in range(out.size):
+            high = np.int32((magnitudes[j] >> low) << low)
+            found = np.int32(magnitudes[j] >> lower) if marks[j] == mark else np.int32(0)
+            value = np.int32(high + middle) if high != 0 else middle_begun if found != 0 else np.int32(0)
+            out[j] = np.int32(np.int32(signs[j]) * value) << shift
 
 
 def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -12,6 +12,7 @@ from .lifting import CLAMP, REACH, TAPS, forward_step, inverse_step
 from .predictors import FOUR_POINT, default_predictors, fitted_steps
 
 __all__ = [
+    "PADDING",
     "allocate",
     "forward",
     "inverse",
@@ -20,6 +21,8 @@ __all__ = [
 
 #: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
 _CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
+#: Unused columns at the end of an array of coefficients, see `allocate`.
+PADDING = 24
 _SAMPLE_LINES = 96
 _NORM_LEVELS = 6
 
@@ -31,7 +34,7 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
     compete for the same lines of the cache.
     """
     rows, columns = shape
-    return np.zeros((rows, columns + 24), np.int32)[:, :columns]
+    return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
 
 
 def forward(values: NDArray[np.int32], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
@@ -99,45 +102,97 @@ def _fit(lines: NDArray[np.int32], step: AxisStep) -> tuple[int, int]:
     stride = max(1, lines.shape[1] // _SAMPLE_LINES)
     sample = np.array(lines[:, ::stride], order="C")
     forward_step(sample, 0, step, (0, 0))
-    nodes = sample[: step.run].astype(np.float64)
-    details = sample[step.coarse :].astype(np.float64)
-    last = step.midpoints - 3
-    inner = details[2:last]
-    outer = [nodes[2 + shift : last + shift] for shift in range(-2, 4)]  # c_{k-2} ... c_{k+3}
-    near = outer[2] + outer[3]
-    first, second = near - outer[1] - outer[4], near - outer[0] - outer[5]
+    first, second, details = _surroundings(sample, step.coarse, step.midpoints)
+    costs: dict[tuple[int, int], float] = {}
 
     def bits(ab: tuple[int, int]) -> float:
-        return _bits(inner - np.floor((ab[0] * first + ab[1] * second + 128) / 256))
+        if ab not in costs:
+            costs[ab] = _bits(first, second, details, *ab)
+        return costs[ab]
 
-    best = min([*_CANDIDATES, *_least_squares(first, second, inner)], key=bits)
+    best = min([*_CANDIDATES, *_least_squares(first, second, details)], key=bits)
     for reach in (4, 2, 1):
         around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
         best = min((ab for ab in around if max(map(abs, ab)) <= 127), key=bits)
     return best
 
 
+@kernel
+def _surroundings(
+    sample: NDArray[np.int32], coarse: int, midpoints: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Factors of a and b in v_k, and d_k, for the inner midpoints k: 2 ... midpoints - 4."""
+    shape = midpoints - 5, sample.shape[1]
+    first, second, details = np.empty(shape), np.empty(shape), np.empty(shape)
+    for k in range(shape[0]):
+        for j in range(shape[1]):
+            near = np.float64(sample[k + 2, j]) + np.float64(sample[k + 3, j])
+            first[k, j] = near - sample[k + 1, j] - sample[k + 4, j]
+            second[k, j] = near - sample[k, j] - sample[k + 5, j]
+            details[k, j] = sample[coarse + k + 2, j]
+    return first, second, details
+
+
 def _least_squares(
     first: NDArray[np.float64], second: NDArray[np.float64], details: NDArray[np.float64]
 ) -> list[tuple[int, int]]:
     """Fits of 256 d = a u + b w, residuals reweighted towards small ones in turn."""
-    weights = np.ones_like(details)
     found = []
-    for _ in range(5):
-        uu, uw, ww = (float((weights * p).sum()) for p in (first * first, first * second, second * second))
-        ud, wd = (256 * float((weights * p * details).sum()) for p in (first, second))
+    a = b = 0.0
+    for turn in range(5):
+        uu, uw, ww, ud, wd = _moments(first, second, details, a, b, turn > 0)
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
             break
-        a, b = (ud * ww - wd * uw) / determinant, (wd * uu - ud * uw) / determinant
-        found.append((int(np.clip(round(a), -127, 127)), int(np.clip(round(b), -127, 127))))
-        weights = 1.0 / (1.0 + np.abs(details - (a * first + b * second) / 256))
+        a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
+        found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
     return found
 
 
-def _bits(details: NDArray[np.float64]) -> float:
-    """About the bits that details take."""
-    return float(np.log2(1.0 + np.abs(details)).sum())
+@kernel
+def _moments(
+    first: NDArray[np.float64],
+    second: NDArray[np.float64],
+    details: NDArray[np.float64],
+    a: float,
+    b: float,
+    weighted: bool,
+) -> tuple[float, float, float, float, float]:
+    """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details; good to 1e-12."""
+    rows, columns = details.shape
+    sums = np.zeros((5, columns))
+    weight = 1.0
+    for i in range(rows):
+        for j in range(columns):
+            u, w, d = first[i, j], second[i, j], details[i, j]
+            if weighted:
+                weight = 1.0 / (1.0 + abs(d - (a * u + b * w) * 0.00390625))
+            sums[0, j] += weight * u * u
+            sums[1, j] += weight * u * w
+            sums[2, j] += weight * w * w
+            sums[3, j] += weight * u * d
+            sums[4, j] += weight * w * d
+    return sums[0].sum(), sums[1].sum(), sums[2].sum(), sums[3].sum(), sums[4].sum()
+
+
+@kernel
+def _bits(
+    first: NDArray[np.float64], second: NDArray[np.float64], details: NDArray[np.float64], a: float, b: float
+) -> float:
+    """About the bits that the details take with (a, b): the sum of log2(1 + |e|), good to 1e-12."""
+    rows, columns = details.shape
+    products = np.empty(columns)
+    total = 0.0
+    for start in range(0, rows, 16):
+        # Sixteen factors of less than 2**37 each are far from overflow: one logarithm does for all of them.
+        products[:] = 1.0
+        for i in range(start, min(start + 16, rows)):
+            for j in range(columns):
+                e = details[i, j] - np.floor((a * first[i, j] + b * second[i, j] + 128.0) * 0.00390625)
+                products[j] *= 1.0 + abs(e)
+        for j in range(columns):
+            total += np.log2(products[j])
+    return total
 
 
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8]) -> NDArray[np.float64]:

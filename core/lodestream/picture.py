@@ -1,0 +1,211 @@
+"""Lattice coordinates into values, and their distances from the original without a picture in between."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernels import strict_kernel
+from .lattice import Lattice
+from .measure import distances
+
+__all__ = ["coordinate_distances", "store_values"]
+
+Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
+
+_STRIP = 1 << 14  # 64-bit integers made at a time
+_ROWS, _COLUMNS = 128, 512  # points whose squares have a sum of their own: all that it takes stays in the cache
+
+# How values are rounded into a dtype, see `lattice.to_dtype`.
+_FLOAT64, _FLOAT32, _INTEGER, _WIDE = range(4)
+
+
+def _rounding(dtype: np.dtype[Any]) -> tuple[int, float, float]:
+    """The rule, and the least and largest value."""
+    if dtype.kind == "f":
+        largest = float(np.finfo(dtype).max)
+        return _FLOAT64 if dtype.itemsize == 8 else _FLOAT32, -largest, largest
+    limits = np.iinfo(dtype)
+    return _WIDE if dtype.itemsize == 8 else _INTEGER, float(limits.min), float(limits.max)
+
+
+@strict_kernel
+def _evaluate(
+    coordinates: NDArray[np.int32],
+    values: NDArray[np.float64],
+    decimal: bool,
+    origin: float,
+    step: float,
+    scale: float,
+    rounding: int,
+    low: float,
+    high: float,
+) -> None:
+    """`Lattice.values`, in float64."""
+    for j in range(values.size):
+        values[j] = np.float64(coordinates[j]) * scale
+    if decimal:
+        for j in range(values.size):
+            values[j] = (values[j] + origin) / step
+    else:
+        for j in range(values.size):
+            values[j] = values[j] * step + origin
+    if rounding != _FLOAT64:
+        for j in range(values.size):
+            values[j] = min(max(values[j], low), high)
+    if rounding == _FLOAT32:
+        for j in range(values.size):
+            values[j] = np.float64(np.float32(values[j]))
+    elif rounding == _INTEGER:
+        for j in range(values.size):
+            values[j] = np.rint(values[j])
+
+
+@strict_kernel
+def _store(
+    coordinates: NDArray[np.int32],
+    pitch: int,
+    points: NDArray[Any],
+    channel: int,
+    decimal: bool,
+    origin: float,
+    step: float,
+    scale: float,
+    rounding: int,
+    low: float,
+    high: float,
+) -> None:
+    rows, columns, channels = points.shape
+    values = np.empty(columns, np.float64)
+    for i in range(rows):
+        line = coordinates[i * pitch : i * pitch + columns]
+        _evaluate(line, values, decimal, origin, step, scale, rounding, low, high)
+        row = points[i].reshape(-1)
+        if channels == 1:
+            for j in range(columns):
+                row[j] = values[j]
+        else:
+            for j in range(columns):
+                row[j * channels + channel] = values[j]
+
+
+@strict_kernel
+def _square_differences(points: NDArray[Any], channels: int, channel: int, values: NDArray[np.float64]) -> None:
+    """Replace values by the squares of how far they are from a channel of the points."""
+    if channels == 1:
+        for j in range(values.size):
+            delta = np.float64(points[j]) - values[j]
+            values[j] = delta * delta
+    else:
+        for j in range(values.size):
+            delta = np.float64(points[j * channels + channel]) - values[j]
+            values[j] = delta * delta
+
+
+@strict_kernel
+def _add(source: NDArray[np.float64], target: NDArray[np.float64], first: bool) -> None:
+    for j in range(target.size):
+        target[j] = source[j] if first else target[j] + source[j]
+
+
+@strict_kernel
+def _tally(squares: NDArray[np.float64], totals: NDArray[np.float64], worst: NDArray[np.float64]) -> None:
+    for j in range(squares.size):
+        square = squares[j]
+        totals[j] += square
+        worst[j] = square if square > worst[j] else worst[j]
+
+
+@strict_kernel
+def _sum_squares(
+    original: NDArray[Any],
+    coordinates: NDArray[np.int32],
+    decimal: NDArray[np.bool_],
+    numbers: NDArray[np.float64],
+    rounding: int,
+    low: float,
+    high: float,
+    totals: NDArray[np.float64],
+) -> float:
+    """Sums of the squared distances of some points each, and the largest of all; ``numbers``: origin, step, scale."""
+    rows, columns, channels = original.shape
+    geometric = coordinates.shape[0]
+    worst, sums = np.zeros(_COLUMNS, np.float64), np.zeros(_COLUMNS, np.float64)
+    values, squares = np.zeros(_COLUMNS, np.float64), np.zeros(_COLUMNS, np.float64)
+    part = 0
+    for top in range(0, rows, _ROWS):
+        for left in range(0, columns, _COLUMNS):
+            width = min(_COLUMNS, columns - left)
+            v, s, t, w = values[:width], squares[:width], sums[:width], worst[:width]
+            t[:] = 0.0
+            for i in range(top, min(top + _ROWS, rows)):
+                points = original[i].reshape(-1)[left * channels : (left + width) * channels]
+                for c in range(geometric):
+                    q = coordinates[c, i, left : left + width]
+                    origin, step, scale = numbers[c, 0], numbers[c, 1], numbers[c, 2]
+                    _evaluate(q, v, decimal[c], origin, step, scale, rounding, low, high)
+                    _square_differences(points, channels, c, v)
+                    if geometric > 1:
+                        _add(v, s, c == 0)
+                _tally(v if geometric == 1 else s, t, w)
+            totals[part] = t.sum()
+            part += 1
+    return float(worst.max())
+
+
+def store_values(lattice: Lattice, coordinates: Coordinates, points: NDArray[Any], channel: int) -> None:
+    """`Lattice.values` of coordinates, into a channel.
+
+    Parameters
+    ----------
+    coordinates : (int32 array of shape (row, column), int)
+        Over two to the power of the second.
+    points : C-contiguous array, shape (row, column, channel)
+    """
+    numbers, fraction = coordinates
+    rounding, low, high = _rounding(points.dtype)
+    if rounding == _WIDE:
+        height = max(1, _STRIP // numbers.shape[1])
+        for start in range(0, len(numbers), height):
+            rows = slice(start, start + height)
+            points[rows, :, channel] = lattice.values(numbers[rows], points.dtype, fraction)
+        return
+    pitch = numbers.strides[0] // numbers.itemsize
+    length = (numbers.shape[0] - 1) * pitch + numbers.shape[1]
+    line = np.lib.stride_tricks.as_strided(numbers, (length,), (numbers.itemsize,))
+    rule = lattice.rule == "decimal", lattice.origin, lattice.step, 2.0**-fraction
+    _store(line, pitch, points, channel, *rule, rounding, low, high)
+
+
+def coordinate_distances(
+    original: NDArray[Any], lattices: Sequence[Lattice], coordinates: NDArray[np.int32], fractions: Sequence[int]
+) -> tuple[float, float]:
+    """`distances` between points and the values of lattice coordinates.
+
+    Parameters
+    ----------
+    original : C-contiguous array, shape (row, column) or (row, column, channel)
+    lattices : one for each channel that is a coordinate
+    coordinates : C-contiguous int32 array, shape (such a channel, row, column or more)
+    fractions : int for each of these channels
+        Coordinates stand over two to this power.
+    """
+    points = original.reshape(*original.shape[:2], -1)
+    rows, columns, _ = points.shape
+    rounding, low, high = _rounding(points.dtype)
+    if rounding != _WIDE:
+        decimal = np.array([lattice.rule == "decimal" for lattice in lattices])
+        numbers = np.array([(lat.origin, lat.step, 2.0**-f) for lat, f in zip(lattices, fractions, strict=True)])
+        totals = np.zeros(-(-rows // _ROWS) * -(-columns // _COLUMNS))
+        worst = _sum_squares(points, coordinates, decimal, numbers, rounding, low, high, totals)
+        if 1e-250 < worst < 1e250:
+            return math.sqrt(math.fsum(totals) / (rows * columns)), math.sqrt(worst)
+    # Integers that float64 cannot tell apart, or squares that it cannot hold.
+    picture = np.empty((rows, columns, len(lattices)), points.dtype)
+    for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
+        store_values(lattice, (coordinates[number, :, :columns], fraction), picture, number)
+    return distances(points, picture, len(lattices))
