@@ -37,9 +37,11 @@ def _from_ordered(bits: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 def difference(original: NDArray[Any], restored: NDArray[Any]) -> bytes:
     """What turns ``restored`` into ``original`` (same shape and dtype); empty when they agree bit for bit."""
-    delta = _ordered(np.ascontiguousarray(original)) - _ordered(np.ascontiguousarray(restored))
-    if not delta.any():
+    unsigned = np.dtype(f"u{original.dtype.itemsize}")
+    original, restored = np.ascontiguousarray(original), np.ascontiguousarray(restored)
+    if np.array_equal(original.view(unsigned), restored.view(unsigned)):
         return b""
+    delta = _ordered(original) - _ordered(restored)
     signed = delta.view(f"i{delta.dtype.itemsize}")
     bits = 8 * delta.dtype.itemsize
     folded = (delta << delta.dtype.type(1)) ^ (signed >> (bits - 1)).view(delta.dtype)
