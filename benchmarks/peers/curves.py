@@ -10,7 +10,7 @@ from typing import Any
 from .registry import OURS, PEERS
 from .trial import TARGETS
 
-__all__ = ["SMALL", "Cell", "Results", "envelope", "geometric_mean"]
+__all__ = ["SMALL", "Cell", "Results", "bytes_at", "envelope", "family", "geometric_mean"]
 
 #: Cells where the best peer needs fewer bytes do not enter means.
 SMALL = 4096
@@ -113,13 +113,26 @@ class Results:
         return found
 
     def lossless(self, surface: str, coder: str, ours: str = "exact") -> Row | None:
-        """The shortest lossless row of a coder, or of one of our streams."""
-        rows = self.streams(surface).get(ours, []) if coder == OURS else self.rows(surface, coder)
+        """The shortest lossless row of a coder, or the end of one of our streams: a receiver knows only there."""
+        if coder == OURS:
+            end = max(self.streams(surface).get(ours, []), key=lambda row: int(row["bytes"]), default=None)
+            return None if end is None or end["max"] else end
+        rows = self.rows(surface, coder)
         return min((row for row in rows if not row["max"]), key=lambda row: int(row["bytes"]), default=None)
 
     def _peers(self, surface: str, kind: str, target: float) -> dict[str, float]:
-        sizes = {peer: bytes_at(self.rows(surface, peer), kind, target) for peer in PEERS}
-        return {peer: size for peer, size in sizes.items() if size is not None}
+        # Modes of one coder are settings: on an envelope of each alone, lines between distant settings pass below what
+        # the other modes were found to need there.
+        families: dict[str, list[Row]] = {}
+        for peer in PEERS:
+            families.setdefault(family(peer), []).extend(self.rows(surface, peer))
+        sizes = {name: bytes_at(rows, kind, target) for name, rows in families.items()}
+        return {name: size for name, size in sizes.items() if size is not None}
+
+
+def family(peer: str) -> str:
+    """The coder that a peer is a mode of."""
+    return peer.split(",")[0]
 
 
 def geometric_mean(values: Sequence[float]) -> float:

@@ -91,7 +91,7 @@ def _psnr(trial: Trial, channel: int, rms: float) -> float:
 
 
 def _sperr_errors(trial: Trial) -> list[float]:
-    return decades(1, 5, 1) if trial.surface.large else decades(1, 5.25, 4)
+    return decades(1, 5, 2) if trial.surface.large else decades(1, 5.25, 4)
 
 
 def _sperr_header(trial: Trial) -> int:
@@ -135,7 +135,7 @@ def sperr_prefix(trial: Trial) -> None:
 def sperr_bound(trial: Trial) -> None:
     """Bounds of the error; lossless within half a step of the lattice."""
     surface = trial.surface
-    for bound in decades(1, 5, 1) if surface.large else decades(1, 5.5, 2):
+    for bound in decades(1, 5, 2) if surface.large else decades(1, 5.5, 4):
         trial.each_channel(
             f"error {bound:.1e}",
             lambda plane, _, bound=bound: _sperr_encode(plane, bound * surface.extent, "pwe"),  # type: ignore[misc]

@@ -7,9 +7,9 @@ __all__ = ["LOSSLESS", "MEMORY", "RULES", "SPEED"]
 RULES = """\
 - A cell is one error on one surface. Errors are relative to the range of heights or to the diagonal of the box, of
   distances in space for x, y, z, and measured on what was decoded, ours like the peers'.
-- A peer counts at the best of its settings, and the best peer of each cell is compared. Ours counts at the best of the
-  exact stream and of streams with a precision; a stream counts with all its layers. The exact stream alone stands
-  beside it.
+- A peer counts at the best of its settings and modes, and the best peer of each cell is compared. Ours counts at the
+  best of the exact stream and of streams with a precision; a stream counts with all its layers. The exact stream alone
+  stands beside it.
 - Bytes are interpolated between settings, or between the layers of one stream, in log-log on the lower envelope. An
   error below the last lossy one costs the lossless stream. A peer's stream that does not itself say shape, type and how
   its numbers become values counts 32 bytes more.
