@@ -69,7 +69,7 @@ def _head(results: Results) -> Iterator[str]:
     yield "This page and its figures are written by\n"
     yield "    make bench-peers\n"
     yield "in an environment of its own (layers of JPEG 2000 need Debian's OpenJPEG: `apt-get install libopenjp2-7`),"
-    name = machine.get("processor", "an unknown processor")
+    name = machine.get("processor", "an unknown processor").strip()
     yield f"which took {took / 60:.0f} minutes of measuring, on one core of {name} "
     when = " to ".join(sorted({dates[0], dates[-1]}))
     yield f"({machine.get('system', '')}, Python {machine.get('python', '')}), {when}.\n"
