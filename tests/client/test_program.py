@@ -127,8 +127,7 @@ def test_an_interrupt_ends_quietly(tmp_path: Path) -> None:
         assert heard.wait(60)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert said == b""
+    assert (process.returncode, said) == (130, b"")
     assert list(tmp_path.iterdir()) == []
 
 
