@@ -24,8 +24,6 @@ __all__ = ["write"]
 PAGE = ROOT / "docs" / "benchmarks.md"
 AIMS = {"rough terrain": 0.95, "smooth": 0.75, "xyz": 0.75}
 KINDS = {"rms": "RMS error", "max": "Maximum error"}
-#: Surfaces larger than 64 x 64 that the aims are about.
-LARGER = ("rough terrain", "smooth", "xyz")
 
 
 def write(data: dict[str, Any]) -> list[Path]:

@@ -124,13 +124,13 @@ class Decoder:
             The layers before the damage stay decodable.
         """
         if self._frames.ended:
-            self._footer += chunk
+            self._take_footer(bytes(chunk))
             return []
         before = len(self.layers)
         for frame in self._frames.feed(bytes(chunk)):
             self._take(frame)
         if self._frames.ended:
-            self._footer += self._frames.rest()
+            self._take_footer(self._frames.rest())
         return self.layers[before:]
 
     def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
@@ -227,6 +227,16 @@ class Decoder:
             place = ByteRange(frame.offset, frame.end - frame.offset)
             index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
             self.index = replace(with_level_bytes(index), metadata_values=self.metadata or {})
+
+    def _take_footer(self, data: Bytes) -> None:
+        offset, length = self._frames.position, sections.FOOTER_LENGTH
+        self._footer += data[: length + 1 - len(self._footer)]
+        if len(self._footer) > length:
+            raise CorruptStreamError(
+                "expected the end of the container, got more bytes", offset + sections.FOOTER_LENGTH
+            )
+        if len(self._footer) == length:
+            sections.parse_footer(bytes(self._footer), offset)
 
     def _take_header(self, frame: Frame) -> None:
         if self.header is not None:

@@ -139,7 +139,7 @@ class _Encoding:
             predictors=predictors,
             extent=self.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in channels),
-            fraction=max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits)),
+            fraction=max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes())),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
@@ -183,6 +183,10 @@ class _Encoding:
         )
         top = np.array([self._top(true, number) for number in range(len(self.layout.tiles))], np.int8)
         return _Channel(true, weights, top), predictors
+
+    def _most_planes(self) -> int:
+        """Bit-planes of the tile that has most; with the fraction they must fit a coefficient."""
+        return max(int(channel.top.max()) for channel in self.channels)
 
     def _empty_levels(self, top: NDArray[np.int8]) -> int:
         """The levels without a coefficient other than 0, as bits."""

@@ -84,10 +84,6 @@ class Storage:
             raise NotFoundError(f"expected the id of a surface on this server, got {surface[:80]!a}")
         return record
 
-    def find(self, surface: str) -> Record | None:
-        """The record of a surface, if there is one."""
-        return self._records.get(surface)
-
     def records(self) -> list[Record]:
         """All records, oldest first."""
         return sorted(self._records.values(), key=lambda record: (record.created, record.id))

@@ -265,3 +265,21 @@ def test_a_large_surface_of_several_tiles_keeps_its_promises_too() -> None:
         assert worst == expected.max_error
         whole, _ = follow(container, plan(index, Target(order=order)), 10_007)
         np.testing.assert_array_equal(whole.surface().points, points)
+
+
+def feed_in_bytes(decoder: Decoder, data: bytes) -> None:
+    for place in range(len(data)):
+        decoder.feed(data[place : place + 1])
+
+
+def test_bytes_after_the_end_and_a_damaged_footer_are_refused_and_the_surface_stays() -> None:
+    container = ls.encode(terrain((9, 12)))
+    damaged = container[:-9] + bytes([container[-9] ^ 1]) + container[-8:]
+    for data in (container + b"\x00", damaged):
+        whole, bytewise = Decoder(), Decoder()
+        with pytest.raises(ls.CorruptStreamError):
+            whole.feed(data)
+        with pytest.raises(ls.CorruptStreamError):
+            feed_in_bytes(bytewise, data)
+        assert whole.complete
+        assert bytewise.complete

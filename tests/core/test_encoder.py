@@ -256,3 +256,12 @@ def test_a_precision_leaves_attributes_as_they_are() -> None:
     assert 0 < decoder.rms == pytest.approx(errors(decoded, points)[0], rel=1e-12)
     assert index_of(container).levels[-1].rms == decoder.rms
     assert not index_of(container).header.exact
+
+
+def test_planes_and_fraction_together_fit_a_coefficient() -> None:
+    rng = np.random.default_rng(8)
+    for bits in (3, 10, 17, 23):
+        points = rng.choice([-(2**bits), 2**bits], (70, 90))
+        header = index_of(assert_comes_back(points)).header
+        planes = max(segment.top for segment in index_of(ls.encode(points)).segments)
+        assert planes + header.fraction <= 28
