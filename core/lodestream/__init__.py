@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .errors import (
         CorruptStreamError,
         FormatError,
+        FormatWarning,
         InputError,
         LodestreamError,
         NotFoundError,
@@ -30,16 +31,18 @@ if TYPE_CHECKING:
     )
     from .formats import read, write
     from .levels import coarsen, hierarchy
-    from .surface import Surface
+    from .surface import Block, Surface
     from .target import Target, Tolerance
 
 _HOMES = {
+    "Block": "surface",
     "Decoder": "decoder",
     "View": "decoder",
     "decode": "decoder",
     "encode": "encoder",
     "CorruptStreamError": "errors",
     "FormatError": "errors",
+    "FormatWarning": "errors",
     "InputError": "errors",
     "LodestreamError": "errors",
     "NotFoundError": "errors",
@@ -60,9 +63,11 @@ _HOMES = {
 }
 
 __all__ = [
+    "Block",
     "CorruptStreamError",
     "Decoder",
     "FormatError",
+    "FormatWarning",
     "InputError",
     "LodestreamError",
     "NotFoundError",

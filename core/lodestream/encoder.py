@@ -14,6 +14,7 @@ from .bitplanes import code_passes, new_model, pass_count, pass_gains
 from .container.model import Header
 from .container.sections import MOST_FRACTION, TILE_BITS
 from .container.writer import CodedLayer, CodedSegment, write_container
+from .errors import InputError
 from .lattice import LATTICE_BITS, Lattice
 from .layout import Layout
 from .measure import extent_of
@@ -69,6 +70,8 @@ def encode(
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
+    if len(surface.blocks) > 1 or surface.mask is not None or surface.attributes:
+        raise InputError("expected one block without holes and attributes; others are not encoded yet")
     progress = progress or (lambda fraction: None)
     container = _Encoding(surface, precision, progress).run()
     for bits in _COARSER:

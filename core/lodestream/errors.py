@@ -17,6 +17,8 @@
     │   └── RemoteProtocolError          by the other side
     └── RemoteError                      the other side refused, with its code and reason
 
+    FormatWarning (UserWarning)          a file cannot say all of a surface
+
 One class for each reaction that a caller may have. Each message says what was expected, what came, and where.
 """
 
@@ -25,6 +27,7 @@ from __future__ import annotations
 __all__ = [
     "CorruptStreamError",
     "FormatError",
+    "FormatWarning",
     "InputError",
     "LocalProtocolError",
     "LodestreamError",
@@ -50,6 +53,10 @@ class InputError(LodestreamError, ValueError):
 
 class FormatError(InputError):
     """A file is not what it says, is cut short, or holds no structured surface."""
+
+
+class FormatWarning(UserWarning):
+    """A file cannot say all of a surface, or does not say all that was needed; what was left out or assumed."""
 
 
 class TooLargeError(InputError):
