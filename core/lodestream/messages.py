@@ -64,14 +64,18 @@ class Code:
 CODES: Mapping[str, Code] = {
     "bad-message": Code(4400, "Not a message of this protocol"),
     "out-of-turn": Code(4400, "A message that is not allowed now"),
+    "no-token": Code(4401, "A token or a ticket is needed"),
+    "bad-token": Code(4403, "A token or ticket that is not known, or no longer"),
     "not-found": Code(4404, "No such surface"),
     "idle": Code(4408, "Nothing was heard or taken for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
     "failed": Code(4424, "The surface could not be built"),
     "bad-target": Code(4422, "A target that the surface cannot meet"),
     "unsupported-version": Code(4426, "Another version of the protocol"),
+    "too-many": Code(4429, "More at the same time than one client may have"),
     "message-too-large": Code(1009, "A message above the limit"),
     "damaged": Code(4500, "The stored container is damaged"),
+    "busy": Code(4503, "As much to do as the server can; come back"),
     "internal": Code(1011, "The server failed"),
     "restarting": Code(1012, "The server is restarting; come back"),
 }
@@ -103,12 +107,15 @@ class Open:
         First credit, in bytes of `Segments.data`.
     held : tuple of (offset, length)
         Slices of the container that the client holds already.
+    ticket : str or None
+        What allows reading where a token does and the client cannot send a header, as in a browser.
     """
 
     type: ClassVar[str] = "open"
     target: Target = field(default_factory=Target)
     credit: int = MAX_CREDIT
     held: tuple[tuple[int, int], ...] = ()
+    ticket: str | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ def _target(value: Any) -> Target:
 
 
 _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
-    Open: {"target": _target, "credit": _integer, "held": _held},
+    Open: {"target": _target, "credit": _integer, "held": _held, "ticket": _text},
     Credit: {"bytes": _positive},
     Stop: {},
     Bye: {},
@@ -129,7 +129,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
-_OPTIONAL = {(Open, "target"), (Open, "held")}
+_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "ticket")}
 
 
 def serialize(event: Event) -> bytes:
@@ -138,7 +138,9 @@ def serialize(event: Event) -> bytes:
     if isinstance(event, Open):
         fields["version"] = VERSION
     for name in _FIELDS[type(event)]:
-        fields[name] = _plain(getattr(event, name))
+        value = _plain(getattr(event, name))
+        if value is not None:
+            fields[name] = value
     packed: bytes = msgpack.packb(fields)
     return packed
 
