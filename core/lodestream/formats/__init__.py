@@ -45,6 +45,8 @@ class Format:
         Takes a `Surface` and a binary file that need not be seekable; None where the format is only read.
     options : mapping of str to str
         Options for reading, each with a line of help.
+    more : str
+        What further files of the same surface are, in words; empty where it takes one file.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Format:
     read: Callable[[Source], Surface] | None = None
     write: Callable[[Surface, BinaryIO], None] | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+    more: str = ""
 
 
 _FORMATS = (
@@ -106,7 +109,7 @@ def read(
     path : str or path-like
         A file of one of the `formats`.
     *more : str or path-like
-        Further files of the same surface. No format takes several files yet.
+        Further files of the same surface, for the formats that take them (`Format.more`).
     max_vertices : int
         Larger surfaces are refused before memory is taken for them.
     filename : str, optional
@@ -142,13 +145,16 @@ def read(
     try:
         if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
-        if more:
-            raise OptionError(f"expected one file, got {1 + len(more)} (several files of one surface come later)")
         format_ = _sniff(path, name.suffix.lower())
         if format_.read is None:
             raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
+        if more and not format_.more:
+            raise OptionError(f"expected one file of format {format_.name}, got {1 + len(more)}")
         _check_options(format_, options)
-        return format_.read(Source(path, name.stem, path.stat().st_size, max_vertices, options))
+        others = tuple(map(Path, more))
+        for other in others:
+            _check_regular(other)
+        return format_.read(Source(path, name.stem, path.stat().st_size, max_vertices, options, others))
     except InputError as error:
         raise _named(error, label) from None
 
@@ -214,8 +220,7 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
 
 
 def _sniff(path: Path, suffix: str) -> Format:
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise FormatError("expected a regular file, got a folder, pipe or device")
+    _check_regular(path)
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if not any(suffix in it.suffixes for it in _FORMATS):
@@ -226,6 +231,11 @@ def _sniff(path: Path, suffix: str) -> Format:
         if format_.sniff(head, suffix):
             return format_
     raise FormatError(f"expected {_readable()}, got {_describe(head)}")
+
+
+def _check_regular(path: Path) -> None:
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise FormatError("expected a regular file, got a folder, pipe or device")
 
 
 def _readable() -> str:

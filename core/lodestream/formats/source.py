@@ -55,6 +55,8 @@ class Source:
         Larger surfaces are refused.
     options : mapping of str to str
         Options of the format, checked to exist; their values are not checked.
+    more : tuple of Path
+        Further files of the same surface, existing regular ones, for the formats that take them.
     """
 
     path: Path
@@ -62,6 +64,7 @@ class Source:
     size: int
     max_vertices: int
     options: Mapping[str, Any]
+    more: tuple[Path, ...] = ()
 
     def check_vertices(self, count: int, shape: str) -> None:
         """Refuse a surface of too many vertices; `shape` says in words where the count comes from."""
