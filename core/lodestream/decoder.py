@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from .container import sections
 from .container.frames import Frame, FrameReader, section_extent
 from .container.model import ByteRange, Header, Index
+from .container.pieces import windows
 from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .errors import CorruptStreamError, OptionError, TruncatedStreamError
+from .digest import DIGEST, values_digest
 from .georeference import level_geotransform
+from .parts import level_masks
 from .reconstruction import Coded, Progress, Reconstruction
-from .surface import Surface
+from .surface import Block, Surface
 
 __all__ = ["Decoder", "View", "decode"]
 
@@ -57,26 +60,40 @@ class View:
 
     @property
     def points(self) -> NDArray[Any]:
-        """The full-resolution picture, with the dtype and axes of the original."""
-        header = self._reconstruction.header
-        return self._reconstruction.points(self._length, self._state, header.levels, self._corrected)
+        """The full-resolution picture of the only block, with the dtype and axes of the original.
 
-    def points_at(self, level: int) -> NDArray[Any]:
+        Raises
+        ------
+        InputError
+            When there are several blocks: `surface` has them.
+        """
+        return self.surface().points
+
+    def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
         """The grid of a coarser level, of that level's shape.
+
+        Parameters
+        ----------
+        level : int
+        block : int, optional
+            Of a surface of several blocks.
 
         Raises
         ------
         OptionError
-            When there is no such level.
+            When there is no such level or block.
+        InputError
+            When there are several blocks, and none was named.
         """
-        header = self._reconstruction.header
-        if not 0 <= level <= header.levels:
-            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
-        corrected = self._corrected and level == header.levels
-        return self._reconstruction.points(self._length, self._state, level, corrected)
+        surface = self.surface(level)
+        if block is None:
+            return surface.points
+        if not 0 <= block < len(surface.blocks):
+            raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
+        return surface.blocks[block].points
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
-        """The full-resolution picture as a surface, or the grid of a coarser level.
+        """The full-resolution picture as a surface, or the grids of a coarser level.
 
         Parameters
         ----------
@@ -84,16 +101,41 @@ class View:
             Of a coarser level of heights the geotransform spans what the surface spans.
         metadata : mapping, optional
             In place of the container's own, which are there only as far as they have come.
+
+        Raises
+        ------
+        OptionError
+            When there is no such level.
+        CorruptStreamError
+            When the complete surface is not the one that was encoded.
         """
         header = self._reconstruction.header
+        finest = level is None or level == header.levels
+        level = header.levels if level is None else level
+        if not 0 <= level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
-        if level is None or level == header.levels:
-            return Surface(self.points, header.closed, metadata=values)
-        points = self.points_at(level)
-        if header.channels == 1:
-            coarse = points.shape[0], points.shape[1]
-            values["geotransform"] = level_geotransform(values.get("geotransform"), header.shape, coarse, header.closed)
-        return Surface(points, header.closed, metadata=values)
+        digest = values.pop(DIGEST, self._metadata.get(DIGEST))
+        grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest)
+        masks = level_masks(header.parts, header.layout, level, header.masks)
+        blocks = []
+        for grid, mask, (_, closed) in zip(grids, masks, header.blocks, strict=True):
+            points, *attributes = grid.arrays
+            named = {
+                kind.name: array if kind.components else array[..., 0]
+                for kind, array in zip(header.attributes, attributes, strict=True)
+            }
+            if mask is not None and not mask.any():
+                mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
+            blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=mask, attributes=named))
+        if self.complete and finest and header.exact and digest is not None and digest != values_digest(blocks):
+            raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got others", header.length)
+        if not finest and header.channels == 1 and len(blocks) == 1:
+            shape = blocks[0].shape
+            values["geotransform"] = level_geotransform(
+                values.get("geotransform"), header.shape, shape, header.closed
+            )
+        return Surface(blocks=blocks, metadata=values)
 
 
 class Decoder:
@@ -143,11 +185,11 @@ class Decoder:
             self._take_slice(offset, bytes(chunk))
         elif offset == self._frames.position + self._frames.pending:
             self.feed(chunk)
-            if self.header is not None:
+            if self.header is not None and (self.header.holes or not self.header.masked):
                 early, self._early = self._early, []
                 for place, data in early:
                     self._take_loose(place, data)
-        elif self.header is None:
+        elif self.header is None or (self.header.masked and not self.header.holes):
             self._early.append((offset, bytes(chunk)))
         else:
             self._take_loose(offset, bytes(chunk))
@@ -217,6 +259,10 @@ class Decoder:
             self._take_header(frame)
         elif self.header is None:
             raise CorruptStreamError(f"expected the header, got a section of kind {frame.kind}", frame.offset)
+        elif frame.kind == sections.MASKS:
+            self._take_masks(frame, self.header)
+        elif self.header.masked and not self.header.holes:
+            raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
         elif frame.kind == sections.LAYER:
             self._take_layer(frame, self.header)
         elif frame.kind == sections.EXACTNESS:
@@ -242,9 +288,19 @@ class Decoder:
         if self.header is not None:
             raise CorruptStreamError("expected one header, got a second", frame.offset)
         self.header = sections.parse_header(frame.payload, frame.payload_offset, frame.end)
-        self._progress = Progress(self.header)
-        self._reconstruction = Reconstruction(self.header)
+        if not self.header.masked:
+            self._begin(self.header)
+
+    def _begin(self, header: Header) -> None:
+        self._progress = Progress(header)
+        self._reconstruction = Reconstruction(header)
         self._level = 0
+
+    def _take_masks(self, frame: Frame, header: Header) -> None:
+        if not header.masked or header.holes:
+            raise CorruptStreamError("expected layers, got masks", frame.offset)
+        self.header = sections.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
+        self._begin(self.header)
 
     def _take_layer(self, frame: Frame, header: Header) -> None:
         number = len(self.layers)
@@ -267,14 +323,15 @@ class Decoder:
     def _take_exactness(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
             raise CorruptStreamError("expected layers, got exactness", frame.offset)
-        self._correct(frame)
-        # What is exact has no error; otherwise only attributes were corrected.
-        last = self.layers[-1]
-        figures = (0.0, 0.0) if header.exact else (last.rms, last.max_error)
+        figures = self._correct(frame, header)
         self._show(len(self.layers), header.levels, frame.end, *figures, True)
 
-    def _correct(self, frame: Frame) -> None:
-        self._reconstruction.correct(bytes(frame.payload), frame.payload_offset)
+    def _correct(self, frame: Frame, header: Header) -> tuple[float, float]:
+        count = sum(1 for _ in windows(header))
+        figures, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, count)
+        for number, piece in enumerate(pieces):
+            self._reconstruction.correct(number, *piece)
+        return figures
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
         self.metadata = values
@@ -345,7 +402,7 @@ class Decoder:
             if frame.kind == sections.METADATA:
                 self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
             else:
-                self._correct(frame)
+                self._correct(frame, self.header)
                 if (state := self._slices.hold_exactness()) is not None:
                     self._show(*state)
 

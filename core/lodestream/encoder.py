@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,20 +13,20 @@ from . import exactness
 from .allocation import TileCurve, assign_layers
 from .bitplanes import code_passes, new_model, pass_count, pass_gains
 from .container.model import Header
-from .container.sections import MOST_FRACTION, TILE_BITS
+from .container.pieces import Window, windows
+from .container.sections import MOST_FRACTION
 from .container.writer import CodedLayer, CodedSegment, write_container
-from .errors import InputError
+from .digest import DIGEST, values_digest
+from .errors import OptionError
 from .lattice import LATTICE_BITS, Lattice
-from .layout import Layout
-from .measure import extent_of
 from .picture import coordinate_distances
-from .predictors import COEFFICIENT_BITS
-from .quantise import channel_of, choose_lattices
-from .reconstruction import channel_picture, initial_state, to_points
-from .surface import Surface
+from .predictors import COEFFICIENT_BITS, default_predictors
+from .preparation import Preparation
+from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
+from .surface import Block, Surface
 from .target import Tolerance
 from .tiles import Tiles, TileTable, gather
-from .transform import PADDING, allocate, forward, synthesis_norms
+from .transform import PADDING, forward, synthesis_norms
 
 __all__ = ["encode"]
 
@@ -44,6 +45,7 @@ def encode(
     surface: Surface | ArrayLike,
     precision: float | str | Tolerance | None = None,
     *,
+    attribute_precision: Mapping[str, float | str | Tolerance] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> bytes:
     """Encode a surface into a container.
@@ -54,7 +56,10 @@ def encode(
         An array is taken as ``Surface(array)``.
     precision : float, str, Tolerance or None
         Largest distance allowed between a point and what comes back, in the surface's unit or, as ``"1e-4d"``, times
-        the range of the heights or the diagonal of the box. None: every value comes back bit for bit.
+        the range of the heights or the diagonal of the box. None: every value comes back bit for bit. Attributes come
+        back bit for bit in any case, but for those with a precision of their own.
+    attribute_precision : mapping of str to float, str or Tolerance, optional
+        Largest distance allowed between the values of an attribute, by its name.
     progress : callable, optional
         Called now and then with the fraction done, 0 to 1.
 
@@ -67,19 +72,32 @@ def encode(
     ------
     InputError
         When the surface cannot be encoded, or not with this precision.
+    OptionError
+        When there is no such attribute.
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
-    if len(surface.blocks) > 1 or surface.mask is not None or surface.attributes:
-        raise InputError("expected one block without holes and attributes; others are not encoded yet")
     progress = progress or (lambda fraction: None)
-    container = _Encoding(surface, precision, progress).run()
+    precisions = {name: _tolerance(wanted) for name, wanted in (attribute_precision or {}).items()}
+    unknown = [name for name in precisions if name not in surface.blocks[0].attributes]
+    if unknown:
+        known = ", ".join(surface.blocks[0].attributes) or "none"
+        raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
+    prepared = Preparation(surface, (None if precision is None else _tolerance(precision), precisions))
+    container = _Encoding(prepared, progress).run()
+    raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
     for bits in _COARSER:
-        if precision is not None or len(container) <= longest(surface.points.nbytes):
+        if prepared.precision is not None or len(container) <= longest(raw):
             break
         # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
-        container = min(container, _Encoding(surface, precision, progress, bits).run(), key=len)
+        container = min(container, _Encoding(prepared, progress, bits).run(), key=len)
     return container
+
+
+def _tolerance(precision: float | str | Tolerance) -> Tolerance:
+    if isinstance(precision, str):
+        return Tolerance.parse(precision)
+    return precision if isinstance(precision, Tolerance) else Tolerance(float(precision))
 
 
 def longest(raw: int) -> int:
@@ -99,32 +117,17 @@ class _Channel:
 class _Encoding:
     """One run of the encoder; the methods stand in the order in which they are called."""
 
-    def __init__(
-        self,
-        surface: Surface,
-        precision: float | str | Tolerance | None,
-        progress: Callable[[float], None],
-        bits: int | None = None,
-    ) -> None:
-        self.surface, self.points, self.progress = surface, surface.points, progress
-        count = 1 if self.points.ndim == 2 else self.points.shape[2]
-        self.geometric = min(count, 3)
-        self.extent = extent_of(self.points, self.geometric)
-        if isinstance(precision, str):
-            precision = Tolerance.parse(precision)
-        elif precision is not None and not isinstance(precision, Tolerance):
-            precision = Tolerance(float(precision))
-        if precision is not None and precision.relative and not self.extent:
-            precision = None  # a fraction of nothing: one point, which a lattice holds exactly
-        self.precision = None if precision is None else precision.absolute(self.extent)
-        tile = tile_exponents(surface.shape)
-        self.layout = Layout(surface.shape, surface.closed, tile)
-        self.table = TileTable.of(self.layout)
+    def __init__(self, prepared: Preparation, progress: Callable[[float], None], bits: int | None = None) -> None:
+        self.prepared, self.progress = prepared, progress
+        self.geometric, self.layout = prepared.geometric, prepared.layout
+        table = TileTable.of(self.layout)
+        self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
         self.bits = 0
-        self.lattices = choose_lattices(self.points, self.geometric, self.precision, bits)
+        self.lattices = prepared.lattices(bits)
 
     def run(self) -> bytes:
-        predictors = np.zeros((len(self.lattices), self.layout.levels, 2, 2), np.int8)
+        prepared = self.prepared
+        predictors = np.zeros((len(self.lattices), *default_predictors(self.layout).shape), np.int8)
         channels = []
         for number, lattice in enumerate(self.lattices):
             channel, predictors[number] = self._transform(number, lattice)
@@ -133,59 +136,75 @@ class _Encoding:
         self.progress(0.1)
         states = assign_layers(self._curves(), self.layout, len(channels))
         self.progress(0.4)
+        surface = prepared.surface
+        masks = [block.mask for block in surface.blocks]
         self.header = Header(
-            dtype=self.points.dtype,
-            shape=self.surface.shape,
-            closed=self.surface.closed,
-            flat=self.points.ndim == 2,
+            dtype=surface.dtype,
+            blocks=tuple((block.shape, block.closed) for block in surface.blocks),
+            arrangement=prepared.arrangement,
+            point_channels=prepared.point_channels,
+            flat=surface.blocks[0].points.ndim == 2,
+            attributes=prepared.kinds,
             lattices=tuple(self.lattices),
             predictors=predictors,
-            extent=self.extent,
+            extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in channels),
             fraction=max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes())),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
             layer_count=0,
+            masked=any(mask is not None for mask in masks),
+            hole=_hole(surface),
+            holes=tuple(block.holes for block in surface.blocks),
+            mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
         )
         states, figures = self._measured(states)
         self.progress(0.7)
-        correction, exact = self._correction()
+        pieces, exact, lossless = self._pieces()
         levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
         self.progress(0.8)
+        metadata = dict(surface.metadata)
+        if lossless:
+            metadata[DIGEST] = values_digest(_as_returned(surface, self.header.hole))
         coded = self._coded(states, figures)
-        container = write_container(
-            self.header,
-            coded,
-            levels,
-            correction,
-            self.surface.metadata,
-            exact=exact,
-        )
+        container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
         self.progress(1.0)
         return container
 
     def _transform(self, number: int, lattice: Lattice) -> tuple[_Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         for fit in (True, False):
-            values = allocate(self.surface.shape)
-            lattice.coordinates(channel_of(self.points, number), out=values)
-            self.bits = max(self.bits, max(int(values.max()), -int(values.min())).bit_length())
-            predictors = forward(values, self.layout, fit)
-            if max(int(values.max()), -int(values.min())) < 1 << COEFFICIENT_BITS:
+            arrays = self.prepared.coordinates(number, lattice)
+            self.bits = max(self.bits, max(_largest(array) for array in arrays).bit_length())
+            predictors = forward(arrays, self.layout, fit)
+            if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
-        true = gather(self.table, values)
-        norms = synthesis_norms(self.layout, predictors)
+        table = self._table(number)
+        true = gather(table, arrays)
+        norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
         spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
-        span = self.extent if number < self.geometric else extent_of(channel_of(self.points, number), 1)
+        span = self.prepared.extent if number < self.geometric else self._span(number)
         spacing = spacing / span if span else 0.0
         weights = np.array(
-            [norms[tile.level, *map(int, band.kind)] * spacing**2 for tile in self.layout.tiles for band in tile.bands]
+            [
+                norms[band.grid][tile.level, *map(int, band.kind)] * spacing**2
+                for tile, bands in zip(self.layout.tiles, table.members, strict=True)
+                for band in bands
+            ]
         )
-        top = np.array([self._top(true, number) for number in range(len(self.layout.tiles))], np.int8)
+        top = np.array([_top(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
         return _Channel(true, weights, top), predictors
+
+    def _table(self, channel: int) -> TileTable:
+        return self.tables[0 if channel < self.geometric else 1]
+
+    def _span(self, channel: int) -> float:
+        """Range of an attribute."""
+        values = [self.prepared.channel(block, channel) for block in range(len(self.prepared.arrays))]
+        return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
 
     def _most_planes(self) -> int:
         """Bit-planes of the tile that has most; with the fraction they must fit a coefficient."""
@@ -196,18 +215,9 @@ class _Encoding:
         levels = range(self.layout.levels + 1)
         return sum(1 << level for level in levels if not top[self.layout.tiles_of(level)].any())
 
-    def _top(self, true: NDArray[np.int32], tile: int) -> int:
-        """Bit-planes of a tile."""
-        rows = self.table.of_tile(tile)
-        largest = 0
-        for place, stride, height, _ in rows[:, :4]:
-            frame = true[place - stride - 1 : place + (height + 1) * stride - 1]
-            largest = max(largest, int(frame.max()), -int(frame.min()))
-        return largest.bit_length()
-
     def _curves(self) -> list[TileCurve]:
         """Cost and gain of every pass, by coding each tile once as a whole."""
-        coder = self._whole = _TileCoder(self.table, self.channels)
+        coder = self._whole = _TileCoder(self._tables_of_channels(), self.channels)
         curves = []
         for tile in range(len(self.layout.tiles)):
             for number, channel in enumerate(self.channels):
@@ -218,32 +228,37 @@ class _Encoding:
                     coder.code(tile, number, passes, passes, costs)
                     bits = np.diff(costs[::-1], prepend=0.0)[::-1]
                     errors = np.zeros(passes + 1, np.float64)
-                    first, last = self.table.first[tile], self.table.first[tile + 1]
+                    table = self._table(number)
+                    first, last = table.first[tile], table.first[tile + 1]
                     early, weights = coder.tiles[number].early, channel.weights[first:last]
-                    rows = self.table.of_tile(tile)
+                    rows = table.of_tile(tile)
                     pass_gains(rows, weights, passes, channel.true, early, errors)
                     gains = np.diff(errors)
                     gains[0] += _ROUNDING * float((weights * rows[:, 2] * rows[:, 3]).sum())
                     curves.append(TileCurve(tile, number, bits, gains))
         return curves
 
-    def _figures(self, state: State, canvases: NDArray[np.int32]) -> Figures:
+    def _tables_of_channels(self) -> list[TileTable]:
+        return [self._table(number) for number in range(len(self.channels))]
+
+    def _figures(self, state: State, canvases: list[NDArray[np.int32]]) -> Figures:
         """RMS and maximum error of what a receiver shows in this state, see `reconstruction.Reconstruction`."""
-        columns = self.surface.shape[1]
-        pictures = [self._picture(number, state, canvas[:, :columns]) for number, canvas in enumerate(canvases)]
-        fractions = [fraction for _, fraction in pictures]
-        return coordinate_distances(self.points, self.lattices[: self.geometric], canvases, fractions)
+        fractions = []
+        for number in range(self.geometric):
+            places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
+            fractions.append(self._picture(number, state, places)[1])
+        curves = len(canvases) - len(self.prepared.parts)
+        lattices = self.lattices[: self.geometric]
+        return coordinate_distances(self.prepared.originals, lattices, canvases[curves:], fractions)
 
-    def _picture(
-        self, number: int, state: State, canvas: NDArray[np.int32] | None = None
-    ) -> tuple[NDArray[np.int32], int]:
+    def _picture(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Picture:
         tiles = self._whole.tiles[number]
-        return channel_picture(self.header, number, tiles, state[:, number], self.layout.levels, canvas)
+        return channel_picture(self.header, number, tiles, state[:, number], self.layout.levels, canvases)
 
-    def _canvases(self) -> NDArray[np.int32]:
-        """Room for a picture of each channel that is a coordinate."""
-        rows, columns = self.surface.shape
-        return np.empty((self.geometric, rows, columns + PADDING), np.int32)
+    def _canvases(self) -> list[NDArray[np.int32]]:
+        """Room for a picture of each channel that is a coordinate, one array for each grid."""
+        shapes = [grid.shape for grid in self.layout.grids]
+        return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
         """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
@@ -261,7 +276,7 @@ class _Encoding:
             figures.append(measured)
         del canvases
         pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
-        self._last = to_points(self.header, pictures)
+        self._last = to_values(self.header, pictures, self.layout.levels)
         return kept, figures
 
     def _level_figures(self, last: Figures) -> list[Figures]:
@@ -281,24 +296,44 @@ class _Encoding:
         """Passes of every tile and channel."""
         return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
 
-    def _correction(self) -> tuple[bytes, bool]:
-        """The exactness section's payload, if there is anything to correct, and whether all is exact then.
+    def _pieces(self) -> tuple[list[bytes], bool, bool]:
+        """The exactness section's pieces; whether the coordinates are exact then, and whether all is.
 
-        A precision is for the coordinates: attributes come back bit for bit all the same.
+        A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit.
         """
-        delta = exactness.difference(self.points, self._last)
-        if not delta or self.precision is None:
-            return delta, True
-        if self.points.ndim == 2 or self.points.shape[2] == self.geometric:
-            return b"", False
-        kept = self._last.copy()
-        kept[..., self.geometric :] = self.points[..., self.geometric :]
-        return exactness.difference(kept, self._last), not exactness.difference(self.points, kept)
+        prepared, pieces = self.prepared, []
+        kept = [prepared.precision is not None] * self.geometric
+        kept += [False] * (prepared.point_channels - self.geometric)
+        for kind in prepared.kinds:
+            kept += [kind.name in prepared.attribute_precisions] * kind.channels
+        exact = [True, True]
+        for window in windows(self.header):
+            block = prepared.surface.blocks[window.block]
+            rows, columns = slice(*window.rows), slice(*window.columns)
+            original, restored = self._given(window), self._last[window.block].window(window)
+            chosen = slice(None) if block.mask is None else block.mask[rows, columns]
+            original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
+            piece = exactness.encode_piece(original, restored)
+            if piece and kept[window.channel]:
+                exact[0 if window.channel < self.geometric else 1] = False
+                piece = b""
+            pieces.append(piece)
+        return pieces, exact[0], all(exact)
+
+    def _given(self, window: Window) -> NDArray[Any]:
+        """One channel of the surface in a window, as it was given."""
+        block, channel = self.prepared.surface.blocks[window.block], window.channel
+        for values in (block.points, *block.attributes.values()):
+            array = values if values.ndim == 3 else values[..., np.newaxis]
+            if channel < array.shape[2]:
+                return array[slice(*window.rows), slice(*window.columns), channel]
+            channel -= array.shape[2]
+        raise IndexError(window.channel)
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self._whole, self._last  # as large as what takes their place
-        coder = _TileCoder(self.table, self.channels)
+        coder = _TileCoder(self._tables_of_channels(), self.channels)
         before = start = self._all_passes()
         layers = []
         for state, (rms, worst) in zip(states, figures, strict=True):
@@ -316,16 +351,16 @@ class _Encoding:
 class _TileCoder:
     """Codes the tiles of all channels, plane after plane, as a reader will meet them."""
 
-    def __init__(self, table: TileTable, channels: list[_Channel]) -> None:
-        self._table = table
+    def __init__(self, tables: list[TileTable], channels: list[_Channel]) -> None:
         self._channels = channels
-        self.tiles = [Tiles(table) for _ in channels]
+        self.tiles = [Tiles(table) for table in tables]
         self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
         model = self._models.setdefault((tile, channel), new_model())
-        tiles, rows = self.tiles[channel], self._table.of_tile(tile)
+        tiles = self.tiles[channel]
+        rows = tiles.table.of_tile(tile)
         coefficients = int((rows[:, 2] * rows[:, 3]).sum())
         # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
         data = np.empty(64 + 3 * passes * coefficients, np.uint8)
@@ -346,12 +381,44 @@ class _TileCoder:
         return data[:length].tobytes()
 
 
-def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
-    """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
-    rows = TILE_BITS // 2
-    narrow = min(shape)
-    while rows > 1 and narrow <= 1 << rows:
-        rows -= 1
-    if narrow > 1 << (TILE_BITS // 2):
-        return TILE_BITS // 2, TILE_BITS // 2
-    return (rows, TILE_BITS - rows) if shape[0] <= shape[1] else (TILE_BITS - rows, rows)
+def _top(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
+    """Bit-planes of a tile."""
+    largest = 0
+    for place, stride, height, _ in table.of_tile(tile)[:, :4]:
+        frame = true[place - stride - 1 : place + (height + 1) * stride - 1]
+        largest = max(largest, int(frame.max()), -int(frame.min()))
+    return largest.bit_length()
+
+
+def _largest(values: NDArray[np.int32]) -> int:
+    """The largest magnitude."""
+    return max(int(values.max()), -int(values.min()))
+
+
+def _encode_mask(mask: NDArray[np.bool_]) -> bytes:
+    from .mask import encode_mask  # only where there is one
+
+    return encode_mask(mask)
+
+
+def _hole(surface: Surface) -> int:
+    """What integer points are under holes: the surface's nodata value where it is one of them."""
+    nodata = surface.metadata.get("nodata")
+    if surface.dtype.kind == "f" or not isinstance(nodata, int | float) or nodata != int(nodata):
+        return 0
+    limits = np.iinfo(surface.dtype)
+    return int(nodata) if max(limits.min, -(2**63)) <= nodata <= min(limits.max, 2**63 - 1) else 0
+
+
+def _as_returned(surface: Surface, hole: int) -> Iterator[Block]:
+    """The blocks as they come out of a container: holes have the value that says so."""
+    for block in surface.blocks:
+        if block.mask is None:
+            yield block
+            continue
+        arrays = [np.array(array) for array in (block.points, *block.attributes.values())]
+        values = Values([array.reshape(*block.shape, -1) for array in arrays])
+        values.clear(~block.mask, hole)
+        points, *attributes = (v.reshape(a.shape) for v, a in zip(values.arrays, arrays, strict=True))
+        named = dict(zip(block.attributes, attributes, strict=True))
+        yield Block(points, block.closed, mask=block.mask, attributes=named)

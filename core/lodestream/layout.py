@@ -1,21 +1,40 @@
 """Where the levels, bands and tiles of a surface lie: pure geometry, the same for writer and reader.
 
-The coefficients of one channel fill an array of the surface's own shape. Level l occupies the first rows and columns
-of it, as many as its grid has; a step splits that corner into the nodes of level l - 1 and up to three *bands* of
-details around it, as is usual for wavelets. A *tile* is a piece of all bands of one level over the same part of the
-surface; level 0 is one tile with one band.
+A surface is coded as one or more *grids*: the parts of its blocks, and the curves along which parts meet. The
+coefficients of one channel of a grid fill an array of the grid's own shape. Level l occupies the first rows and
+columns of it, as many as its grid has; a step splits that corner into the nodes of level l - 1 and up to three *bands*
+of details around it, as is usual for wavelets. A *tile* is a piece of all bands of one level over the same part of a
+grid, or all bands of a level of several small grids; level 0 of all grids is one tile.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from .axis import AxisStep, axis_lengths, axis_step
 from .errors import InputError
 from .surface import Closed
 
-__all__ = ["Band", "Layout", "Tile", "tile_bounds"]
+__all__ = ["Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
+
+#: Small grids share their tiles as long as they have no more points together.
+GROUP_POINTS = 1 << 16
+
+Sides = tuple[bool, bool, bool, bool]
+_NONE: Sides = (False, False, False, False)
+
+
+class Source(NamedTuple):
+    """Where a side's points come from: the grid of a curve, perhaps backwards.
+
+    Of a curve's end: another curve's first point, or its last one if ``reversed``.
+    """
+
+    grid: int
+    reversed: bool
 
 
 @dataclass(frozen=True)
@@ -30,12 +49,15 @@ class Band:
         First and past-the-last index in the array of coefficients.
     origin : (int, int)
         Index of the first coefficient within the whole band of its level.
+    grid : int
+        Number of the grid in the layout.
     """
 
     kind: tuple[bool, bool]
     rows: tuple[int, int]
     columns: tuple[int, int]
     origin: tuple[int, int]
+    grid: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -45,11 +67,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile: its level, its place in the level's grid of tiles, its bands (none empty), its parent's number or -1."""
+    """A tile: its level, its place in the level's grid of tiles, its bands (none empty), its parent's number or -1.
+
+    ``whole`` are the bands of channels that take nothing from curves.
+    """
 
     level: int
     place: tuple[int, int]
     bands: tuple[Band, ...]
+    whole: tuple[Band, ...]
     parent: int
 
 
@@ -63,75 +89,181 @@ def tile_bounds(length: int, exponent: int) -> list[int]:
     return [size * i for i in range(count)] + [length]
 
 
-class Layout:
-    """Levels, bands and tiles of a grid.
+@dataclass(frozen=True)
+class Grid:
+    """What is coarsened by itself: a part of a block, or a curve of one column.
 
-    Parameters
+    Attributes
     ----------
     shape : (rows, columns)
     closed : (bool, bool)
+    clamped : four bool
+        First row, last row, first column, last column: that end of an axis keeps its node as it is.
+    stops : (bool, bool)
+        The axis is not coarsened further once its length is even.
+    sources : four Source or None
+        Of the same sides: where their points come from, as far as the channel is a coordinate. No tile holds those.
+    curve : bool
+    """
+
+    shape: tuple[int, int]
+    closed: Closed = (False, False)
+    clamped: Sides = _NONE
+    stops: tuple[bool, bool] = (False, False)
+    sources: tuple[Source | None, Source | None, Source | None, Source | None] = (None, None, None, None)
+    curve: bool = False
+
+    @property
+    def taken(self) -> Sides:
+        """Which sides have a source."""
+        first, last, left, right = (source is not None for source in self.sources)
+        return first, last, left, right
+
+    @cached_property
+    def lengths(self) -> tuple[list[int], list[int]]:
+        """Lengths of both axes at every level until they stop, coarsest first."""
+        rows, columns = (axis_lengths(*axis) for axis in zip(self.shape, self.closed, self.stops, strict=True))
+        return rows, columns
+
+    def shape_at(self, above: int) -> tuple[int, int]:
+        """The shape so many levels below the grid itself; an axis that has stopped stays."""
+        rows, columns = (axis[max(len(axis) - 1 - above, 0)] for axis in self.lengths)
+        return rows, columns
+
+    def steps_at(self, above: int) -> tuple[AxisStep, AxisStep]:
+        """The steps along axis 0 and axis 1 down from the level that is so many levels below the grid itself."""
+        shape, ends = self.shape_at(above), (self.clamped[:2], self.clamped[2:])
+        rows, columns = (axis_step(*a) for a in zip(shape, self.closed, ends, self.stops, strict=True))
+        return rows, columns
+
+
+class Layout:
+    """Levels, bands and tiles of a surface.
+
+    Parameters
+    ----------
+    grids : sequence of Grid
+        Curves first. A surface of one block that shares no side is one grid.
     tile : (int, int)
         Exponents of two of a tile's rows and columns, in coefficients of one band.
     """
 
-    def __init__(self, shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> None:
-        if min(shape) < 1:
-            raise InputError(f"expected a grid of at least one row and column, got {shape[0]} x {shape[1]}")
-        self.shape, self.closed, self.tile = shape, closed, tile
-        lengths = [axis_lengths(n, c) for n, c in zip(shape, closed, strict=True)]
-        self.levels = max(map(len, lengths)) - 1
-        for axis in lengths:
-            axis[:0] = [axis[0]] * (self.levels + 1 - len(axis))
-        self.shapes = list(zip(*lengths, strict=True))
+    def __init__(self, grids: Sequence[Grid], tile: tuple[int, int]) -> None:
+        for grid in grids:
+            if min(grid.shape) < 1:
+                raise InputError(f"expected at least one row and column, got {grid.shape[0]} x {grid.shape[1]}")
+        self.grids, self.tile = tuple(grids), tile
+        self.levels = max(len(axis) for grid in grids for axis in grid.lengths) - 1
+        self.shared = any(any(grid.taken) for grid in grids)
 
-    def steps(self, level: int) -> tuple[AxisStep, AxisStep]:
-        """The steps along axis 0 and axis 1 from ``level`` (at least 1) to the level below."""
-        rows, columns = self.shapes[level]
-        return axis_step(rows, self.closed[0]), axis_step(columns, self.closed[1])
+    @classmethod
+    def single(cls, shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> Layout:
+        """The layout of one block that shares no side."""
+        return cls([Grid(shape, closed)], tile)
+
+    def shape(self, grid: int, level: int) -> tuple[int, int]:
+        """Rows and columns of a grid at a level."""
+        return self.grids[grid].shape_at(self.levels - level)
+
+    def steps(self, grid: int, level: int) -> tuple[AxisStep, AxisStep]:
+        """The steps along axis 0 and axis 1 of a grid from ``level`` (at least 1) to the level below."""
+        return self.grids[grid].steps_at(self.levels - level)
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:
-        """All tiles, coarsest level first, row by row."""
-        rows, columns = self.shapes[0]
-        tiles = [Tile(0, (0, 0), (Band((False, False), (0, rows), (0, columns), (0, 0)),), -1)]
-        grids = {0: (0, 1, 1)}  # level -> number of its first tile, tiles down, tiles across
+        """All tiles, coarsest level first, then group by group (curves first), row by row."""
+        every = range(len(self.grids))
+        tiles = [Tile(0, (0, 0), *self._members(every, 0), -1)]
+        parents: dict[int, tuple[int, int, int]] = {}  # group -> number of its first tile, tiles down, tiles across
+        groups = self._groups()
         for level in range(1, self.levels + 1):
-            coarse, fine = self.shapes[level - 1], self.shapes[level]
-            bounds = [tile_bounds(n, e) for n, e in zip(coarse, self.tile, strict=True)]
-            down, across = (len(b) - 1 for b in bounds)
-            grids[level] = len(tiles), down, across
-            first, parents_down, parents_across = grids[level - 1]
-            halves = [c != f for c, f in zip(*self.shapes[max(level - 2, 0) : level], strict=True)] if level > 1 else []
-            for i in range(down):
-                for j in range(across):
-                    bands = self._bands(coarse, fine, bounds, (i, j))
-                    parent = -1
-                    if level > 1:
-                        up = min(i >> halves[0], parents_down - 1), min(j >> halves[1], parents_across - 1)
-                        parent = first + up[0] * parents_across + up[1]
-                    tiles.append(Tile(level, (i, j), bands, parent))
+            for number, group in enumerate(groups):
+                first, bounds = len(tiles), self._bounds(group, level)
+                down, across = (len(b) - 1 for b in bounds)
+                before, parents_down, parents_across = parents.get(number, (0, 1, 1))
+                halves = self._halves(group[0], level) if len(group) == 1 else (0, 0)
+                for i in range(down):
+                    for j in range(across):
+                        parent = -1
+                        if level > 1:
+                            up = min(i >> halves[0], parents_down - 1), min(j >> halves[1], parents_across - 1)
+                            parent = before + up[0] * parents_across + up[1]
+                        members = self._members(group, level, bounds, (i, j))
+                        tiles.append(Tile(level, (i, j), *members, parent))
+                parents[number] = first, down, across
         return tuple(tiles)
 
-    @staticmethod
+    def _groups(self) -> list[list[int]]:
+        """Grids whose tiles are common: the curves, and consecutive small parts."""
+        groups: list[list[int]] = []
+        size = 0
+        for number, grid in enumerate(self.grids):
+            points = grid.shape[0] * grid.shape[1]
+            joins = groups and grid.curve == self.grids[groups[-1][0]].curve
+            if joins and (grid.curve or size + points <= GROUP_POINTS):
+                groups[-1].append(number)
+                size += points
+            else:
+                groups.append([number])
+                size = points
+        return groups
+
+    def _halves(self, grid: int, level: int) -> tuple[int, int]:
+        """For each axis 1 if it steps from the level below to the one below that."""
+        if level < 2:
+            return 0, 0
+        finer, coarser = self.shape(grid, level - 1), self.shape(grid, level - 2)
+        return int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
+
+    def _bounds(self, group: list[int], level: int) -> tuple[list[int], list[int]]:
+        coarse = self.shape(group[0], level - 1)
+        if len(group) > 1 or self.grids[group[0]].curve:
+            return [0, coarse[0]], [0, coarse[1]]  # one tile, of which only the number of bounds matters
+        return tile_bounds(coarse[0], self.tile[0]), tile_bounds(coarse[1], self.tile[1])
+
+    def _members(
+        self,
+        group: Sequence[int],
+        level: int,
+        bounds: tuple[list[int], list[int]] | None = None,
+        place: tuple[int, int] = (0, 0),
+    ) -> tuple[tuple[Band, ...], tuple[Band, ...]]:
+        """The tile's bands of coordinates, and of channels that take nothing from curves and have none."""
+        bands: list[Band] = []
+        whole: list[Band] = []
+        for number in group:
+            grid = self.grids[number]
+            coarse = self.shape(number, level - 1) if level else self.shape(number, 0)
+            own = bounds if bounds and len(group) == 1 else ([0, coarse[0]], [0, coarse[1]])
+            bands += self._bands(number, level, own, place, grid.taken)
+            if not grid.curve:
+                whole += self._bands(number, level, own, place, _NONE)
+        return tuple(bands), tuple(whole) if self.shared else tuple(bands)
+
     def _bands(
-        coarse: tuple[int, int], fine: tuple[int, int], bounds: list[list[int]], place: tuple[int, int]
-    ) -> tuple[Band, ...]:
+        self, number: int, level: int, bounds: tuple[list[int], list[int]], place: tuple[int, int], taken: Sides
+    ) -> list[Band]:
+        fine = self.shape(number, level)
+        coarse = self.shape(number, level - 1) if level else fine
+        kinds = ((False, True), (True, False), (True, True)) if level else ((False, False),)
         bands = []
-        for kind in ((False, True), (True, False), (True, True)):
+        for kind in kinds:
             spans = []
             for axis in range(2):
                 start, stop = bounds[axis][place[axis]], bounds[axis][place[axis] + 1]
+                last = place[axis] == len(bounds[axis]) - 2
                 if kind[axis]:
                     details = fine[axis] - coarse[axis]
-                    last = place[axis] == len(bounds[axis]) - 2
                     start, stop = min(start, details), details if last else min(stop, details)
                     spans.append((coarse[axis] + start, coarse[axis] + stop, start))
                 else:
+                    start += taken[2 * axis] and place[axis] == 0
+                    stop -= taken[2 * axis + 1] and last
                     spans.append((start, stop, start))
             rows, columns = spans
             if rows[1] > rows[0] and columns[1] > columns[0]:
-                bands.append(Band(kind, rows[:2], columns[:2], (rows[2], columns[2])))
-        return tuple(bands)
+                bands.append(Band(kind, rows[:2], columns[:2], (rows[2], columns[2]), number))
+        return bands
 
     def tiles_of(self, level: int) -> range:
         """Numbers of the tiles of a level."""

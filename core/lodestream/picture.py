@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from .kernels import strict_kernel
 from .lattice import Lattice
 from .measure import distances
 
-__all__ = ["coordinate_distances", "store_values"]
+__all__ = ["Original", "coordinate_distances", "store_values"]
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
 
 _STRIP = 1 << 14  # 64-bit integers made at a time
+_EVERY = np.zeros((0, 0), np.bool_)
 _ROWS, _COLUMNS = 128, 512  # points whose squares have a sum of their own: all that it takes stays in the cache
 
 # How values are rounded into a dtype, see `lattice.to_dtype`.
@@ -129,9 +131,13 @@ def _sum_squares(
     rounding: int,
     low: float,
     high: float,
+    counted: NDArray[np.bool_],
     totals: NDArray[np.float64],
 ) -> float:
-    """Sums of the squared distances of some points each, and the largest of all; ``numbers``: origin, step, scale."""
+    """Sums of the squared distances of some points each, and the largest of all; ``numbers``: origin, step, scale.
+
+    Points that are not ``counted`` are left out; all are where it is empty.
+    """
     rows, columns, channels = original.shape
     geometric = coordinates.shape[0]
     worst, sums = np.zeros(_COLUMNS, np.float64), np.zeros(_COLUMNS, np.float64)
@@ -151,7 +157,11 @@ def _sum_squares(
                     _square_differences(points, channels, c, v)
                     if geometric > 1:
                         _add(v, s, c == 0)
-                _tally(v if geometric == 1 else s, t, w)
+                squared = v if geometric == 1 else s
+                if counted.size:
+                    for j in range(width):
+                        squared[j] = squared[j] if counted[i, left + j] else 0.0
+                _tally(squared, t, w)
             totals[part] = t.sum()
             part += 1
     return float(worst.max())
@@ -181,31 +191,72 @@ def store_values(lattice: Lattice, coordinates: Coordinates, points: NDArray[Any
     _store(line, pitch, points, channel, *rule, rounding, low, high)
 
 
+@dataclass(frozen=True)
+class Original:
+    """The points of one part that pictures are compared with.
+
+    Attributes
+    ----------
+    points : C-contiguous array, shape (row, column, channel)
+        Finite, under holes too.
+    counted : bool, shape (row, column), or None
+        Which points errors are of; None: all.
+    """
+
+    points: NDArray[Any]
+    counted: NDArray[np.bool_] | None
+
+    @property
+    def count(self) -> int:
+        """Points that errors are of."""
+        if self.counted is None:
+            return self.points.shape[0] * self.points.shape[1]
+        return int(np.count_nonzero(self.counted))
+
+
 def coordinate_distances(
-    original: NDArray[Any], lattices: Sequence[Lattice], coordinates: NDArray[np.int32], fractions: Sequence[int]
+    originals: Sequence[Original],
+    lattices: Sequence[Lattice],
+    coordinates: Sequence[NDArray[np.int32]],
+    fractions: Sequence[int],
 ) -> tuple[float, float]:
     """`distances` between points and the values of lattice coordinates.
 
     Parameters
     ----------
-    original : C-contiguous array, shape (row, column) or (row, column, channel)
+    originals : one for each part
     lattices : one for each channel that is a coordinate
-    coordinates : C-contiguous int32 array, shape (such a channel, row, column or more)
+    coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each part
     fractions : int for each of these channels
         Coordinates stand over two to this power.
     """
-    points = original.reshape(*original.shape[:2], -1)
-    rows, columns, _ = points.shape
-    rounding, low, high = _rounding(points.dtype)
+    rounding, low, high = _rounding(originals[0].points.dtype)
     if rounding != _WIDE:
         decimal = np.array([lattice.rule == "decimal" for lattice in lattices])
         numbers = np.array([(lat.origin, lat.step, 2.0**-f) for lat, f in zip(lattices, fractions, strict=True)])
-        totals = np.zeros(-(-rows // _ROWS) * -(-columns // _COLUMNS))
-        worst = _sum_squares(points, coordinates, decimal, numbers, rounding, low, high, totals)
+        sums, worst = [], 0.0
+        for original, place in zip(originals, coordinates, strict=True):
+            rows, columns, _ = original.points.shape
+            totals = np.zeros(-(-rows // _ROWS) * -(-columns // _COLUMNS))
+            counted = _EVERY if original.counted is None else original.counted
+            squares = _sum_squares(original.points, place, decimal, numbers, rounding, low, high, counted, totals)
+            sums.append(math.fsum(totals))
+            worst = max(worst, squares)
         if 1e-250 < worst < 1e250:
-            return math.sqrt(math.fsum(totals) / (rows * columns)), math.sqrt(worst)
+            return math.sqrt(math.fsum(sums) / sum(original.count for original in originals)), math.sqrt(worst)
     # Integers that float64 cannot tell apart, or squares that it cannot hold.
-    picture = np.empty((rows, columns, len(lattices)), points.dtype)
-    for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
-        store_values(lattice, (coordinates[number, :, :columns], fraction), picture, number)
+    compared = []
+    for original, place in zip(originals, coordinates, strict=True):
+        rows, columns, _ = original.points.shape
+        picture = np.empty((rows, columns, len(lattices)), original.points.dtype)
+        for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
+            store_values(lattice, (place[number, :, :columns], fraction), picture, number)
+        chosen = slice(None) if original.counted is None else original.counted
+        points = original.points[..., : len(lattices)]
+        compared.append((points[chosen], picture[chosen]))
+    if len(compared) == 1 and compared[0][0].ndim == 3:
+        return distances(*compared[0], len(lattices))
+    points, picture = (
+        np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
+    )
     return distances(points, picture, len(lattices))

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
+from .target import Tolerance
 
-__all__ = ["channel_of", "choose_lattices"]
+__all__ = ["attribute_lattices", "channel_of", "choose_lattices"]
 
 _DEFAULT_STEPS = 2.0**20
 #: Sums and differences of pictures on their way to such values do not overflow.
@@ -53,7 +54,7 @@ def choose_lattices(
     if bits is not None:
         # With no bit at all every value is nearest to the same lattice point.
         return [precision_lattice(low, high, max(high - low, 1e-300) * 2.0 ** -(bits or -2)) for low, high in spans]
-    widest = max(high - low for low, high in spans[:geometric])
+    widest = max((high - low for low, high in spans[:geometric]), default=0.0)
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:
         raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
@@ -69,6 +70,33 @@ def choose_lattices(
         else:
             lattices.append(precision_lattice(low, high, wanted))
     return lattices
+
+
+def attribute_lattices(
+    values: NDArray[Any], precision: Tolerance | None = None, bits: int | None = None
+) -> list[Lattice]:
+    """A lattice for each component of an attribute.
+
+    Parameters
+    ----------
+    values : array, shape (point, component)
+    precision : Tolerance, optional
+        Largest distance allowed between the values of a point and what comes back. None: the components' own lattices
+        where found, or fine ones, for what they leave out is stored.
+    bits : int, optional
+        Keep no more of any component than so many bits of its range.
+    """
+    grid = values[:, np.newaxis]
+    count = values.shape[1]
+    if precision is not None:
+        lows, highs = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
+        extent = float(np.sqrt(((highs - lows) ** 2).sum()))
+        if extent or not precision.relative:
+            return choose_lattices(grid, count, precision.absolute(extent), bits)
+    if bits is not None:
+        return choose_lattices(grid, count, None, bits)
+    # As attributes of nothing: each component gets its own lattice, or a fine one.
+    return choose_lattices(grid, 0, None)
 
 
 def _spacing(lattice: Lattice) -> float:

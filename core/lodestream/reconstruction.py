@@ -13,13 +13,27 @@ from numpy.typing import NDArray
 from . import exactness
 from .bitplanes import code_passes, new_model, pass_count
 from .container.model import Header
+from .container.pieces import Window, windows
 from .errors import CorruptStreamError
+from .parts import assemble, level_masks
 from .picture import store_values
 from .predictors import COEFFICIENT_BITS
 from .tiles import UNANNOUNCED, Tiles, TileTable
 from .transform import allocate, inverse
 
-__all__ = ["Coded", "Progress", "Reconstruction", "channel_picture", "initial_state", "to_points"]
+__all__ = [
+    "Coded",
+    "Picture",
+    "Progress",
+    "Reconstruction",
+    "Values",
+    "channel_picture",
+    "initial_state",
+    "to_values",
+]
+
+#: Lattice coordinates of each grid, over two to the power of the second.
+Picture = tuple[list[NDArray[np.int32]], int]
 
 _NO_COSTS = np.zeros(0, np.float64)
 _NO_TRUTH = np.zeros(0, np.int32)
@@ -50,8 +64,7 @@ class Reconstruction:
         self._queue: list[Coded] = []
         self._taken = 0
         self._lock = Lock()
-        self._correction: tuple[bytes, int] | None = None
-        self._table: TileTable | None = None
+        self._pieces: dict[int, tuple[bytes, int]] = {}
         self._tiles: list[Tiles] = []
         self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
@@ -64,45 +77,61 @@ class Reconstruction:
         """Take a segment; nothing is decoded yet."""
         self._queue.append(segment)
 
-    def correct(self, payload: bytes, offset: int) -> None:
-        """Take the exactness section's payload, which stands at ``offset``."""
-        self._correction = payload, offset
+    def correct(self, number: int, data: bytes, offset: int) -> None:
+        """Take a piece of the exactness section, which stands at ``offset``."""
+        if data:
+            self._pieces[number] = data, offset
 
-    def points(self, length: int, state: NDArray[np.int8], level: int, corrected: bool = False) -> NDArray[Any]:
-        """The grid of ``level`` when the first ``length`` segments are known, in the surface's dtype and axes.
+    def blocks(self, length: int, state: NDArray[np.int8], level: int, corrected: bool = False) -> list[Values]:
+        """The grids of ``level`` when the first ``length`` segments are known, one for each block.
 
         Raises
         ------
         CorruptStreamError
-            When ``corrected`` is asked for and the exactness section does not fit.
+            When ``corrected`` is asked for and a piece of the exactness section does not fit.
         """
+        header = self.header
         with self._lock:
             self._decode(length)
-            channels = [
-                channel_picture(self.header, channel, tiles, state[:, channel], level)
+            pictures = [
+                channel_picture(header, channel, tiles, state[:, channel], level)
                 for channel, tiles in enumerate(self._tiles)
             ]
-        points = to_points(self.header, channels)
-        if corrected and self._correction is not None:
-            points = exactness.restore(points, *self._correction)
-        return points
+        blocks = to_values(header, pictures, level)
+        if corrected:
+            self._correct(blocks)
+        for block, mask in zip(blocks, level_masks(header.parts, header.layout, level, header.masks), strict=True):
+            if mask is not None:
+                block.clear(~mask, header.hole)
+        return blocks
 
-    def _layout_table(self) -> TileTable:
-        if self._table is None:
-            self._table = TileTable.of(self.header.layout)
-            self._tiles = [Tiles(self._table) for _ in range(self.header.channels)]
-        return self._table
+    def _correct(self, blocks: list[Values]) -> None:
+        for number, window in enumerate(windows(self.header)):
+            if number in self._pieces:
+                values = blocks[window.block].window(window)
+                mask = self.header.masks[window.block]
+                chosen = slice(None) if mask is None else mask[slice(*window.rows), slice(*window.columns)]
+                known = values[chosen]
+                values[chosen] = exactness.decode_piece(known.ravel(), *self._pieces[number]).reshape(known.shape)
+
+    def _prepare(self) -> list[Tiles]:
+        if not self._tiles:
+            header = self.header
+            table = TileTable.of(header.layout)
+            other = TileTable.of(header.layout, False) if header.layout.shared else table
+            self._tiles = [Tiles(table if c < header.geometric else other) for c in range(header.channels)]
+        return self._tiles
 
     def _decode(self, length: int) -> None:
-        table = self._layout_table()
+        every = self._prepare()
         while self._taken < length:
             segment = self._queue[self._taken]
             key = segment.tile, segment.channel
-            tiles = self._tiles[segment.channel]
+            tiles = every[segment.channel]
             model = self._models.setdefault(key, new_model())
             code_passes(
                 True,
-                table.of_tile(segment.tile),
+                tiles.table.of_tile(segment.tile),
                 segment.first,
                 segment.first - segment.passes + 1,
                 tiles.known,
@@ -168,10 +197,13 @@ class Progress:
 
 
 def initial_state(header: Header) -> NDArray[np.int8]:
-    """The state before the first layer: of the levels without a coefficient other than 0 everything is known."""
-    levels = np.array([tile.level for tile in header.layout.tiles])
-    known = (np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1
-    return np.where(known.astype(bool), 0, UNANNOUNCED).astype(np.int8)
+    """The state before the first layer: what has no coefficient, or none other than 0 in its whole level, is known."""
+    tiles = header.layout.tiles
+    levels = np.array([tile.level for tile in tiles])
+    known = ((np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1).astype(bool)
+    known[:, : header.geometric] |= np.array([not tile.bands for tile in tiles])[:, None]
+    known[:, header.geometric :] |= np.array([not tile.whole for tile in tiles])[:, None]
+    return np.where(known, 0, UNANNOUNCED).astype(np.int8)
 
 
 def channel_picture(
@@ -180,35 +212,73 @@ def channel_picture(
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
-    canvas: NDArray[np.int32] | None = None,
-) -> tuple[NDArray[np.int32], int]:
-    """One channel of the grid of ``level`` in a state.
+    canvases: Sequence[NDArray[np.int32]] | None = None,
+) -> Picture:
+    """One channel of the grids of ``level`` in a state.
 
     Parameters
     ----------
-    canvas : int32 array from `allocate`, optional
-        Of the shape of the level, where the picture is made; a new one otherwise.
+    canvases : int32 arrays from `allocate`, optional
+        Of the shapes of the level, one for each grid, where the picture is made; new ones otherwise.
 
     Returns
     -------
-    (int32 array, shape (row, column), int)
-        Lattice coordinates over two to the power of the second.
+    (list of int32 arrays, shape (row, column), int)
+        Lattice coordinates of each grid, curves first, over two to the power of the second.
     """
     layout = header.layout
     whole = 0
     while whole < level and not state[layout.tiles_of(whole + 1)].any():
         whole += 1
     fraction = header.fraction if whole < level else 0
-    coefficients = allocate(layout.shapes[level]) if canvas is None else canvas
+    coefficients = [
+        allocate(layout.shape(number, level)) if canvases is None else canvases[number]
+        for number in range(len(layout.grids))
+    ]
     tiles.spread_levels(level, state, coefficients, whole, fraction)
-    inverse(coefficients, layout, header.predictors[channel], level, whole, fraction)
+    inverse(coefficients, layout, header.predictors[channel], level, whole, fraction, channel < header.geometric)
     return coefficients, fraction
 
 
-def to_points(header: Header, channels: Sequence[tuple[NDArray[np.int32], int]]) -> NDArray[Any]:
-    """Values of each `channel_picture`, in the surface's dtype and axes."""
-    rows, columns = channels[0][0].shape
-    points = np.empty((rows, columns, len(channels)), header.dtype)
-    for number, (lattice, coordinates) in enumerate(zip(header.lattices, channels, strict=True)):
-        store_values(lattice, coordinates, points, number)
-    return points.reshape(rows, columns) if header.flat else points
+@dataclass
+class Values:
+    """A block's points, shape (row, column, channel), and those of its attributes."""
+
+    arrays: list[NDArray[Any]]
+
+    def window(self, window: Window) -> NDArray[Any]:
+        """One channel in a window, a view."""
+        channel = window.channel
+        for array in self.arrays:
+            if channel < array.shape[2]:
+                return array[slice(*window.rows), slice(*window.columns), channel]
+            channel -= array.shape[2]
+        raise IndexError(window.channel)
+
+    def clear(self, holes: NDArray[np.bool_], hole: int) -> None:
+        """Give holes the value that says so: NaN in floats, ``hole`` in integer points, 0 in integer attributes."""
+        for number, array in enumerate(self.arrays):
+            array[holes] = np.nan if array.dtype.kind == "f" else 0 if number else array.dtype.type(hole)
+
+
+def to_values(header: Header, pictures: Sequence[Picture], level: int) -> list[Values]:
+    """Values of each channel's picture, block by block."""
+    layout, parts = header.layout, header.parts
+    curves = len(layout.grids) - len(parts)
+    components = [header.point_channels, *(kind.channels for kind in header.attributes)]
+    grids: list[list[NDArray[Any]]] = []  # of each array, of each part
+    channel = 0
+    for count in components:
+        arrays = [
+            np.empty((*layout.shape(curves + k, level), count), header.dtypes[channel]) for k in range(len(parts))
+        ]
+        for component in range(count):
+            coordinates, fraction = pictures[channel]
+            for k, array in enumerate(arrays):
+                store_values(header.lattices[channel], (coordinates[curves + k], fraction), array, component)
+            channel += 1
+        grids.append(arrays)
+    return [
+        Values([np.ascontiguousarray(assemble(parts, layout, level, block, arrays)) for arrays in grids])
+        for block in range(len(header.blocks))
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,24 +34,31 @@ class TileTable:
         Lengths of the flat arrays of coefficients and of block flags.
     windows : int64, shape (band, 3)
         Of each band: its tile, and its first row and column in the array of coefficients.
+    of_grid : list of int64 arrays
+        For each grid the numbers of its bands, coarsest level first.
     """
 
     layout: Layout
+    members: list[tuple[Band, ...]]
     bands: NDArray[np.int64]
     first: list[int]
     size: int
     blocks: int
     windows: NDArray[np.int64]
+    of_grid: list[NDArray[np.int64]]
 
     @classmethod
-    def of(cls, layout: Layout) -> TileTable:
-        """Lay out the tiles of a surface."""
+    def of(cls, layout: Layout, coordinate: bool = True) -> TileTable:
+        """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
         rows: list[list[int]] = []
         windows: list[tuple[int, int, int]] = []
+        of_grid: list[list[int]] = [[] for _ in layout.grids]
         first = [0]
         size, blocks = 3, 0
-        for number, tile in enumerate(layout.tiles):
-            for band in tile.bands:
+        members = [tile.bands if coordinate else tile.whole for tile in layout.tiles]
+        for number, bands in enumerate(members):
+            for band in bands:
+                of_grid[band.grid].append(len(rows))
                 height, width = band.shape
                 stride, across = width + 2, (width + 7) // 8
                 place = size + 2 * stride + 2
@@ -61,7 +69,9 @@ class TileTable:
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
         places = np.array(windows, np.int64).reshape(-1, 3)
-        table = cls(layout, np.array(rows, np.int64).reshape(-1, BAND_FIELDS), first, size + 8, blocks, places)
+        of = [np.array(numbers, np.int64) for numbers in of_grid]
+        described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
+        table = cls(layout, members, described, first, size + 8, blocks, places, of)
         table._join_parents()
         return table
 
@@ -69,19 +79,17 @@ class TileTable:
         for number, tile in enumerate(self.layout.tiles):
             if tile.parent < 0:
                 continue
-            finer, coarser = self.layout.shapes[tile.level - 1], self.layout.shapes[tile.level - 2]
-            shifts = [int(a != b) for a, b in zip(finer, coarser, strict=True)]
-            parents = dict(
-                zip((b.kind for b in self.layout.tiles[tile.parent].bands), self.of_tile(tile.parent), strict=True)
-            )
-            origins = {b.kind: b.origin for b in self.layout.tiles[tile.parent].bands}
-            for band, row in zip(tile.bands, self.of_tile(number), strict=True):
-                if band.kind in parents:
-                    place, stride = parents[band.kind][:2]
-                    down, right = (
-                        (o >> s) - p for o, s, p in zip(band.origin, shifts, origins[band.kind], strict=True)
-                    )
-                    row[5:9] = place + down * stride + right, stride, *shifts
+            above = self.members[tile.parent]
+            parents = {(b.grid, b.kind): (b, row) for b, row in zip(above, self.of_tile(tile.parent), strict=True)}
+            for band, row in zip(self.members[number], self.of_tile(number), strict=True):
+                if (band.grid, band.kind) not in parents:
+                    continue
+                finer, coarser = (self.layout.shape(band.grid, tile.level - below) for below in (1, 2))
+                shifts = [int(a != b) for a, b in zip(finer, coarser, strict=True)]
+                parent, (place, stride) = parents[band.grid, band.kind][0], parents[band.grid, band.kind][1][:2]
+                # Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
+                down, right = (((o + s) >> s) - p for o, s, p in zip(band.origin, shifts, parent.origin, strict=True))
+                row[5:9] = place + down * stride + right, stride, *shifts
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, a view."""
@@ -98,40 +106,36 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
 
-    def spread(self, tile: int, remaining: int, coefficients: NDArray[np.int32]) -> None:
-        """Put a tile's coefficients, as they are known when so many passes remain, into the array of all coefficients.
+    def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
+        """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
 
         Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
         """
         state = np.full(len(self.table.layout.tiles), remaining, np.int8)
         first, last = self.table.first[tile : tile + 2]
-        self._spread(first, last, state, coefficients, 0, 0)
+        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
+            self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, 0, 0)
 
     def spread_levels(
-        self, level: int, state: NDArray[np.int8], coefficients: NDArray[np.int32], whole: int, fraction: int
+        self, level: int, state: NDArray[np.int8], coefficients: Sequence[NDArray[np.int32]], whole: int, fraction: int
     ) -> None:
         """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
 
-        The coefficients of levels above ``whole`` are multiplied by 2**fraction.
+        ``coefficients`` are arrays of the grids. Those of levels above ``whole`` are multiplied by 2**fraction.
         """
         tiles_of = self.table.layout.tiles_of
         last = self.table.first[tiles_of(level).stop]
-        self._spread(0, last, state, coefficients, tiles_of(whole).stop, fraction)
+        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
+            self._spread(numbers[numbers < last], state, array, tiles_of(whole).stop, fraction)
 
     def _spread(
-        self,
-        first: int,
-        last: int,
-        state: NDArray[np.int8],
-        coefficients: NDArray[np.int32],
-        finer: int,
-        fraction: int,
+        self, numbers: NDArray[np.int64], state: NDArray[np.int8], array: NDArray[np.int32], finer: int, fraction: int
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows
-        rows, columns = coefficients.shape
-        pitch = coefficients.strides[0] // coefficients.itemsize
-        line = np.lib.stride_tricks.as_strided(coefficients, ((rows - 1) * pitch + columns,), (coefficients.itemsize,))
-        _spread(*arrays, first, last, np.ascontiguousarray(state), finer, fraction, line, pitch)
+        rows, columns = array.shape
+        pitch = array.strides[0] // array.itemsize
+        line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
+        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch)
 
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
@@ -145,15 +149,14 @@ def _spread(
     early: NDArray[np.uint8],
     bands: NDArray[np.int64],
     windows: NDArray[np.int64],
-    first: int,
-    last: int,
+    numbers: NDArray[np.int64],
     state: NDArray[np.int8],
     finer: int,
     fraction: int,
     out: NDArray[np.int32],
     pitch: int,
 ) -> None:
-    for band in range(first, last):
+    for band in numbers:
         tile, top, left = windows[band, 0], windows[band, 1], windows[band, 2]
         passes, shift = int(state[tile]), fraction if tile >= finer else 0
         width = bands[band, 3]
@@ -204,13 +207,13 @@ def _spread_row(
             out[j] = np.int32(np.int32(signs[j]) * value) << shift
 
 
-def gather(table: TileTable, coefficients: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The flat array of the coefficients (with their signs) of all tiles."""
+def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
+    """The flat array of the coefficients (with their signs) of all tiles, from the arrays of the grids."""
     flat = np.zeros(table.size, np.int32)
-    for number, tile in enumerate(table.layout.tiles):
-        for band, row in zip(tile.bands, table.of_tile(number), strict=True):
+    for number, bands in enumerate(table.members):
+        for band, row in zip(bands, table.of_tile(number), strict=True):
             place, stride, height = (int(x) for x in row[:3])
             start = place - stride - 1
             frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
-            frame[1:-1, 1:-1] = _window(coefficients, band)
+            frame[1:-1, 1:-1] = _window(coefficients[band.grid], band)
     return flat

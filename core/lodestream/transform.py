@@ -1,15 +1,23 @@
-"""The whole hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder."""
+"""The whole hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder.
+
+A channel has an array for each grid of the layout, see `lodestream.layout`. A part whose side comes from a curve holds
+that side's points at every level: level 0 copies them, and the details along the side that the inverse needs are made
+by a forward step of the curve's points. Curves are therefore stepped first.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
 from .kernels import kernel
-from .layout import Layout
+from .layout import Layout, Source
 from .lifting import CLAMP, REACH, TAPS, forward_step, inverse_step
-from .predictors import FOUR_POINT, default_predictors, fitted_steps
+from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
 
 __all__ = [
     "PADDING",
@@ -37,13 +45,13 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
     return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
 
 
-def forward(values: NDArray[np.int32], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
+def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
     """Turn a channel's lattice coordinates into its coefficients, in place.
 
     Parameters
     ----------
-    values : int32, shape (row, column), from `allocate`
-        Magnitudes of at most 2**24.
+    arrays : int32, shape (row, column), from `allocate`, one for each grid
+        Magnitudes of at most 2**24. Sides that come from curves hold the same points as these.
     layout : Layout
     fit : bool
         Choose the third step's (a, b) by size for each level and axis that is long enough; otherwise (0, 0) there.
@@ -51,58 +59,126 @@ def forward(values: NDArray[np.int32], layout: Layout, fit: bool = True) -> NDAr
     Returns
     -------
     int8, shape (level, axis, 2)
-        (a, b) of the step from ``level + 1`` to ``level``.
+        (a, b) of the step from ``level + 1`` to ``level`` along axis 0 and 1 of the parts, and of the curves.
     """
     predictors = default_predictors(layout)
     fitted = set(fitted_steps(layout))
     for level in range(layout.levels, 0, -1):
-        rows, columns = layout.shapes[level]
-        corner = values[:rows, :columns]
-        for axis, step in enumerate(layout.steps(level)):
-            if not step.midpoints:
-                continue
-            if fit and (level - 1, axis) in fitted:
-                predictors[level - 1, axis] = _fit(corner if axis == 0 else corner.T, step)
-            a, b = (int(x) for x in predictors[level - 1, axis])
-            forward_step(corner, axis, step, (a, b))
+        for axis in range(2):
+            corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
+            for which in (axis, CURVES) if axis == 0 else (axis,):
+                if fit and (level - 1, which) in fitted:
+                    lines = [
+                        (corner if axis == 0 else corner.T, layout.steps(k, level)[axis])
+                        for k, corner in enumerate(corners)
+                        if layout.grids[k].curve == (which == CURVES)
+                    ]
+                    predictors[level - 1, which] = _fit(lines)
+            for k, grid in enumerate(layout.grids):
+                step = layout.steps(k, level)[axis]
+                if step.midpoints:
+                    forward_step(corners[k], axis, step, predictor(predictors, grid, step, level, axis))
     return predictors
 
 
+def _corner(array: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.int32]:
+    return array[: shape[0], : shape[1]]
+
+
 def inverse(
-    coefficients: NDArray[np.int32],
+    arrays: Sequence[NDArray[np.int32]],
     layout: Layout,
     predictors: NDArray[np.int8],
     level: int,
     whole: int | None = None,
     fraction: int = 0,
+    coordinate: bool = True,
 ) -> None:
-    """Turn coefficients into the grid of ``level``, in place, in the first rows and columns of the array.
+    """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
     Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
     lattice steps, those above count steps over 2**fraction; so does the result where ``whole`` is less than ``level``.
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
+
+    Of a channel that is no ``coordinate`` no side comes from a curve, and curves mean nothing.
     """
+    takes = coordinate and layout.shared
+    numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.curve]
+    if takes:
+        _take_nodes(arrays, layout)
     for finer in range(1, level + 1):
-        if whole is not None and finer == whole + 1:
-            rows, columns = layout.shapes[whole]
-            grid = coefficients[:rows, :columns]
-            np.clip(grid, -(CLAMP >> fraction), CLAMP >> fraction, out=grid)
-            grid <<= fraction
-        rows, columns = layout.shapes[finer]
-        corner = coefficients[:rows, :columns]
-        steps = layout.steps(finer)
-        for axis in (1, 0):
-            a, b = (int(x) for x in predictors[finer - 1, axis])
-            inverse_step(corner, axis, steps[axis], (a, b))
+        for k in numbers:
+            if whole is not None and finer == whole + 1:
+                corner = _corner(arrays[k], layout.shape(k, whole))
+                np.clip(corner, -(CLAMP >> fraction), CLAMP >> fraction, out=corner)
+                corner <<= fraction
+            grid, steps = layout.grids[k], layout.steps(k, finer)
+            corner = _corner(arrays[k], layout.shape(k, finer))
+            if takes and not grid.curve:
+                _take_details(arrays, layout, predictors, k, finer)
+            for axis in (1, 0):
+                if steps[axis].midpoints:
+                    inverse_step(corner, axis, steps[axis], predictor(predictors, grid, steps[axis], finer, axis))
 
 
-def _fit(lines: NDArray[np.int32], step: AxisStep) -> tuple[int, int]:
+def _take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
+    """Level 0 of what comes from curves: their common ends first, then the sides of parts."""
+    for k, grid in enumerate(layout.grids):
+        rows, columns = layout.shape(k, 0)
+        for side, source in enumerate(grid.sources):
+            if source is None:
+                continue
+            if grid.curve:
+                last = layout.shape(source.grid, 0)[0] - 1
+                arrays[k][0 if side == 0 else rows - 1, 0] = arrays[source.grid][last if source.reversed else 0, 0]
+            else:
+                place = (0, rows - 1, 0, columns - 1)[side]
+                line = arrays[k][place, :columns] if side < 2 else arrays[k][:rows, place]
+                line[:] = _points(arrays, layout, source, 0)
+
+
+def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source, level: int) -> NDArray[np.int32]:
+    """Points of a curve at a level, in the order of the side that takes them."""
+    points = arrays[source.grid][: layout.shape(source.grid, level)[0], 0]
+    return points[::-1] if source.reversed else points
+
+
+def _take_details(
+    arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], part: int, level: int
+) -> None:
+    """The details along a part's sides that come from curves."""
+    grid, steps = layout.grids[part], layout.steps(part, level)
+    rows, columns = (step.coarse for step in steps)
+    for side, source in enumerate(grid.sources):
+        axis = 1 if side < 2 else 0
+        step = steps[axis]
+        if source is None or not step.midpoints:
+            continue
+        place = (0, rows - 1, 0, columns - 1)[side]
+        target = arrays[part][place, : step.length] if side < 2 else arrays[part][: step.length, place]
+        points = _points(arrays, layout, source, level)
+        if points.size == 1:
+            target[step.coarse :] = 0  # a pole
+            continue
+        line = points.reshape(1, -1).copy()
+        forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
+        target[step.coarse :] = line[0, step.coarse :]
+
+
+def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
     """The (a, b) that makes the details along axis 0 of some of the columns smallest, in bits."""
-    stride = max(1, lines.shape[1] // _SAMPLE_LINES)
-    sample = np.array(lines[:, ::stride], order="C")
-    forward_step(sample, 0, step, (0, 0))
-    first, second, details = _surroundings(sample, step.coarse, step.midpoints)
+    lines = sum(corner.shape[1] for corner, _ in grids)
+    samples = []
+    for corner, step in grids:
+        if step.midpoints and step.run >= FIT_NODES:
+            stride = max(1, min(lines // _SAMPLE_LINES, corner.shape[1]))
+            sample = np.array(corner[:, ::stride], order="C")
+            forward_step(sample, 0, step, (0, 0))
+            samples.append(_surroundings(sample, step.coarse, step.midpoints))
+    first, second, details = samples[0]
+    if len(samples) > 1:
+        first, second, details = (np.concatenate([s[i].ravel() for s in samples])[:, None] for i in range(3))
     costs: dict[tuple[int, int], float] = {}
 
     def bits(ab: tuple[int, int]) -> float:
@@ -195,8 +271,8 @@ def _bits(
     return total
 
 
-def synthesis_norms(layout: Layout, predictors: NDArray[np.int8]) -> NDArray[np.float64]:
-    """Squared norms of what one unit of a coefficient adds to the surface, in its middle.
+def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
+    """Squared norms of what one unit of a coefficient of a grid adds to it, in its middle.
 
     Returns
     -------
@@ -205,22 +281,29 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8]) -> NDArray[np.
     """
     lines = np.ones((2, layout.levels + 1, 2))
     for axis in range(2):
+        stepping = []
+        for level in range(1, layout.levels + 1):
+            step = layout.steps(number, level)[axis]
+            if step.midpoints:
+                stepping.append((level, *predictor(predictors, layout.grids[number], step, level, axis)))
         for level in range(layout.levels + 1):
-            lines[axis, level] = [_line_norm(layout, predictors, axis, level, kind) for kind in (0, 1)]
+            above = tuple(step for step in stepping if step[0] >= level)
+            lines[axis, level] = [_line_norm(above, max(level, 1), kind) for kind in (0, 1)]
     norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
     return norms
 
 
-def _line_norm(layout: Layout, predictors: NDArray[np.int8], axis: int, level: int, kind: int) -> float:
-    """Squared norm along one axis of a node (kind 0) or detail (kind 1) of a band of this level."""
-    first = max(level, 1)
-    stepping = [m for m in range(first, layout.levels + 1) if layout.steps(m)[axis].midpoints]
+@lru_cache(maxsize=4096)
+def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int, kind: int) -> float:
+    """Squared norm along one axis of a node (kind 0) or detail (kind 1) of a band of level ``first``.
+
+    ``stepping``: level and (a, b) of the steps from this level on.
+    """
     if not stepping:
         return 1.0
     length, line = 16, np.zeros(16)
-    is_node = kind == 0 or stepping[0] != first
-    for count, m in enumerate(stepping[:_NORM_LEVELS]):
-        a, b = (int(x) for x in predictors[m - 1, axis])
+    is_node = kind == 0 or stepping[0][0] != first
+    for count, (_, a, b) in enumerate(stepping[:_NORM_LEVELS]):
         details = np.zeros(length)
         if count == 0:
             (line if is_node else details)[length // 2] = 1.0

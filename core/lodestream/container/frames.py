@@ -12,7 +12,7 @@ from . import sections
 __all__ = ["Frame", "FrameReader", "section_extent", "whole_section"]
 
 _START = len(sections.MAGIC) + 1
-_KNOWN = {sections.HEADER, sections.LAYER, sections.EXACTNESS, sections.METADATA, sections.INDEX}
+_KNOWN = {sections.HEADER, sections.LAYER, sections.EXACTNESS, sections.METADATA, sections.INDEX, sections.MASKS}
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrangement import Arrangement, Part, grids_of
 from ..lattice import Lattice
 from ..layout import Layout
+from ..parts import level_shapes
 from ..surface import Closed
 
-__all__ = ["ByteRange", "Header", "Index", "LayerRecord", "LevelRecord", "Segment"]
+__all__ = ["AttributeKind", "ByteRange", "Header", "Index", "LayerRecord", "LevelRecord", "Piece", "Segment"]
 
 
 @dataclass(frozen=True, order=True)
@@ -31,19 +33,37 @@ class ByteRange:
 
 
 @dataclass(frozen=True)
+class AttributeKind:
+    """An attribute by its name, with its type and components; 0 of them for an array without an axis of components."""
+
+    name: str
+    dtype: np.dtype[Any]
+    components: int
+
+    @property
+    def channels(self) -> int:
+        """Numbers at a point."""
+        return max(self.components, 1)
+
+
+@dataclass(frozen=True)
 class Header:
     """What is needed to draw.
 
     Attributes
     ----------
-    dtype : numpy dtype of the values, native order
-    shape : (rows, columns)
-    closed : (rows, columns)
+    dtype : numpy dtype of the points, native order
+    blocks : tuple of ((rows, columns), closed)
+    arrangement : Arrangement or None
+        How blocks are coded; None: one block by itself.
+    point_channels : int
+        Numbers of a point: coordinates, and attributes in the same array.
     flat : bool
-        The values came as (H, W), not as (H, W, C).
-    lattices : one `Lattice` a channel
+        The points came as (H, W), not as (H, W, C).
+    attributes : tuple of AttributeKind
+    lattices : one `Lattice` a channel: of the points, then of each attribute
     predictors : int8 array of shape (channel, level, axis, 2)
-        The third step's (a, b) of the step from ``level`` to ``level + 1`` along each axis.
+        The third step's (a, b) of the step from ``level`` to ``level + 1`` along each axis, see `predictors`.
     extent : float
         Range of the heights, or diagonal of the box of the points; what ``1e-3d`` refers to.
     fraction : int
@@ -58,14 +78,26 @@ class Header:
         An exactness section follows the layers.
     layer_count : int
         Layers of the complete stream.
+    plane : mapping or None
+        Of heights that came with the x and y of a regular lattice: what restores them, see `lodestream.heights`.
+    masked : bool
+        A section of masks follows the header.
+    hole : int
+        What integer points are where there is a hole.
+    holes : tuple of int, one for each block
+        Points that are not valid.
+    mask_data : tuple of bytes, one for each block
+        Coded masks; empty where all points are valid.
     length : int
-        Bytes from the start of the container to the end of the header.
+        Bytes from the start of the container to the end of the header and the masks.
     """
 
     dtype: np.dtype[Any]
-    shape: tuple[int, int]
-    closed: Closed
+    blocks: tuple[tuple[tuple[int, int], Closed], ...]
+    arrangement: Arrangement | None
+    point_channels: int
     flat: bool
+    attributes: tuple[AttributeKind, ...]
     lattices: tuple[Lattice, ...]
     predictors: NDArray[np.int8]
     extent: float
@@ -75,27 +107,75 @@ class Header:
     exact: bool
     corrected: bool
     layer_count: int
+    plane: Mapping[str, Any] | None = None
+    masked: bool = False
+    hole: int = 0
+    holes: tuple[int, ...] = ()
+    mask_data: tuple[bytes, ...] = ()
     length: int = 0
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the only block."""
+        return self.blocks[0][0]
+
+    @property
+    def closed(self) -> Closed:
+        """Which axes of the only block wrap."""
+        return self.blocks[0][1]
+
+    @property
     def channels(self) -> int:
-        """Numbers at a point."""
+        """Numbers at a point, attributes included."""
         return len(self.lattices)
 
     @property
     def geometric(self) -> int:
         """Of the channels, how many are coordinates: 1 (heights), 2 (planar) or 3 (xyz); the others are attributes."""
-        return min(self.channels, 3)
+        return min(self.point_channels, 3)
+
+    @cached_property
+    def dtypes(self) -> tuple[np.dtype[Any], ...]:
+        """Type of each channel."""
+        kinds = [kind.dtype for kind in self.attributes for _ in range(kind.channels)]
+        return (self.dtype,) * self.point_channels + tuple(kinds)
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """What is coded as a grid each."""
+        if self.arrangement is not None:
+            return self.arrangement.parts
+        (rows, columns), closed = self.blocks[0]
+        return (Part(0, (0, rows), (0, columns), closed),)
 
     @cached_property
     def layout(self) -> Layout:
         """Levels, bands and tiles."""
-        return Layout(self.shape, self.closed, self.tile)
+        if self.arrangement is not None:
+            return Layout(grids_of(self.arrangement), self.tile)
+        return Layout.single(*self.blocks[0], self.tile)
 
     @property
     def levels(self) -> int:
         """Number L of the finest level, the surface itself."""
         return self.layout.levels
+
+    def level_shape(self, level: int) -> tuple[int, int] | None:
+        """Rows and columns of a level of the only block; None where there are several."""
+        shapes = level_shapes(self.parts, self.layout, level, len(self.blocks))
+        return shapes[0] if len(shapes) == 1 else None
+
+    @cached_property
+    def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
+        """For each block which points are valid; None: all."""
+        if not self.masked:
+            return (None,) * len(self.blocks)
+        from ..mask import decode_mask  # only where there is one: it needs the compiler
+
+        return tuple(
+            decode_mask(data, shape, self.length) if data else None
+            for data, (shape, _) in zip(self.mask_data, self.blocks, strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -117,10 +197,13 @@ class LayerRecord:
 
 @dataclass(frozen=True)
 class LevelRecord:
-    """The state that holds all of the levels up to one and nothing finer; ``bytes`` is what `plan` sends for it."""
+    """The state that holds all of the levels up to one and nothing finer; ``bytes`` is what `plan` sends for it.
+
+    ``shape`` is that of the only block's grid, None where there are several.
+    """
 
     level: int
-    shape: tuple[int, int]
+    shape: tuple[int, int] | None
     bytes: int
     rms: float
     max_error: float
@@ -143,10 +226,19 @@ class Segment:
 
 
 @dataclass(frozen=True)
+class Piece:
+    """What corrects one channel in one window of a block; ``crc`` is of its bytes."""
+
+    range: ByteRange
+    crc: int
+
+
+@dataclass(frozen=True)
 class Index:
     """Where everything lies in a complete container.
 
-    ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``size`` is the file's.
+    ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``pieces`` of it stand in
+    the order of `lodestream.pieces.windows`. ``size`` is the file's.
     """
 
     header: Header
@@ -154,6 +246,7 @@ class Index:
     levels: tuple[LevelRecord, ...]
     segments: tuple[Segment, ...]
     exactness: ByteRange | None
+    pieces: tuple[Piece, ...]
     metadata: ByteRange
     index: ByteRange
     size: int

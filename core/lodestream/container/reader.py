@@ -47,11 +47,19 @@ def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
 
 def _read_header(read: Callable[[int, int], bytes], size: int) -> Header:
     reader, wanted = FrameReader(), _FIRST_READ
+    header: Header | None = None
     position = 0
     while position < size:
         chunk = read(position, min(wanted, size - position))
         for frame in reader.feed(chunk):
-            return sections.parse_header(frame.payload, frame.payload_offset, frame.end)
+            if header is None:
+                header = sections.parse_header(frame.payload, frame.payload_offset, frame.end)
+            elif frame.kind == sections.MASKS:
+                return sections.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
+            else:
+                raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
+            if not header.masked:
+                return header
         if not chunk:
             break
         position += len(chunk)
@@ -93,16 +101,19 @@ def describe(index: Index) -> dict[str, Any]:
     whole file.
     """
     header = index.header
-    shape, closed = list(header.shape), list(header.closed)
+    blocks = [{"shape": list(shape), "closed": list(closed)} for shape, closed in header.blocks]
+    only = blocks[0] if len(blocks) == 1 else {"shape": None, "closed": None}
     return {
-        "shape": shape,
-        "closed": closed,
-        "blocks": [{"shape": shape, "closed": closed}],
+        "shape": only["shape"],
+        "closed": only["closed"],
+        "blocks": blocks,
         "channels": header.channels,
+        "attributes": [kind.name for kind in header.attributes],
+        "holes": sum(header.holes),
         "dtype": header.dtype.name,
         "extent": header.extent,
         "levels": [
-            {"level": r.level, "shape": list(r.shape), "bytes": r.bytes, "rms": r.rms, "max": r.max_error}
+            {"level": r.level, "shape": r.shape and list(r.shape), "bytes": r.bytes, "rms": r.rms, "max": r.max_error}
             for r in index.levels
         ],
         "layers": [{"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers],

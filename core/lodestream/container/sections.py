@@ -5,17 +5,28 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 
+from ..arrangement import grids_of
 from ..errors import CorruptStreamError, InputError, UnsupportedVersionError
 from ..lattice import Lattice
 from ..layout import Layout
-from ..predictors import COEFFICIENT_BITS, default_predictors, fitted_steps
+from ..predictors import COEFFICIENT_BITS, CURVES, default_predictors, fitted_steps
 from .fields import FieldReader, FieldWriter
-from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
+from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Piece, Segment
+from .pieces import windows
+from .shape import (
+    DTYPES,
+    LARGEST_SURFACE,
+    parse_arrangement,
+    parse_extras,
+    serialize_arrangement,
+    serialize_extras,
+)
 
 __all__ = [
     "EXACTNESS",
@@ -25,6 +36,7 @@ __all__ = [
     "LARGEST_SURFACE",
     "LAYER",
     "MAGIC",
+    "MASKS",
     "METADATA",
     "MOST_FRACTION",
     "OPTIONAL",
@@ -36,31 +48,31 @@ __all__ = [
     "parse_header",
     "parse_index",
     "parse_layer",
+    "parse_masks",
     "parse_metadata",
+    "parse_pieces",
     "section",
     "serialize_footer",
     "serialize_header",
     "serialize_index",
     "serialize_layer",
     "serialize_metadata",
+    "serialize_pieces",
 ]
 
-VERSION = 1
+VERSION = 2
 MAGIC = b"\x89LODE\r\n"  # a byte that is no text, the name, a line end that text transfer would damage
-HEADER, LAYER, EXACTNESS, METADATA, INDEX = 1, 2, 3, 4, 5
+HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
 #: Kinds from here on may be skipped by a reader that does not know them.
 OPTIONAL = 128
 FOOTER_LENGTH = 24
 _FOOTER_MAGIC = b"LODEEND\n"
 
-#: Most points that a header may promise.
-LARGEST_SURFACE = 2**31
 #: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
 _LARGEST_FILE = 2**62
 #: Most binary places between lattice steps.
 MOST_FRACTION = 6
-_DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 _RULES = ("affine", "decimal")
 
 
@@ -85,53 +97,96 @@ def section(kind: int, payload: bytes) -> bytes:
 
 
 def serialize_header(header: Header) -> bytes:
-    """Magic, version and header section."""
+    """Magic, version, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
-    out.byte(header.closed[0] | header.closed[1] << 1 | header.flat << 2 | header.exact << 3 | header.corrected << 4)
-    out.byte(_DTYPES.index(header.dtype))
-    for number in (*header.shape, header.channels, header.layer_count):
-        out.varint(number)
+    extras = serialize_extras(header.attributes, header.plane)
+    marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
+    out.byte(sum(1 << place for place, flag in enumerate((*header.closed, *marks)) if flag))
+    out.byte(DTYPES.index(header.dtype))
+    out.varint(header.point_channels)
+    out.varint(header.layer_count)
     out.byte(header.tile[0] | header.tile[1] << 4)
     out.byte(header.fraction)
     out.pack("d", header.extent)
+    if header.arrangement is None:
+        out.varint(header.shape[0])
+        out.varint(header.shape[1])
+    else:
+        serialize_arrangement(out, header.blocks, header.arrangement)
+    if extras:
+        out.varint(len(extras))
+        out.data += extras
     for lattice in header.lattices:
         out.byte(_RULES.index(lattice.rule))
         out.pack("dd", lattice.origin, lattice.step)
     for levels in header.empty:
         out.varint(levels)
     fitted = fitted_steps(header.layout)
-    for predictors in header.predictors:
+    for channel, predictors in enumerate(header.predictors):
         for level, axis in fitted:
-            out.pack("bb", *(int(x) for x in predictors[level, axis]))
-    return MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+            if axis < CURVES or channel < header.geometric:
+                out.pack("bb", *(int(x) for x in predictors[level, axis]))
+    data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+    return data + section(MASKS, _serialize_masks(header)) if header.masked else data
+
+
+def _serialize_masks(header: Header) -> bytes:
+    out = FieldWriter()
+    out.pack("q", header.hole)
+    for holes, data in zip(header.holes, header.mask_data, strict=True):
+        out.varint(holes)
+        if holes:
+            out.varint(len(data))
+            out.data += data
+    return bytes(out.data)
+
+
+def parse_masks(header: Header, payload: memoryview, offset: int, length: int) -> Header:
+    """The header with the masks of their section, which stands at ``offset`` and ends at ``length``."""
+    fields = FieldReader(payload, offset)
+    (hole,) = fields.unpack("q")
+    holes, coded = [], []
+    for shape, _ in header.blocks:
+        holes.append(fields.varint(shape[0] * shape[1]))
+        coded.append(bytes(fields.take(fields.varint(len(payload)))) if holes[-1] else b"")
+    fields.end()
+    if header.dtype.kind != "f" and not np.iinfo(header.dtype).min <= hole <= np.iinfo(header.dtype).max:
+        raise CorruptStreamError(f"expected holes as a value of {header.dtype}, got {hole}", offset)
+    return replace(header, hole=int(hole), holes=tuple(holes), mask_data=tuple(coded), length=length)
 
 
 def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     """Header section's payload, which stands at ``offset``; the header ends at ``length``."""
     fields = FieldReader(payload, offset)
     flags, code = fields.byte(), fields.byte()
-    if flags > 31 or code >= len(_DTYPES):
-        raise CorruptStreamError(
-            f"expected flags below 32 and a type below {len(_DTYPES)}, got {flags} and {code}", offset
-        )
-    shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
-    channels, layer_count = fields.varint(2**16), fields.varint(2**16)
-    points = shape[0] * shape[1]
-    few = channels == 0 or layer_count == 0 or (flags & 4 and channels != 1)
-    if few or points < 2 or points * channels > LARGEST_SURFACE:
-        raise CorruptStreamError(
-            f"expected points, channels and layers, got {shape[0]} x {shape[1]} x {channels}, {layer_count}", offset
-        )
-    exponents = fields.byte()
+    if code >= len(DTYPES):
+        raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
+    point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
+    exponents, fraction = fields.byte(), fields.byte()
     tile = exponents & 15, exponents >> 4
+    (extent,) = fields.unpack("d")
+    arrangement = None
+    if flags & 64:
+        blocks, arrangement = parse_arrangement(fields)
+    else:
+        shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+        blocks = ((shape, (bool(flags & 1), bool(flags & 2))),)
+    attributes, plane = parse_extras(fields.take(fields.varint(len(payload))), offset) if flags & 128 else ((), None)
+    channels = point_channels + sum(kind.channels for kind in attributes)
+    points = sum(rows * columns for (rows, columns), _ in blocks)
+    few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
+    if few or points * channels > LARGEST_SURFACE:
+        raise CorruptStreamError(
+            f"expected points, channels and layers, got {points} x {channels}, {layer_count} layers", offset
+        )
     # Tiles across a narrow surface would be many, and nearly empty.
-    count = max(1, shape[0] >> tile[0]) * max(1, shape[1] >> tile[1])
-    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + (points >> (TILE_BITS - 1)):
+    count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
-    fraction = fields.byte()
     if fraction > MOST_FRACTION:
         raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
-    (extent,) = fields.unpack("d")
+    if not (math.isfinite(extent) and extent >= 0):
+        raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = []
     for _ in range(channels):
         start, rule = fields.at, fields.byte()
@@ -139,24 +194,24 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
             raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
         lattices.append(Lattice(_RULES[rule], origin, step))
-    if not (math.isfinite(extent) and extent >= 0):
-        raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
-    closed = bool(flags & 1), bool(flags & 2)
-    layout = Layout(shape, closed, tile)
-    empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
-    fitted = fitted_steps(layout)
-    predictors = np.stack([default_predictors(layout)] * channels)
+    grids = Layout.single(*blocks[0], tile) if arrangement is None else Layout(grids_of(arrangement), tile)
+    empty = tuple(fields.varint((2 << grids.levels) - 1) for _ in range(channels))
+    predictors = np.stack([default_predictors(grids)] * channels)
+    fitted = fitted_steps(grids)
     for channel in range(channels):
         for level, axis in fitted:
-            predictors[channel, level, axis] = fields.unpack("bb")
+            if axis < CURVES or channel < min(point_channels, 3):
+                predictors[channel, level, axis] = fields.unpack("bb")
     if (predictors == -128).any():
         raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
     fields.end()
     return Header(
-        dtype=_DTYPES[code],
-        shape=shape,
-        closed=closed,
+        dtype=DTYPES[code],
+        blocks=blocks,
+        arrangement=arrangement,
+        point_channels=point_channels,
         flat=bool(flags & 4),
+        attributes=attributes,
         lattices=tuple(lattices),
         predictors=predictors,
         extent=extent,
@@ -166,6 +221,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
         layer_count=layer_count,
+        plane=plane,
+        masked=bool(flags & 32),
         length=length,
     )
 
@@ -273,8 +330,36 @@ def serialize_index(index: Index) -> bytes:
     for level in index.levels:
         out.pack("dd", level.rms, level.max_error)
     out.varint(index.exactness.length if index.exactness else 0)
+    for piece in index.pieces:
+        out.varint(piece.range.length)
+        if piece.range.length:
+            out.pack("I", piece.crc)
     out.varint(index.metadata.length)
     return bytes(out.data)
+
+
+def serialize_pieces(figures: tuple[float, float], pieces: Sequence[bytes]) -> bytes:
+    """Payload of the exactness section: the errors that are left, the pieces' lengths, then the pieces."""
+    out = FieldWriter()
+    out.pack("dd", *figures)
+    for piece in pieces:
+        out.varint(len(piece))
+    return bytes(out.data) + b"".join(pieces)
+
+
+def parse_pieces(
+    payload: memoryview, offset: int, count: int
+) -> tuple[tuple[float, float], list[tuple[bytes, int]]]:
+    """The errors that an exactness section, which stands at ``offset``, leaves; its pieces and their places."""
+    fields = FieldReader(payload, offset)
+    figures = _figures(fields)
+    lengths = [fields.varint(len(payload)) for _ in range(count)]
+    pieces = []
+    for length in lengths:
+        at = fields.at
+        pieces.append((bytes(fields.take(length)), at))
+    fields.end()
+    return figures, pieces
 
 
 def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header: Header) -> Index:
@@ -309,13 +394,15 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
         layers.append(LayerRecord(number, place, place + length, level, rms, max_error))
         place += length
     figures = [_figures(fields) for _ in range(header.levels + 1)]
-    exactness, metadata = fields.varint(_LARGEST_FILE), fields.varint(_LARGEST_FILE)
+    exactness = fields.varint(_LARGEST_FILE)
+    pieces = _parse_places(fields, header, place, exactness) if exactness else ()
+    metadata = fields.varint(_LARGEST_FILE)
     fields.end()
     filled = place + exactness + metadata == index_range.offset
     if len(layers) != header.layer_count or bool(exactness) != header.corrected or not filled:
         raise CorruptStreamError("expected layers that fill the container up to the index, got others", offset)
     levels = tuple(
-        LevelRecord(level, header.layout.shapes[level], 0, rms, max_error)
+        LevelRecord(level, header.level_shape(level), 0, rms, max_error)
         for level, (rms, max_error) in enumerate(figures)
     )
     return Index(
@@ -324,10 +411,26 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
         levels,
         tuple(segments),
         ByteRange(place, exactness) if exactness else None,
+        pieces,
         ByteRange(place + exactness, metadata),
         index_range,
         index_range.end + FOOTER_LENGTH,
     )
+
+
+def _parse_places(fields: FieldReader, header: Header, place: int, length: int) -> tuple[Piece, ...]:
+    """Where the pieces of the exactness section stand that begins at ``place``."""
+    start, found, total = fields.at, [], 0
+    for _ in windows(header):
+        size = fields.varint(length)
+        (crc,) = fields.unpack("I") if size else (0,)
+        found.append((total, size, int(crc)))
+        total += size
+    # Pieces fill the end of the section, before its CRC.
+    first = place + length - 4 - total
+    if first < place:
+        raise CorruptStreamError(f"expected pieces within {length} bytes of exactness, got {total}", start)
+    return tuple(Piece(ByteRange(first + at, size), crc) for at, size, crc in found)
 
 
 def serialize_footer(index: ByteRange) -> bytes:

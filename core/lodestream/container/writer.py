@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from . import sections
-from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
+from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Piece, Segment
 
 __all__ = ["CodedLayer", "CodedSegment", "write_container"]
 
@@ -38,7 +38,7 @@ def write_container(
     header: Header,
     layers: Sequence[CodedLayer],
     levels: Sequence[tuple[float, float]],
-    correction: bytes,
+    pieces: Sequence[bytes],
     metadata: Mapping[str, Any],
     *,
     exact: bool,
@@ -52,13 +52,13 @@ def write_container(
     layers : sequence of CodedLayer
     levels : sequence of (rms, max_error)
         One for each level.
-    correction : bytes
-        Payload of the exactness section, empty where there is none.
+    pieces : sequence of bytes
+        Of the exactness section, in the order of `pieces.windows`; nothing, or all empty, where there is none.
     metadata : mapping
     exact : bool
         The complete stream restores every value bit for bit.
     """
-    header = replace(header, exact=exact, corrected=bool(correction), layer_count=len(layers))
+    header = replace(header, exact=exact, corrected=any(pieces), layer_count=len(layers))
     out = bytearray(sections.serialize_header(header))
     header = replace(header, length=len(out))
     records, segments, finest = [], [], 0
@@ -77,14 +77,21 @@ def write_container(
             place += len(s.data)
             finest = max(finest, header.layout.tiles[s.tile].level)
         records.append(LayerRecord(number, start, len(out), finest, layer.rms, layer.max_error))
-    exactness = _append(out, sections.EXACTNESS, correction) if correction else None
+    exactness, places = None, []
+    if header.corrected:
+        exactness = _append(out, sections.EXACTNESS, sections.serialize_pieces(levels[-1], pieces))
+        place = len(out) - 4 - sum(map(len, pieces))
+        for piece in pieces:
+            places.append(Piece(ByteRange(place, len(piece)), zlib.crc32(piece)))
+            place += len(piece)
     where_metadata = _append(out, sections.METADATA, sections.serialize_metadata(dict(metadata)))
     index = Index(
         header,
         tuple(records),
-        tuple(LevelRecord(level, header.layout.shapes[level], 0, *figures) for level, figures in enumerate(levels)),
+        tuple(LevelRecord(level, header.level_shape(level), 0, *figures) for level, figures in enumerate(levels)),
         tuple(segments),
         exactness,
+        tuple(places),
         where_metadata,
         ByteRange(len(out), 0),
         0,

@@ -1,0 +1,34 @@
+"""The pieces of an exactness section: one for each channel in each window of each block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from .model import Header
+
+__all__ = ["Window", "windows"]
+
+
+class Window(NamedTuple):
+    """A piece's channel and place: rows and columns, half-open, of a block."""
+
+    channel: int
+    block: int
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+
+def windows(header: Header) -> Iterator[Window]:
+    """All pieces in the order of the file: block by block, row by row of windows, channel by channel.
+
+    A window has twice the rows and columns of a tile: about the points that a tile of the finest level makes.
+    """
+    height, width = (2 << exponent for exponent in header.tile)
+    for block, ((rows, columns), _) in enumerate(header.blocks):
+        for top in range(0, rows, height):
+            for left in range(0, columns, width):
+                for channel in range(header.channels):
+                    yield Window(
+                        channel, block, (top, min(top + height, rows)), (left, min(left + width, columns))
+                    )

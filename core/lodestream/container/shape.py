@@ -1,0 +1,168 @@
+"""The part of a header that says what a surface is made of: blocks, curves, parts and attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from ..arrangement import Arrangement, Curve, Part, Side, covers
+from ..errors import CorruptStreamError
+from ..surface import Closed
+from .fields import FieldReader, FieldWriter
+from .model import AttributeKind
+
+__all__ = [
+    "DTYPES",
+    "LARGEST_SURFACE",
+    "Blocks",
+    "parse_arrangement",
+    "parse_extras",
+    "serialize_arrangement",
+    "serialize_extras",
+]
+
+DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
+#: Most points that a header may promise.
+LARGEST_SURFACE = 2**31
+_MOST_PARTS = 1 << 16
+
+Blocks = tuple[tuple[tuple[int, int], Closed], ...]
+
+
+def _bits(*flags: bool) -> int:
+    return sum(1 << place for place, flag in enumerate(flags) if flag)
+
+
+def serialize_arrangement(out: FieldWriter, blocks: Blocks, arrangement: Arrangement) -> None:
+    """Blocks, curves and parts."""
+    out.varint(len(blocks))
+    for shape, closed in blocks:
+        out.varint(shape[0])
+        out.varint(shape[1])
+        out.byte(_bits(*closed))
+    out.varint(len(arrangement.curves))
+    for curve in arrangement.curves:
+        out.varint(curve.length << 2 | _bits(curve.closed, curve.stops))
+    out.varint(len(arrangement.parts))
+    for part in arrangement.parts:
+        shape = blocks[part.block][0]
+        window = part.rows != (0, shape[0]) or part.columns != (0, shape[1])
+        out.varint(part.block)
+        out.byte(_bits(*part.closed, *part.flipped, *part.stops, window))
+        out.byte(_bits(*part.clamped, *(side is not None for side in part.sides)))
+        if window:
+            for start, stop in (part.rows, part.columns):
+                out.varint(start)
+                out.varint(stop - start)
+        for side in part.sides:
+            if side is not None:
+                out.varint(side.curve << 1 | side.reversed)
+
+
+def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
+    """Undo `serialize_arrangement`, checking that parts cover the blocks and fit their curves."""
+    start = fields.at
+    blocks = []
+    points = 0
+    for _ in range(_count(fields)):
+        shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+        flags = fields.byte()
+        points += shape[0] * shape[1]
+        if shape[0] * shape[1] < 2 or points > LARGEST_SURFACE or flags > 3:
+            raise CorruptStreamError(f"expected blocks of points, got {shape[0]} x {shape[1]}", start)
+        blocks.append((shape, (bool(flags & 1), bool(flags & 2))))
+    curves = []
+    for _ in range(_count(fields, 0)):
+        number = fields.varint(4 * LARGEST_SURFACE)
+        curves.append(Curve(number >> 2, bool(number & 1), bool(number & 2)))
+    parts = [_parse_part(fields, blocks, curves) for _ in range(_count(fields))]
+    for number, (shape, closed) in enumerate(blocks):
+        own = [part for part in parts if part.block == number]
+        wraps = len(own) == 1 and own[0].closed == closed
+        if not covers(shape, own[0].closed if wraps else (False, False), [(p.rows, p.columns) for p in own]):
+            raise CorruptStreamError(f"expected parts that cover block {number} once, got others", start)
+    return tuple(blocks), Arrangement(tuple(parts), tuple(curves))
+
+
+def _count(fields: FieldReader, least: int = 1) -> int:
+    start = fields.at
+    count = fields.varint(_MOST_PARTS)
+    # Each takes a byte at least: nothing is made that was not sent.
+    if not least <= count <= len(fields.data):
+        raise CorruptStreamError(f"expected {least} to {len(fields.data)} of them, got {count}", start)
+    return count
+
+
+def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]], curves: list[Curve]) -> Part:
+    start = fields.at
+    block = fields.varint(len(blocks) - 1)
+    flags, ends = fields.byte(), fields.byte()
+    shape, whole = blocks[block]
+    spans = [(0, shape[0]), (0, shape[1])]
+    if flags & 64:
+        for axis in range(2):
+            first = fields.varint(shape[axis])
+            spans[axis] = first, first + fields.varint(shape[axis] - first)
+    rows, columns = spans
+    closed = bool(flags & 1), bool(flags & 2)
+    lengths = columns[1] - columns[0], rows[1] - rows[0]
+    stops = bool(flags & 16), bool(flags & 32)
+    sides: list[Side | None] = []
+    for number in range(4):
+        if not ends & 16 << number:
+            sides.append(None)
+            continue
+        value = fields.varint(2 * _MOST_PARTS)
+        side, along = Side(value >> 1, bool(value & 1)), 1 - number // 2
+        curve = curves[side.curve] if side.curve < len(curves) else None
+        length = lengths[number // 2]
+        pole = curve is not None and curve.length == 1
+        same = curve is not None and (curve.length, curve.closed, curve.stops) == (length, closed[along], stops[along])
+        if not (pole or same) or closed[1 - along] or not ends & 1 << number:
+            raise CorruptStreamError(f"expected a curve of {length} points at a clamped side, got {curve}", start)
+        sides.append(side)
+    cut = (rows, columns) != ((0, shape[0]), (0, shape[1]))
+    if flags > 127 or min(lengths) < 1 or (cut and any(closed)) or any(c and not w for c, w in zip(closed, whole)):
+        raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
+    first, last, left, right = sides
+    return Part(
+        block,
+        rows,
+        columns,
+        closed,
+        (bool(flags & 4), bool(flags & 8)),
+        (first, last, left, right),
+        (bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)),
+        stops,
+    )
+
+
+def serialize_extras(attributes: tuple[AttributeKind, ...], plane: Mapping[str, Any] | None) -> bytes:
+    """A MessagePack map of what few surfaces have."""
+    values: dict[str, Any] = {}
+    if attributes:
+        values["attributes"] = [[kind.name, DTYPES.index(kind.dtype), kind.components] for kind in attributes]
+    if plane is not None:
+        values["plane"] = dict(plane)
+    return bytes(msgpack.packb(values)) if values else b""
+
+
+def parse_extras(data: memoryview, offset: int) -> tuple[tuple[AttributeKind, ...], Mapping[str, Any] | None]:
+    """Undo `serialize_extras`."""
+    try:
+        values = msgpack.unpackb(data, raw=False, strict_map_key=True)
+        kinds = tuple(
+            AttributeKind(str(name), DTYPES[int(code)], int(components))
+            for name, code, components in values.get("attributes", [])
+        )
+        plane = values.get("plane")
+        if not (plane is None or isinstance(plane, dict)) or any(not 0 <= k.components < 2**16 for k in kinds):
+            raise ValueError("another")
+        if len({kind.name for kind in kinds}) != len(kinds):
+            raise ValueError("two attributes of one name")
+    except (ValueError, TypeError, IndexError, AttributeError, msgpack.UnpackException) as error:
+        raise CorruptStreamError(f"expected attributes and a plane in MessagePack, got {error}", offset) from None
+    return kinds, plane

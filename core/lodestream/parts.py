@@ -1,0 +1,99 @@
+"""Blocks cut into parts, and grids of parts put together to grids of blocks, at any level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrangement import Part
+from .layout import Grid, Layout
+
+__all__ = ["assemble", "level_masks", "level_positions", "level_shapes", "take"]
+
+Positions = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
+def take(block: NDArray[Any], part: Part) -> NDArray[Any]:
+    """A part's window of a block's array (row, column, ...), turned as it is stored; a view."""
+    window = block[slice(*part.rows), slice(*part.columns)]
+    return window[:: -1 if part.flipped[0] else 1, :: -1 if part.flipped[1] else 1]
+
+
+def _node_positions(grid: Grid, axis: int, above: int) -> NDArray[np.int64]:
+    """Which samples of a grid's axis stand at the nodes so many levels below it."""
+    positions = np.arange(grid.shape[axis], dtype=np.int64)
+    for below in range(above):
+        step = grid.steps_at(below)[axis]
+        if step.midpoints:
+            run = positions[: 2 * step.run : 2]
+            positions = np.concatenate([run, positions[-1:]]) if step.tail else run
+    return positions
+
+
+def level_positions(parts: Sequence[Part], layout: Layout, level: int, block: int) -> Positions:
+    """Which rows and columns of a block stand at the nodes of a level."""
+    rows: set[int] = set()
+    columns: set[int] = set()
+    for number, part in enumerate(parts):
+        if part.block == block:
+            down, right = _part_positions(part, layout, level, number, len(parts))
+            rows.update(down.tolist())
+            columns.update(right.tolist())
+    return np.array(sorted(rows), np.int64), np.array(sorted(columns), np.int64)
+
+
+def _part_positions(part: Part, layout: Layout, level: int, number: int, count: int) -> Positions:
+    grid = layout.grids[len(layout.grids) - count + number]
+    found = []
+    for axis, window in enumerate((part.rows, part.columns)):
+        nodes = _node_positions(grid, axis, layout.levels - level)
+        found.append(window[0] + (grid.shape[axis] - 1 - nodes if part.flipped[axis] else nodes))
+    return found[0], found[1]
+
+
+def level_shapes(parts: Sequence[Part], layout: Layout, level: int, blocks: int) -> list[tuple[int, int]]:
+    """Rows and columns of each block's grid at a level."""
+    if len(parts) == blocks:
+        curves = len(layout.grids) - len(parts)
+        return [layout.shape(curves + number, level) for number in range(blocks)]
+    positions = (level_positions(parts, layout, level, block) for block in range(blocks))
+    return [(rows.size, columns.size) for rows, columns in positions]
+
+
+def assemble(
+    parts: Sequence[Part], layout: Layout, level: int, block: int, grids: Sequence[NDArray[Any]]
+) -> NDArray[Any]:
+    """A block's grid of a level out of the grids of its parts.
+
+    Parameters
+    ----------
+    grids : arrays (row, column, ...), one for each part, as stored
+    """
+    own = [(number, part) for number, part in enumerate(parts) if part.block == block]
+    if len(own) == 1:
+        number, part = own[0]
+        return grids[number][:: -1 if part.flipped[0] else 1, :: -1 if part.flipped[1] else 1]
+    rows, columns = level_positions(parts, layout, level, block)
+    whole = np.zeros((rows.size, columns.size, *grids[own[0][0]].shape[2:]), grids[own[0][0]].dtype)
+    for number, part in own:
+        down, right = _part_positions(part, layout, level, number, len(parts))
+        whole[np.ix_(np.searchsorted(rows, down), np.searchsorted(columns, right))] = grids[number]
+    return whole
+
+
+def level_masks(
+    parts: Sequence[Part], layout: Layout, level: int, masks: Sequence[NDArray[np.bool_] | None]
+) -> list[NDArray[np.bool_] | None]:
+    """Which nodes of a level stand for valid points: those at whose place the full grid has one."""
+    found: list[NDArray[np.bool_] | None] = []
+    for block, mask in enumerate(masks):
+        coarse = None
+        if mask is not None:
+            coarse = mask
+            if level < layout.levels:
+                coarse = mask[np.ix_(*level_positions(parts, layout, level, block))]
+        found.append(coarse)
+    return found

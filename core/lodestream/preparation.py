@@ -1,0 +1,271 @@
+"""A surface on its way into the encoder: holes filled, lattices chosen, blocks cut into parts, each vertex counted once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrangement import Arrangement, Curve, Part, Side, grids_of
+from .container.model import AttributeKind
+from .lattice import Lattice
+from .layout import Layout
+from .measure import extent_of
+from .parts import take
+from .picture import Original
+from .quantise import attribute_lattices, choose_lattices
+from .surface import Block, Surface
+from .target import Tolerance
+from .transform import allocate
+
+__all__ = ["Precisions", "Preparation"]
+
+Arrays = list[NDArray[Any]]
+#: Of the coordinates, and of attributes by name.
+Precisions = tuple[Tolerance | None, Mapping[str, Tolerance]]
+
+
+class Preparation:
+    """What the encoder needs of a surface.
+
+    Attributes
+    ----------
+    surface : Surface
+    arrays : list, one for each block, of lists of arrays, shape (row, column, channel)
+        Points, then each attribute; without holes.
+    geometric : int
+        Channels that are coordinates.
+    kinds : tuple of AttributeKind
+    extent : float
+        Range of the heights or diagonal of the box, of valid points.
+    precision : float or None
+        Largest distance allowed, in the surface's unit.
+    layout : Layout
+    arrangement : Arrangement or None
+        None where the surface is one block that shares no side.
+    parts : tuple of Part
+    originals : list of Original, one for each part
+    """
+
+    def __init__(self, surface: Surface, precisions: Precisions) -> None:
+        self.surface = surface
+        self.arrays = [_filled(block) for block in surface.blocks]
+        first = surface.blocks[0]
+        self.point_channels = self.arrays[0][0].shape[2]
+        self.geometric = min(self.point_channels, 3)
+        self.kinds = tuple(
+            AttributeKind(name, array.dtype, array.shape[2] if array.ndim == 3 else 0)
+            for name, array in first.attributes.items()
+        )
+        self._valid = _valid_points(surface.blocks, [arrays[0] for arrays in self.arrays])
+        self.extent = extent_of(self._valid, self.geometric)
+        precision, self.attribute_precisions = precisions
+        if precision is not None and precision.relative and not self.extent:
+            precision = None  # a fraction of nothing: one point, which a lattice holds exactly
+        self.precision = None if precision is None else precision.absolute(self.extent)
+        self.arrangement = self._arranged()
+        if self.arrangement is None:
+            shape = first.shape
+            self.parts: tuple[Part, ...] = (Part(0, (0, shape[0]), (0, shape[1]), first.closed),)
+            self.tile = tile_exponents(shape)
+            self.layout = Layout.single(shape, first.closed, self.tile)
+        else:
+            self.parts, self.tile = self.arrangement.parts, (TILE_BITS // 2, TILE_BITS // 2)
+            self.layout = Layout(grids_of(self.arrangement), self.tile)
+        self.originals = self._originals()
+
+    def lattices(self, bits: int | None) -> list[Lattice]:
+        """A lattice for each channel; ``bits``: keep no more than so many of any channel's range."""
+        found = choose_lattices(self._valid, self.geometric, self.precision, bits)
+        for number, kind in enumerate(self.kinds, 1):
+            values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in self.arrays])
+            found += attribute_lattices(values, self.attribute_precisions.get(kind.name), bits)
+        return found
+
+    def channel(self, block: int, channel: int) -> NDArray[Any]:
+        """One channel of a block, shape (row, column), a view."""
+        for array in self.arrays[block]:
+            if channel < array.shape[2]:
+                return array[..., channel]
+            channel -= array.shape[2]
+        raise IndexError(channel)
+
+    def coordinates(self, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
+        """Lattice coordinates of a channel, one array for each grid of the layout; what is shared agrees."""
+        arrays = [allocate(grid.shape) for grid in self.layout.grids]
+        curves = len(arrays) - len(self.parts)
+        if self.arrangement is None:
+            lattice.coordinates(self.channel(0, channel), out=arrays[0])
+            return arrays
+        known: set[int] = set()
+        for number, part in enumerate(self.parts):
+            values = np.ascontiguousarray(take(self.channel(part.block, channel), part))
+            arrays[curves + number][...] = lattice.coordinates(values)
+            if channel >= self.geometric:
+                continue
+            for side, line in zip(part.sides, _lines(arrays[curves + number]), strict=True):
+                if side is None:
+                    continue
+                curve = arrays[side.curve][:, 0]
+                if side.curve not in known:
+                    curve[:] = (line[::-1] if side.reversed else line)[: curve.size]
+                    known.add(side.curve)
+        if channel < self.geometric:
+            self._agree(arrays, curves)
+        return arrays
+
+    def _agree(self, arrays: list[NDArray[np.int32]], curves: int) -> None:
+        """Sides take their points from their curves: under holes, and on coarser lattices, these may differ."""
+        for number, grid in enumerate(self.layout.grids[:curves]):
+            for end, source in enumerate(grid.sources[:2]):
+                if source is not None:
+                    arrays[number][-end, 0] = arrays[source.grid][-1 if source.reversed else 0, 0]
+        for number, part in enumerate(self.parts):
+            for side, line in zip(part.sides, _lines(arrays[curves + number]), strict=True):
+                if side is not None:
+                    curve = arrays[side.curve][:, 0]
+                    line[:] = curve[::-1] if side.reversed else curve
+
+    def _arranged(self) -> Arrangement | None:
+        blocks = self.surface.blocks
+        if self.geometric == 1 or (len(blocks) == 1 and not _may_share(blocks[0], self.arrays[0][0])):
+            if len(blocks) == 1:
+                return None
+            whole = [Part(k, (0, b.shape[0]), (0, b.shape[1]), b.closed) for k, b in enumerate(blocks)]
+            return Arrangement(tuple(whole))
+        from .sides import LatticeBlock, arrange
+
+        lattices = choose_lattices(self._valid, self.geometric, self.precision, None)
+        sources = []
+        for block, arrays in zip(blocks, self.arrays, strict=True):
+            channels = [lattices[k].coordinates(arrays[0][..., k]) for k in range(self.geometric)]
+            points = np.stack(channels, axis=2)
+            if block.mask is not None:
+                points[~block.mask] = 0  # whatever stands under holes agrees
+            sources.append(LatticeBlock(points, block.closed, block.mask))
+        found = arrange(sources, self.geometric)
+        parts = [
+            Part(
+                p.block,
+                p.rows,
+                p.columns,
+                p.closed,
+                p.flipped,
+                tuple(s and Side(s.curve, s.reversed) for s in p.sides),  # type: ignore[arg-type]  # four of them
+                p.clamped,
+                p.stops,
+            )
+            for p in found.parts
+        ]
+        curves = [Curve(c.length, c.closed, c.stops) for c in found.curves]
+        for number, part in enumerate(parts):
+            window = take(sources[part.block].coordinates, part)
+            sides = list(part.sides)
+            mask = sources[part.block].mask
+            valid = _lines(np.ones(part.shape, np.bool_) if mask is None else take(mask, part))
+            for place, line in enumerate(_lines(window)):
+                wraps = part.closed[place // 2]  # such an axis has no ends
+                if sides[place] is None and not wraps and len(line) > 1 and valid[place].all() and (line == line[0]).all():
+                    sides[place] = Side(len(curves), False)
+                    curves.append(Curve(1))
+            first, last, left, right = sides
+            clamped = [a or s is not None for a, s in zip(part.clamped, sides, strict=True)]
+            parts[number] = replace(
+                part, sides=(first, last, left, right), clamped=(clamped[0], clamped[1], clamped[2], clamped[3])
+            )
+        if len(parts) == 1 and not curves and parts[0].flipped == parts[0].stops == (False, False):
+            return None
+        return Arrangement(tuple(parts), tuple(curves))
+
+    def _originals(self) -> list[Original]:
+        if self.arrangement is None:
+            return [Original(self.arrays[0][0], self.surface.blocks[0].mask)]
+        originals = []
+        used: set[int] = set()
+        for part in self.parts:
+            points = np.ascontiguousarray(take(self.arrays[part.block][0], part))
+            mask = self.surface.blocks[part.block].mask
+            counted = np.ones(part.shape, np.bool_) if mask is None else take(mask, part).copy()
+            lines = _lines(counted)
+            again = [side is not None and self._again(side, used) for side in part.sides]
+            for place, (side, line) in enumerate(zip(part.sides, lines, strict=True)):
+                if again[place]:
+                    line[:] = False
+                elif side is not None and self.layout.grids[side.curve].shape[0] == 1:
+                    beside = (2, 3) if place < 2 else (0, 1)
+                    line[1:] = False
+                    if again[beside[0]] or again[beside[1]]:
+                        line[:] = False
+            originals.append(Original(points, counted))
+        return originals
+
+    @staticmethod
+    def _again(side: Side, used: set[int]) -> bool:
+        """Whether a curve's points were counted already."""
+        if side.curve in used:
+            return True
+        used.add(side.curve)
+        return False
+
+
+TILE_BITS = 14
+
+
+def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
+    """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
+    rows = TILE_BITS // 2
+    narrow = min(shape)
+    while rows > 1 and narrow <= 1 << rows:
+        rows -= 1
+    if narrow > 1 << (TILE_BITS // 2):
+        return TILE_BITS // 2, TILE_BITS // 2
+    return (rows, TILE_BITS - rows) if shape[0] <= shape[1] else (TILE_BITS - rows, rows)
+
+
+def _lines(array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """First row, last row, first column, last column; views."""
+    return array[0], array[-1], array[:, 0], array[:, -1]
+
+
+def _filled(block: Block) -> Arrays:
+    """Points and attributes with an axis of channels, finite everywhere."""
+    arrays = []
+    for number, values in enumerate((block.points, *block.attributes.values())):
+        array = values if values.ndim == 3 else values[..., np.newaxis]
+        mask = block.mask
+        if array.dtype.kind == "f" and (number or array.shape[2] > 3):
+            # An attribute may have no value where the point has a place; exactness gives it back.
+            finite = np.isfinite(array).all(axis=2)
+            mask = finite if mask is None else mask & finite
+        if mask is not None and not mask.all():
+            from .fill import fill_holes  # only where there is one
+
+            array = fill_holes(array, mask, block.closed)
+        arrays.append(np.ascontiguousarray(array))
+    return arrays
+
+
+def _valid_points(blocks: tuple[Block, ...], arrays: Arrays) -> NDArray[Any]:
+    """The valid points, shape (row, column) or (row, column, channel)."""
+    flat = blocks[0].points.ndim == 2
+    if len(blocks) == 1 and blocks[0].mask is None:
+        points = arrays[0]
+    else:
+        chosen = [
+            array.reshape(-1, array.shape[2]) if block.mask is None else array[block.mask]
+            for block, array in zip(blocks, arrays, strict=True)
+        ]
+        points = np.concatenate(chosen)[:, np.newaxis]
+    return points[..., 0] if flat else points
+
+
+def _may_share(block: Block, points: NDArray[Any]) -> bool:
+    """Whether one block might share a side with itself, or have a pole: whether any two of its corners agree."""
+    if min(block.shape) < 2:
+        return False
+    corners = [points[i, j, :3].tobytes() for i in (0, -1) for j in (0, -1)]
+    ends = [line[0, :3].tobytes() == line[-1, :3].tobytes() for line in _lines(points)]
+    return len(set(corners)) < 4 or any(ends) or block.mask is not None
