@@ -238,7 +238,7 @@ def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
         formats.read(tmp_path / "a.npz", band=1)
     with pytest.raises(OptionError, match="expected max_vertices as a whole number, got '9'"):
         formats.read(tmp_path / "a.npy", max_vertices="9")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="expected one file, got 3"):
+    with pytest.raises(OptionError, match="expected one file of format npy, got 3"):
         formats.read(tmp_path / "a.npy", tmp_path / "b.npy", tmp_path / "c.npy")
 
 
