@@ -17,22 +17,23 @@ from numpy.typing import NDArray
 __all__ = ["AxisStep", "axis_lengths", "axis_step", "coarse_length", "extension"]
 
 
-def coarse_length(length: int, closed: bool) -> int:
+def coarse_length(length: int, closed: bool, stops: bool = False) -> int:
     """Samples that remain of an axis after one step; the same number where the axis has stopped.
 
     An open axis is coarsened while it has at least 3 samples, a closed one while it has at least 5. An open axis of
     even length keeps its last sample as a node of its own beyond a gap; a closed axis of odd length has the gap at
-    the seam.
+    the seam. With ``stops`` an open axis of even length has stopped: an axis without a direction has no end that a gap
+    could lie at.
     """
-    if length < (5 if closed else 3):
+    if length < (5 if closed else 3) or (stops and not closed and length % 2 == 0):
         return length
     return (length + 1) // 2 if closed or length % 2 else length // 2 + 1
 
 
-def axis_lengths(length: int, closed: bool) -> list[int]:
+def axis_lengths(length: int, closed: bool, stops: bool = False) -> list[int]:
     """Lengths of an axis at every level until it stops, coarsest first, the axis itself last."""
     lengths = [length]
-    while (coarser := coarse_length(lengths[-1], closed)) != lengths[-1]:
+    while (coarser := coarse_length(lengths[-1], closed, stops)) != lengths[-1]:
         lengths.append(coarser)
     return lengths[::-1]
 
@@ -112,13 +113,15 @@ class AxisStep:
 
 
 @lru_cache(maxsize=4096)
-def axis_step(length: int, closed: bool = False, clamped: tuple[bool, bool] = (False, False)) -> AxisStep:
+def axis_step(
+    length: int, closed: bool = False, clamped: tuple[bool, bool] = (False, False), stops: bool = False
+) -> AxisStep:
     """The step from an axis of this length to the next coarser one.
 
     ``clamped`` says of either end of an open axis whether its node is kept as it is: a side shared with another block,
-    or a pole.
+    or a pole. For ``stops`` see `coarse_length`.
     """
-    coarse = coarse_length(length, closed)
+    coarse = coarse_length(length, closed, stops)
     midpoints = length - coarse
     wraps = closed and length % 2 == 0 and midpoints > 0
     run = midpoints if wraps else midpoints + 1 if midpoints else coarse

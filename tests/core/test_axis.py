@@ -30,6 +30,17 @@ def test_an_axis_stops_at_two_nodes_or_closed_at_three_or_four() -> None:
     assert len(axis_lengths(4097, False)) == 13
 
 
+def test_an_axis_that_stops_is_coarsened_while_its_length_is_odd() -> None:
+    assert axis_lengths(13, False, stops=True) == [4, 7, 13]
+    assert axis_lengths(12, False, stops=True) == [12]
+    assert axis_step(12, False, (True, True), stops=True) == AxisStep(12, 12, 0, 12, False, True, True)
+    for length in range(1, 100):
+        lengths = axis_lengths(length, False)
+        kept = [n for n in lengths if all(m % 2 for m in lengths if m > n)]
+        assert axis_lengths(length, False, stops=True) == kept
+        assert axis_lengths(length, True, stops=True) == axis_lengths(length, True)
+
+
 def test_nodes_and_midpoints_of_a_step_account_for_every_sample() -> None:
     for length, closed in itertools.product(range(1, 60), (False, True)):
         step = axis_step(length, closed)

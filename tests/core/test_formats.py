@@ -238,7 +238,7 @@ def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
         formats.read(tmp_path / "a.npz", band=1)
     with pytest.raises(OptionError, match="expected max_vertices as a whole number, got '9'"):
         formats.read(tmp_path / "a.npy", max_vertices="9")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="expected one file, got 3"):
+    with pytest.raises(OptionError, match="expected one file of format npy, got 3"):
         formats.read(tmp_path / "a.npy", tmp_path / "b.npy", tmp_path / "c.npy")
 
 
@@ -303,7 +303,11 @@ def test_importing_formats_loads_no_library_of_a_format() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_values_that_are_no_surface_are_refused_with_the_name_of_the_file(tmp_path: Path) -> None:
+def test_values_that_are_not_finite_are_holes(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[1.0, np.nan], [np.inf, 2.0]]))
-    with pytest.raises(InputError, match=r"a\.npy: expected finite values, got NaN or infinity at 2 of 4 points"):
-        formats.read(tmp_path / "a.npy")
+    mask = formats.read(tmp_path / "a.npy").mask
+    assert mask is not None
+    assert mask.tolist() == [[True, False], [False, True]]
+    np.save(tmp_path / "b.npy", np.full((2, 3), np.nan))
+    with pytest.raises(InputError, match=r"b\.npy: expected at least one valid point, got 2 x 3 holes"):
+        formats.read(tmp_path / "b.npy")

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..errors import FormatError, InputError, OptionError
-from ..surface import Surface
-from . import geotiff, npy, npz, obj, ply
+from ..seams import restore
+from ..surface import Closed, Surface
+from . import geotiff, npy, npz, obj, plot3d, ply
 from .source import DEFAULT_MAX_VERTICES, Source
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
@@ -47,6 +48,11 @@ class Format:
         Options for reading, each with a line of help.
     more : str
         What further files of the same surface are, in words; empty where it takes one file.
+    named : callable or None
+        What the name of a file says: options (such as the place of an .hgt) that hold unless they are given. Whoever
+        tells surfaces apart by their bytes and options counts these as options.
+    media_type : str
+        For answers over HTTP.
     """
 
     name: str
@@ -56,7 +62,17 @@ class Format:
     write: Callable[[Surface, BinaryIO], None] | None = None
     options: Mapping[str, str] = field(default_factory=dict)
     more: str = ""
+    named: Callable[[str], Mapping[str, str]] | None = None
+    media_type: str = "application/octet-stream"
 
+
+_CLOSED: Mapping[str, Closed | None] = {
+    "auto": None,
+    "none": (False, False),
+    "rows": (True, False),
+    "cols": (False, True),
+    "both": (True, True),
+}
 
 _FORMATS = (
     Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
@@ -64,6 +80,7 @@ _FORMATS = (
     Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options={"band": "number of the band, from 1"}),
     Format("ply", (".ply",), ply.sniff, write=ply.write),
     Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
+    Format("plot3d", plot3d.SUFFIXES, plot3d.sniff, plot3d.read, options=plot3d.READ_OPTIONS, more=plot3d.MORE),
 )
 
 
@@ -98,6 +115,7 @@ def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Forma
 def read(
     path: str | os.PathLike[str],
     *more: str | os.PathLike[str],
+    closed: str | Closed = "auto",
     max_vertices: int = DEFAULT_MAX_VERTICES,
     filename: str | None = None,
     **options: Any,
@@ -110,6 +128,9 @@ def read(
         A file of one of the `formats`.
     *more : str or path-like
         Further files of the same surface, for the formats that take them (`Format.more`).
+    closed : {"auto", "none", "rows", "cols", "both"} or (bool, bool)
+        Which axes wrap. "auto": those of which the format says so, or whose last row or column repeats the first bit
+        for bit, which is then merged with it (``seam`` in the metadata) and written again by `write`.
     max_vertices : int
         Larger surfaces are refused before memory is taken for them.
     filename : str, optional
@@ -135,7 +156,7 @@ def read(
     OptionError
         When an option does not exist or does not take its value.
     InputError
-        When the values cannot be a surface: NaN, infinities, nodata.
+        When the values cannot be a surface: not one of them is valid.
     OSError
         When the file cannot be opened.
     """
@@ -143,6 +164,9 @@ def read(
     label = filename or os.fspath(path)
     name = Path(label)
     try:
+        if isinstance(closed, str) and closed not in _CLOSED:
+            raise OptionError(f"expected closed as one of {', '.join(_CLOSED)}, got {closed!r}")
+        chosen = _CLOSED[closed] if isinstance(closed, str) else closed
         if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
         format_ = _sniff(path, name.suffix.lower())
@@ -151,12 +175,25 @@ def read(
         if more and not format_.more:
             raise OptionError(f"expected one file of format {format_.name}, got {1 + len(more)}")
         _check_options(format_, options)
+        if format_.named:
+            options = {**format_.named(name.name), **options}
         others = tuple(map(Path, more))
         for other in others:
             _check_regular(other)
-        return format_.read(Source(path, name.stem, path.stat().st_size, max_vertices, options, others))
+        size = path.stat().st_size
+        surface = format_.read(Source(path, name.stem, size, max_vertices, options, others, chosen))
+        return surface if chosen is None else _closed(surface, chosen)
     except InputError as error:
         raise _named(error, label) from None
+
+
+def _closed(surface: Surface, closed: Closed) -> Surface:
+    if len(surface.blocks) > 1:
+        raise OptionError(f"expected closed=auto for a surface of several blocks, got {len(surface.blocks)} blocks")
+    if surface.closed == tuple(closed):
+        return surface
+    attributes = surface.attributes
+    return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=surface.metadata)
 
 
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
@@ -216,7 +253,7 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     writers = {it.name: it.write for it in _FORMATS if it.write}
     if format_name not in writers:
         raise OptionError(f"expected a format that is written ({', '.join(writers)}), got {format_name!r}")
-    writers[format_name](surface, file)
+    writers[format_name](restore(surface), file)
 
 
 def _sniff(path: Path, suffix: str) -> Format:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FormatError, OptionError, TooLargeError
+from ..surface import Closed
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Source", "number"]
 
@@ -57,6 +58,8 @@ class Source:
         Options of the format, checked to exist; their values are not checked.
     more : tuple of Path
         Further files of the same surface, existing regular ones, for the formats that take them.
+    closed : (bool, bool) or None
+        Which axes wrap, where that was said; None leaves it to the reader.
     """
 
     path: Path
@@ -65,6 +68,7 @@ class Source:
     max_vertices: int
     options: Mapping[str, Any]
     more: tuple[Path, ...] = ()
+    closed: Closed | None = None
 
     def check_vertices(self, count: int, shape: str) -> None:
         """Refuse a surface of too many vertices; `shape` says in words where the count comes from."""

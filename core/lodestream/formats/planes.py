@@ -1,0 +1,116 @@
+"""Index planes of volumes: which one a reader takes, and how it is laid out in rows and columns."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatWarning, OptionError
+from .source import Source
+
+__all__ = ["HELP", "Cut", "cuts"]
+
+#: Help for the option, for the table of formats.
+HELP = "index plane of a volume, as axis and index: i0, j3, k-1 (the last)"
+
+_AXES = "ijk"
+_DEFAULT = "i0"
+
+#: Points along i, j and k.
+Dims = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """The surface that is taken of one block.
+
+    Attributes
+    ----------
+    dims : (int, int, int)
+        Points of the block along i, j and k.
+    key : tuple
+        Index of the surface in an array of shape (k, j, i, ...).
+    shape : (int, int)
+        Rows and columns of the surface: of the axes that are left, the earlier runs along the rows; a curve is (N, 1).
+    """
+
+    dims: Dims
+    key: tuple[int | slice, int | slice, int | slice]
+    shape: tuple[int, int]
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Take the surface out of the block's values, an array of shape (k * j * i, ...) with i running fastest."""
+        i, j, k = self.dims
+        volume = values.reshape(k, j, i, *values.shape[1:])
+        return np.ascontiguousarray(volume[self.key].reshape(*self.shape, *values.shape[1:]))
+
+
+def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[Cut], dict[str, Any]]:
+    """Decide which surface is taken of each block, by the option ``plane``.
+
+    An axis of one point is dropped. Of a volume the plane i0 is taken where the option is not given, with a warning.
+
+    Returns
+    -------
+    cuts : list of Cut
+    metadata : dict
+        ``plane`` (as in the option) and ``volumes`` (points along i, j and k of each block); empty without a volume.
+
+    Raises
+    ------
+    OptionError
+        When the option is no plane, lies outside a block, or there is no volume to take a plane of.
+    TooLargeError
+        When the surfaces have more points than allowed.
+    """
+    axis, index = _parse(source.options.get("plane"))
+    volumes = [dims for dims in blocks if min(dims) > 1]
+    if source.options.get("plane") is not None and not volumes and any(dims[axis] > 1 for dims in blocks):
+        raise OptionError(f"expected no plane= for a surface, which {_words(blocks[0])} points are already")
+    if source.options.get("plane") is None and volumes:
+        warnings.warn(
+            f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose another with plane=, like j3",
+            FormatWarning,
+            stacklevel=2,
+        )
+    result = [_cut(dims, axis, index) for dims in blocks]
+    points = sum(cut.shape[0] * cut.shape[1] for cut in result)
+    largest = max(result, key=lambda cut: cut.shape[0] * cut.shape[1])
+    words = f"{len(result)} blocks" if len(result) > 1 else f"{largest.shape[0]} x {largest.shape[1]}"
+    source.check_vertices(points, f"{points:,} ({words})")
+    return result, {"plane": f"{_AXES[axis]}{index}", "volumes": [list(dims) for dims in blocks]} if volumes else {}
+
+
+def _parse(value: Any) -> tuple[int, int]:
+    match = re.fullmatch(r"([ijk])(-?\d{1,9})", str(_DEFAULT if value is None else value).strip().lower())
+    if match is None:
+        raise OptionError(f"expected plane= an axis and an index, such as i0, j3 or k-1, got {str(value)!r}")
+    return _AXES.index(match[1]), int(match[2])
+
+
+def _cut(dims: Dims, axis: int, index: int) -> Cut:
+    key: list[int | slice] = [slice(None)] * 3
+    if min(dims) > 1:
+        if not -dims[axis] <= index < dims[axis]:
+            raise OptionError(
+                f"expected plane= {_AXES[axis]} from {-dims[axis]} to {dims[axis] - 1} for a volume of {_words(dims)} "
+                f"points, got {index}"
+            )
+        key[2 - axis] = index
+        left = [length for number, length in enumerate(dims) if number != axis]
+    else:
+        left = [length for length in dims if length > 1]
+        while len(left) < 2:
+            left.insert(0, 1)  # a curve runs down the rows
+        return Cut(dims, (slice(None), slice(None), slice(None)), (left[1], left[0]))
+    return Cut(dims, (key[0], key[1], key[2]), (left[1], left[0]))
+
+
+def _words(dims: Dims) -> str:
+    return " x ".join(map(str, dims))

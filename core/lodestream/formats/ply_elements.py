@@ -1,0 +1,429 @@
+"""Elements of a PLY file, text or binary: a header that says what follows, and the tables that follow.
+
+The reader is our own because one library keeps a list property as Python objects, each a hundred times its bytes, and
+others know meshes only and drop what belongs to a grid.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from .source import number
+
+__all__ = ["Element", "Header", "Lists", "Property", "Table", "read_elements", "read_header"]
+
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_HEAD = 1 << 20
+_END = re.compile(rb"(?:^|\n|\r)end_header[ \t]*(?:\r\n|\n|\r)")
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """A column of a table; `count` is the type of the lengths where it holds lists, else empty."""
+
+    name: str
+    dtype: str
+    count: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """A table: its name, how many rows it has, its columns."""
+
+    name: str
+    rows: int
+    properties: tuple[Property, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What stands before the tables.
+
+    Attributes
+    ----------
+    order : str
+        ``<`` or ``>``; empty for text.
+    elements : tuple of Element
+        In the order of the file.
+    info : tuple of str
+        The lines of ``obj_info`` and ``comment``, without these words.
+    end : int
+        Bytes of the header.
+    lines : int
+        Lines of the header.
+    """
+
+    order: str
+    elements: tuple[Element, ...]
+    info: tuple[str, ...]
+    end: int
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lists:
+    """A column of lists.
+
+    Attributes
+    ----------
+    counts : int64 array of shape (rows,)
+    values : array of shape (sum of counts,)
+        The lists one after another.
+    """
+
+    counts: NDArray[np.int64]
+    values: NDArray[Any]
+
+
+#: The columns of an element by name.
+Table = Mapping[str, "NDArray[Any] | Lists"]
+
+
+def read_header(path: Path) -> Header:
+    """Read the header of a PLY file and check what it promises against the size of the file.
+
+    Raises
+    ------
+    FormatError
+        When it is no header of PLY 1.0, or its elements cannot fit into the file.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    end = _END.search(head)
+    if end is None:
+        raise FormatError(f"expected a PLY header that ends with end_header within {number(_HEAD)} bytes, got none")
+    lines = head[: end.end()].decode("latin-1").splitlines()
+    order: str | None = None
+    elements: list[Element] = []
+    info: list[str] = []
+    for place, line in enumerate(lines, 1):
+        words = line.split()
+        match words:
+            case ["ply"] | ["end_header"] | []:
+                pass
+            case ["format", name, "1.0"] if name in _FORMATS and order is None:
+                order = _FORMATS[name]
+            case ["comment" | "obj_info", *_]:
+                info.append(line.split(None, 1)[1] if len(words) > 1 else "")
+            case ["element", name, rows] if rows.isdecimal() and len(rows) < 20:
+                elements.append(Element(name, int(rows), ()))
+            case ["property", "list", count, dtype, name] if {count, dtype} <= _TYPES.keys() and elements:
+                if _TYPES[count][0] == "f":
+                    raise FormatError(f"line {place}: expected a list whose length is an integer, got {line.strip()!r}")
+                elements[-1] = _with(elements[-1], Property(name, _TYPES[dtype], _TYPES[count]), place)
+            case ["property", dtype, name] if dtype in _TYPES and elements:
+                elements[-1] = _with(elements[-1], Property(name, _TYPES[dtype]), place)
+            case _:
+                raise FormatError(f"line {place}: expected a line of a PLY 1.0 header, got {line.strip()[:80]!r}")
+    if order is None:
+        raise FormatError("expected a PLY header with a line of the format, got none")
+    header = Header(order, tuple(elements), tuple(info), end.end(), len(lines))
+    _check_size(header, path.stat().st_size)
+    return header
+
+
+def read_elements(path: Path, header: Header) -> dict[str, Table]:
+    """Read the tables of a PLY file, by the names of their elements.
+
+    Raises
+    ------
+    FormatError
+        When the file is cut short, something follows the tables, or text is no number.
+    """
+    return _read_text(path, header) if not header.order else _read_binary(path, header)
+
+
+def _with(element: Element, added: Property, line: int) -> Element:
+    if any(it.name == added.name for it in element.properties):
+        raise FormatError(f"line {line}: expected properties of different names, got {added.name!r} twice")
+    return Element(element.name, element.rows, (*element.properties, added))
+
+
+def _check_size(header: Header, size: int) -> None:
+    follows = size - header.end
+    promised = 0
+    for element in header.elements:
+        each = [np.dtype(it.count or it.dtype).itemsize if header.order else 2 for it in element.properties]
+        promised += element.rows * sum(each)
+        if promised > follows + 1:  # the last number of a text may lack its end of line
+            raise FormatError(
+                f"expected at least {number(promised)} bytes after the header for {number(element.rows)} rows of "
+                f"{element.name}, got {number(follows)}"
+            )
+    if len({element.name for element in header.elements}) < len(header.elements):
+        raise FormatError("expected elements of different names in a PLY header, got one twice")
+
+
+def _read_text(path: Path, header: Header) -> dict[str, Table]:
+    with path.open("rb") as file:
+        file.seek(header.end)
+        body = file.read()
+    if b"\r" in body:
+        body = body.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    rows = body.split(b"\n")
+    tables: dict[str, Table] = {}
+    start, line = 0, header.lines + 1
+    for element in header.elements:
+        values = _Words(rows, start, element, line)
+        tables[element.name] = values.table()
+        start, line = start + element.rows, line + element.rows
+    rest = next((row for row in rows[start:] if row.strip()), None)
+    if rest is not None:
+        raise FormatError(f"line {line}: expected the end of the file after its elements, got {_shown(rest)}")
+    return tables
+
+
+class _Words:
+    """The rows of one element in text, each on a line of its own."""
+
+    def __init__(self, rows: list[bytes], start: int, element: Element, line: int) -> None:
+        self._rows, self._start, self._element, self._line = rows, start, element, line
+
+    def table(self) -> Table:
+        element = self._element
+        if self._start + element.rows > len(self._rows):
+            got = len(self._rows) - self._start
+            raise FormatError(f"expected {number(element.rows)} lines of {element.name}, got {number(got)}")
+        if not any(it.count for it in element.properties):
+            return self._plain()
+        return self._lists()
+
+    def _plain(self) -> Table:
+        properties = self._element.properties
+        columns = [np.empty(self._element.rows, it.dtype) for it in properties]
+        for start, values in self._chunks(len(properties)):
+            for column, numbers, it in zip(columns, values.T, properties, strict=True):
+                column[start : start + len(numbers)] = self._fitting(numbers, it, start)
+        return {it.name: column for it, column in zip(properties, columns, strict=True)}
+
+    def _chunks(self, width: int) -> Iterator[tuple[int, NDArray[np.float64]]]:
+        """Give the numbers of some rows at a time, all of one length."""
+        for start in range(0, self._element.rows, _CHUNK):
+            stop = min(start + _CHUNK, self._element.rows)
+            words = [row.split() for row in self._rows[self._start + start : self._start + stop]]
+            for offset, row in enumerate(words):
+                if len(row) != width:
+                    raise self._refusal(start + offset, f"{width} numbers")
+            yield start, self._floats(words, start).reshape(-1, width)
+
+    def _floats(self, words: list[list[bytes]], start: int) -> NDArray[np.float64]:
+        try:
+            return np.array([float(word) for row in words for word in row], np.float64)
+        except ValueError:
+            for offset, row in enumerate(words):
+                try:
+                    list(map(float, row))
+                except ValueError:
+                    raise self._refusal(start + offset, "numbers") from None
+            raise
+
+    def _fitting(self, numbers: NDArray[np.float64], it: Property, start: int) -> NDArray[np.float64]:
+        """Check that numbers fit into an integer type."""
+        if np.dtype(it.dtype).kind == "f":
+            return numbers
+        limits = np.iinfo(it.dtype)
+        wrong = ~((numbers >= limits.min) & (numbers <= limits.max) & (numbers == np.trunc(numbers)))
+        if wrong.any():
+            raise self._refusal(
+                start + int(wrong.argmax()), f"an integer from {limits.min} to {limits.max} ({it.name})"
+            )
+        return numbers
+
+    def _lists(self) -> Table:
+        properties = self._element.properties
+        rows = [row.split() for row in self._rows[self._start : self._start + self._element.rows]]
+        scalars: dict[str, list[float]] = {it.name: [] for it in properties if not it.count}
+        counts: dict[str, list[int]] = {it.name: [] for it in properties if it.count}
+        lists: dict[str, list[float]] = {it.name: [] for it in properties if it.count}
+        for index, row in enumerate(rows):
+            place = 0
+            try:
+                for it in properties:
+                    if not it.count:
+                        scalars[it.name].append(float(row[place]))
+                        place += 1
+                        continue
+                    count = int(row[place])
+                    values = row[place + 1 : place + 1 + count]
+                    if count < 0 or len(values) != count:
+                        raise ValueError("a list of another length than it says")
+                    counts[it.name].append(count)
+                    lists[it.name].extend(map(float, values))
+                    place += 1 + count
+            except (ValueError, IndexError):
+                raise self._refusal(index, "lists after their lengths") from None
+            if place != len(row):
+                raise self._refusal(index, f"{place} numbers")
+        table: dict[str, NDArray[Any] | Lists] = {}
+        for it in properties:
+            if it.count:
+                table[it.name] = Lists(np.array(counts[it.name], np.int64), self._typed(lists[it.name], it))
+            else:
+                table[it.name] = self._typed(scalars[it.name], it)
+        return table
+
+    def _typed(self, numbers: list[float], it: Property) -> NDArray[Any]:
+        values = np.array(numbers, np.float64)
+        dtype = np.dtype(it.dtype)
+        if dtype.kind != "f" and values.size:
+            limits = np.iinfo(dtype)
+            if not (values.min() >= limits.min and values.max() <= limits.max and (values == np.trunc(values)).all()):
+                raise FormatError(
+                    f"expected {it.name} of {self._element.name} as integers from {limits.min} to {limits.max}, got "
+                    "others"
+                )
+        return values.astype(dtype)
+
+    def _refusal(self, row: int, expected: str) -> FormatError:
+        shown = _shown(self._rows[self._start + row])
+        return FormatError(f"line {self._line + row}: expected {expected} of {self._element.name}, got {shown}")
+
+
+def _read_binary(path: Path, header: Header) -> dict[str, Table]:
+    data = np.memmap(path, np.uint8, "r")
+    tables: dict[str, Table] = {}
+    place = header.end
+    for element in header.elements:
+        if not element.properties:
+            tables[element.name] = {}
+            continue
+        if not any(it.count for it in element.properties):
+            record = _record(element, header.order, {})
+            stop = place + element.rows * record.itemsize
+            if stop > len(data):
+                raise _short(element, element.rows, stop - len(data))
+            rows = data[place:stop].view(record)
+            tables[element.name] = {it.name: rows[it.name].astype(np.dtype(it.dtype)) for it in element.properties}
+        else:
+            tables[element.name], stop = _binary_lists(data, place, element, header.order)
+        place = stop
+    if place != len(data):
+        raise FormatError(
+            f"expected the end of the file after its elements, got {number(len(data) - place)} bytes more"
+        )
+    return tables
+
+
+def _record(element: Element, order: str, lengths: Mapping[str, int]) -> np.dtype[Any]:
+    """The type of a row, where all lists of a column have the same length."""
+    fields: list[Any] = []
+    for it in element.properties:
+        if it.count:
+            fields.append((f"count of {it.name}", order + it.count))
+            fields.append((it.name, order + it.dtype, (lengths[it.name],)))
+        else:
+            fields.append((it.name, order + it.dtype))
+    return np.dtype(fields)
+
+
+def _binary_lists(data: NDArray[np.uint8], place: int, element: Element, order: str) -> tuple[Table, int]:
+    uniform = _uniform_lists(data, place, element, order)
+    if uniform is not None:
+        return uniform
+    # One loop over bytes finds where each list lies; the values are then gathered at once.
+    content = data[place:].tobytes()
+    starts: dict[str, list[int]] = {it.name: [] for it in element.properties}
+    counts: dict[str, list[int]] = {it.name: [] for it in element.properties if it.count}
+    steps = [
+        (it, np.dtype(it.count).itemsize if it.count else 0, np.dtype(it.dtype).itemsize) for it in element.properties
+    ]
+    endian: Literal["little", "big"] = "little" if order == "<" else "big"
+    at = 0
+    for row in range(element.rows):
+        for it, head, item in steps:
+            count = 1
+            if head:
+                signed = it.count[0] == "i"
+                count = int.from_bytes(content[at : at + head], endian, signed=signed)
+                at += head
+                counts[it.name].append(count)
+            starts[it.name].append(at)
+            at += count * item
+            if count < 0 or at > len(content):
+                raise _short(element, row, max(at - len(content), 1))
+    raw = np.frombuffer(content, np.uint8)
+    table: dict[str, NDArray[Any] | Lists] = {}
+    for it, _, item in steps:
+        lengths = np.array(counts.get(it.name, [1] * element.rows), np.int64)
+        values = _gather(raw, np.array(starts[it.name], np.int64), lengths, order + it.dtype, item)
+        table[it.name] = Lists(lengths, values) if it.count else values
+    return table, place + at
+
+
+def _uniform_lists(data: NDArray[np.uint8], place: int, element: Element, order: str) -> tuple[Table, int] | None:
+    """Read lists that are all as long as the first, as those of a mesh of one kind of faces are."""
+    if not element.rows:
+        return None
+    lengths: dict[str, int] = {}
+    at = place
+    for it in element.properties:
+        if it.count:
+            head = np.dtype(order + it.count)
+            if at + head.itemsize > len(data):
+                return None
+            lengths[it.name] = int(data[at : at + head.itemsize].view(head)[0])
+            at += head.itemsize
+        at += np.dtype(it.dtype).itemsize * lengths.get(it.name, 1)
+        if min(lengths.values(), default=0) < 0 or at > len(data):
+            return None
+    record = _record(element, order, lengths)
+    stop = place + element.rows * record.itemsize
+    if stop > len(data):
+        return None
+    rows = data[place:stop].view(record)
+    if any((rows[f"count of {name}"] != length).any() for name, length in lengths.items()):
+        return None
+    table: dict[str, NDArray[Any] | Lists] = {}
+    for it in element.properties:
+        values = rows[it.name].astype(np.dtype(it.dtype)).reshape(-1)
+        table[it.name] = Lists(np.full(element.rows, lengths[it.name], np.int64), values) if it.count else values
+    return table, stop
+
+
+def _gather(
+    raw: NDArray[np.uint8], starts: NDArray[np.int64], counts: NDArray[np.int64], dtype: str, item: int
+) -> NDArray[Any]:
+    total = int(counts.sum())
+    before = np.cumsum(counts) - counts
+    inside = np.arange(total, dtype=np.int64) - np.repeat(before, counts)
+    places = np.repeat(starts, counts) + inside * item
+    bytes_ = raw[places[:, None] + np.arange(item)] if total else np.empty((0, item), np.uint8)
+    return np.ascontiguousarray(bytes_).reshape(-1).view(dtype).astype(np.dtype(dtype).newbyteorder("="))
+
+
+def _short(element: Element, row: int, missing: int) -> FormatError:
+    return FormatError(
+        f"expected {number(element.rows)} rows of {element.name}, got a file that is cut short at row {number(row)} by "
+        f"{number(missing)} bytes"
+    )
+
+
+def _shown(row: bytes) -> str:
+    return repr(row.strip()[:60].decode("ascii", "backslashreplace"))

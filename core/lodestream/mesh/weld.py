@@ -1,0 +1,337 @@
+"""The mesh of a surface: its blocks joined where they touch, poles as fans, holes left open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..surface import Block, Surface
+
+__all__ = ["SIDES", "Faces", "Weld", "face_map", "faces_of", "side_of", "weld"]
+
+#: With fewer points, the faces that join the ends of a closed axis would lie on those already there.
+_MIN_CLOSED = 3
+
+#: The sides of a block, as the metadata name them, and the points on each.
+SIDES: dict[str, tuple[slice | int, slice | int]] = {
+    "first_row": (0, slice(None)),
+    "last_row": (-1, slice(None)),
+    "first_column": (slice(None), 0),
+    "last_column": (slice(None), -1),
+}
+
+
+class Faces(NamedTuple):
+    """A welded mesh, as `faces_of` gives it.
+
+    Attributes
+    ----------
+    vertices : array of shape (V, 3)
+        x, y, z. Heights are drawn over x and y, planar points get z = 0. The surface's type; float64 where the
+        coordinates of heights are not whole.
+    quads : int64 array of shape (Q, 4)
+        0-based vertices of each quad, going round it.
+    triangles : int64 array of shape (T, 3)
+        0-based vertices of each triangle, going round it.
+    attributes : dict of str to arrays of shape (V,) or (V, K)
+        The blocks' attributes; channels of the points beyond the third are ``attribute_0`` and so on.
+    """
+
+    vertices: NDArray[Any]
+    quads: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    attributes: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Weld:
+    """Which points of a surface are the vertices of its mesh, and the faces over them.
+
+    Attributes
+    ----------
+    source : int64 array of shape (V,)
+        For each vertex, the point that it is: its index among the points of all blocks, one block after another, each
+        in row order. Increasing.
+    quads : int64 array of shape (Q, 4)
+        0-based vertices of each quad, going round it.
+    triangles : int64 array of shape (T, 3)
+        0-based vertices of each triangle, going round it.
+    joined : int64 array of shape (V,)
+        For each vertex, the first vertex at the same place that is the same vertex but for its attributes; itself where
+        there is no other. A format whose faces name places and attributes separately, like OBJ, writes the places of
+        these alone.
+    """
+
+    source: NDArray[np.int64]
+    quads: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    joined: NDArray[np.int64]
+
+
+def faces_of(surface: Surface) -> Faces:
+    """Make the mesh of a surface, for the formats whose vertices carry their attributes with them.
+
+    Blocks are welded where vertices on their sides have the same coordinates and attributes, closed axes are joined by
+    faces, a collapsed side is one vertex with a fan of triangles, and cells at holes are left out; see
+    `lodestream.mesh` for what the metadata say about it. Every valid point is a vertex, with a face or without.
+
+    Raises
+    ------
+    InputError
+        When the metadata's ``faces``, ``poles`` or ``geotransform`` are not of the form that they should have.
+    """
+    welded = weld(surface)
+    vertices = np.concatenate([_coordinates(block, surface.metadata) for block in surface.blocks])[welded.source]
+    attributes: dict[str, NDArray[Any]] = {}
+    first = surface.blocks[0]
+    for channel in range(3, first.points.shape[2] if first.points.ndim == 3 else 0):
+        values = [block.points[:, :, channel].reshape(-1) for block in surface.blocks]
+        attributes[f"attribute_{channel - 3}"] = np.concatenate(values)[welded.source]
+    for name, array in first.attributes.items():
+        values = [block.attributes[name].reshape(-1, *array.shape[2:]) for block in surface.blocks]
+        attributes[name] = np.concatenate(values)[welded.source]
+    return Faces(vertices, welded.quads, welded.triangles, attributes)
+
+
+def weld(surface: Surface) -> Weld:
+    """Find the vertices and faces of a surface's mesh; what `faces_of` makes it of.
+
+    Raises
+    ------
+    InputError
+        When the metadata's ``faces`` or ``poles`` are not of the form that they should have.
+    """
+    blocks = surface.blocks
+    maps = [face_map(surface.metadata, number, len(blocks)) for number in range(len(blocks))]
+    starts = np.cumsum([0, *(block.points.shape[0] * block.points.shape[1] for block in blocks)])
+    points = [
+        np.arange(start, start + block.shape[0] * block.shape[1]).reshape(block.shape)
+        for start, block in zip(starts.tolist(), blocks, strict=False)
+    ]
+    poles = _poles(surface)
+    joined = np.arange(starts[-1])
+    _join_sides(blocks, points, maps, joined)
+    for number, side, _ in poles:
+        if not _joins(maps[number], len(blocks)):
+            row = points[number][SIDES[side]]
+            joined[row] = joined[row].min()
+    vertex = _same_vertices(blocks, joined)
+    quads, triangles = [], []
+    for number, block in enumerate(blocks):
+        degenerate = any(pole == number and kind == "degenerate" for pole, _, kind in poles)
+        block_quads, block_triangles = _faces(block, points[number], joined, maps[number], degenerate)
+        quads.append(block_quads)
+        triangles.append(block_triangles)
+    return _compressed(blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles))
+
+
+def face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[str, Any]:
+    """What the metadata's ``faces`` say about a block of so many; empty where they say nothing.
+
+    Raises
+    ------
+    InputError
+        When they are not of the form that `lodestream.mesh` describes.
+    """
+    faces = metadata.get("faces", {})
+    if isinstance(faces, list | tuple) and len(faces) == blocks:
+        faces = faces[block]
+    if not isinstance(faces, Mapping) or faces.get("diagonal") not in (None, "main", "anti"):
+        raise InputError(f"expected a map in the metadata's faces, or one for each of {blocks} blocks, got {faces!r}")
+    return faces
+
+
+def side_of(array: NDArray[Any], side: str) -> NDArray[Any]:
+    """The values on a side of a block."""
+    result: NDArray[Any] = array[SIDES[side]]
+    return result
+
+
+def _poles(surface: Surface) -> list[tuple[int, str, str]]:
+    """Block, side and kind of the poles that are one vertex."""
+    result = []
+    entries = surface.metadata.get("poles", [])
+    try:
+        for entry in entries:
+            number, side, kind = int(entry["block"]), str(entry["side"]), str(entry["kind"])
+            if not 0 <= number < len(surface.blocks) or side not in SIDES:
+                raise KeyError(side)
+            if kind in ("fan", "degenerate"):
+                result.append((number, side, kind))
+    except (TypeError, KeyError, ValueError):
+        raise InputError(f"expected poles with block, side and kind in the metadata, got {entries!r}") from None
+    return result
+
+
+def _joins(faces: Mapping[str, Any], blocks: int) -> bool:
+    return bool(faces.get("joined", blocks > 1))
+
+
+def _join_sides(
+    blocks: tuple[Block, ...],
+    points: list[NDArray[np.int64]],
+    maps: list[Mapping[str, Any]],
+    joined: NDArray[np.int64],
+) -> None:
+    """Let points of open sides at the same place, in blocks of the same part, stand for the first of them."""
+    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[Any]]]] = {}
+    for block, index, faces in zip(blocks, points, maps, strict=True):
+        if not _joins(faces, len(blocks)) or block.points.ndim != 3:
+            continue
+        border = np.zeros(block.shape, np.bool_)
+        for side, place in SIDES.items():
+            if not block.closed["column" in side]:
+                border[place] = True
+        if block.mask is not None:
+            border &= block.mask
+        parts.setdefault(int(faces.get("part", 0)), []).append((index[border], block.points[border][:, :3]))
+    for sides in parts.values():
+        index = np.concatenate([side for side, _ in sides])
+        joined[index] = index[_first_equal([np.concatenate([places for _, places in sides])])]
+
+
+def _same_vertices(blocks: tuple[Block, ...], joined: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each point, the first of those that it is joined with that has the same attributes."""
+    vertex = np.arange(len(joined))
+    together = np.flatnonzero(joined != vertex)
+    if not together.size:
+        return vertex
+    together = np.union1d(together, joined[together])
+    start, keys = 0, []
+    for block in blocks:
+        count = block.points.shape[0] * block.points.shape[1]
+        inside = together[(together >= start) & (together < start + count)] - start
+        arrays = [block.points, *block.attributes.values()]
+        keys.append([array.reshape(count, -1)[inside] for array in arrays])
+        start += count
+    columns = [np.concatenate(column) for column in zip(*keys, strict=True)]
+    vertex[together] = together[_first_equal([joined[together], *columns])]
+    return vertex
+
+
+def _first_equal(columns: list[NDArray[Any]]) -> NDArray[np.int64]:
+    """For each row of arrays side by side, the first row that is equal to it, bit for bit but for the sign of zero."""
+    rows = [
+        np.ascontiguousarray(column + 0 if column.dtype.kind == "f" else column)
+        .reshape(len(column), -1)
+        .view(np.uint8)
+        .reshape(len(column), -1)
+        for column in columns
+    ]
+    packed = np.concatenate(rows, axis=1)
+    keys = packed.view(np.dtype((np.void, packed.shape[1]))).reshape(-1)
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return first[inverse.reshape(-1)]
+
+
+def _faces(
+    block: Block,
+    points: NDArray[np.int64],
+    joined: NDArray[np.int64],
+    faces: Mapping[str, Any],
+    degenerate: bool,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Quads and triangles of a block in the order of its cells, over the points of the surface."""
+    rows, width = block.shape
+    down = rows if block.closed[0] and rows >= _MIN_CLOSED else rows - 1
+    across = width if block.closed[1] and width >= _MIN_CLOSED else width - 1
+    r, c = np.arange(down)[:, None], np.arange(across)[None, :]
+    below, right = (r + 1) % rows, (c + 1) % width
+    corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
+    corners = corners.reshape(-1, 4)
+    corners = corners[_kept(block, faces, corners - points[0, 0])]
+    ends = joined[corners]
+    collapsed = (ends == np.roll(ends, -1, axis=1)).any(axis=1)
+    quads, fans = corners[~collapsed], np.empty((0, 3), np.int64)
+    if collapsed.any():
+        fans, folded = _fans(corners[collapsed], ends[collapsed])
+        if degenerate:
+            quads, fans = np.concatenate([quads, folded]), fans[:0]
+    diagonal = faces.get("diagonal")
+    if diagonal is not None:
+        halves = ((0, 1, 2), (0, 2, 3)) if diagonal == "main" else ((0, 1, 3), (1, 2, 3))
+        cut = np.stack([quads[:, half] for half in halves], axis=1).reshape(-1, 3)
+        quads, fans = quads[:0], np.concatenate([cut, fans])
+    if faces.get("reversed"):
+        quads, fans = quads[:, (0, 3, 2, 1)], fans[:, (0, 2, 1)]
+    return quads, fans
+
+
+def _kept(block: Block, faces: Mapping[str, Any], corners: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which cells have a face; `corners` are numbers of points of the block, the first of a cell at (r, c)."""
+    kept: NDArray[np.bool_] = np.ones(len(corners), np.bool_)
+    if block.mask is not None:
+        kept &= block.mask.reshape(-1)[corners].all(axis=1)
+    left_out = faces.get("left_out")
+    if left_out is not None and tuple(left_out["shape"]) == block.shape:
+        kept &= ~np.isin(corners[:, 0], np.asarray(left_out["cells"], np.int64))
+    return kept
+
+
+def _fans(corners: NDArray[np.int64], ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cells with a collapsed edge, as triangles and as quads that name a vertex twice.
+
+    Of the two ends of such an edge, the one in the cell's own row and column stays. Cells that collapse to a line or a
+    point have no face.
+    """
+    gone = np.zeros(corners.shape, np.bool_)
+    folded = corners.copy()
+    for stays, goes in ((0, 1), (0, 3), (1, 2), (3, 2)):
+        equal = ends[:, stays] == ends[:, goes]
+        gone[:, goes] |= equal
+        folded[equal, goes] = folded[equal, stays]
+    single = (gone.sum(axis=1) == 1) & (ends[:, 0] != ends[:, 2]) & (ends[:, 1] != ends[:, 3])
+    return corners[single][~gone[single]].reshape(-1, 3), folded[single]
+
+
+def _compressed(
+    blocks: tuple[Block, ...],
+    vertex: NDArray[np.int64],
+    joined: NDArray[np.int64],
+    quads: NDArray[np.int64],
+    triangles: NDArray[np.int64],
+) -> Weld:
+    """Number the vertices without gaps: those in faces, and the other valid points that stand for themselves."""
+    quads, triangles = vertex[quads], vertex[triangles]
+    used: NDArray[np.bool_] = np.equal(joined, np.arange(len(joined)))
+    start = 0
+    for block in blocks:
+        count = block.points.shape[0] * block.points.shape[1]
+        if block.mask is not None:
+            used[start : start + count] &= block.mask.reshape(-1)
+        start += count
+    used[quads.reshape(-1)] = True
+    used[triangles.reshape(-1)] = True
+    source = np.flatnonzero(used)
+    if len(source) == len(used):
+        return Weld(source, quads, triangles, joined)
+    numbers = np.cumsum(used) - 1
+    return Weld(source, numbers[quads], numbers[triangles], numbers[joined[source]])
+
+
+def _coordinates(block: Block, metadata: Mapping[str, Any]) -> NDArray[Any]:
+    """x, y and z of the points in row order."""
+    points = block.points
+    rows, width = block.shape
+    if points.ndim == 3:
+        places = points.reshape(rows * width, -1)[:, :3]
+        if places.shape[1] == 3:
+            return places
+        return np.concatenate([places, np.zeros((len(places), 1), places.dtype)], axis=1)
+    row, column = (index.reshape(-1) for index in np.indices((rows, width)))
+    x: NDArray[Any] = column
+    y: NDArray[Any] = row
+    transform = metadata.get("geotransform")
+    if transform is not None:
+        try:
+            x0, x_column, x_row, y0, y_column, y_row = map(float, transform)
+        except (TypeError, ValueError):
+            raise InputError(f"expected a geotransform of six numbers in the metadata, got {transform!r}") from None
+        x = x0 + (column + 0.5) * x_column + (row + 0.5) * x_row
+        y = y0 + (column + 0.5) * y_column + (row + 0.5) * y_row
+    return np.stack([x, y, points.reshape(-1)], axis=-1)
