@@ -35,16 +35,16 @@ class Channel:
     @classmethod
     def of(cls, plane: NDArray[Any], step: float) -> Channel:
         """Quantise and transform a channel."""
-        layout = Layout((plane.shape[0], plane.shape[1]), (False, False), TILE)
-        work = transform.allocate(layout.shape)
+        layout = Layout.single((plane.shape[0], plane.shape[1]), (False, False), TILE)
+        work = transform.allocate(layout.grids[0].shape)
         centre = (float(plane.min()) + float(plane.max())) / 2
         work[...] = np.rint((plane.astype(np.float64) - centre) / step)
-        transform.forward(work, layout)
+        transform.forward([work], layout)
         bands = [[work[slice(*band.rows), slice(*band.columns)] for band in tile.bands] for tile in layout.tiles]
         planes = tuple(max(int(np.abs(band).max()).bit_length() for band in tile) for tile in bands)
         room = tuple(np.zeros(5 * sum(band.size for band in tile) + 64, np.uint8) for tile in bands)
         table = TileTable.of(layout)
-        return cls(table, gather(table, work), planes, room)
+        return cls(table, gather(table, [work]), planes, room)
 
     def code(self, decoding: bool) -> tuple[Tiles, int]:
         """Code all planes of all tiles; returns what is known after that, and the bytes written."""

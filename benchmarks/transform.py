@@ -17,22 +17,22 @@ def main() -> None:
     """Print one table of a 4097 x 4097 surface."""
     surface = fractal()
     warm = surface.copy()
-    layout = Layout(surface.shape, (False, False), (7, 7))
+    layout = Layout.single(surface.shape, (False, False), (7, 7))
     lattice = (surface - 32768).astype(np.int32)
     work = transform.allocate(lattice.shape)
 
     work[...] = lattice
-    predictors = transform.forward(work, layout)
+    predictors = transform.forward([work], layout)
     coefficients = np.array(work)
     bands = pywt.wavedec2(surface, "bior2.2")
 
     def forward(fit: bool) -> None:
         work[...] = lattice
-        transform.forward(work, layout, fit)
+        transform.forward([work], layout, fit)
 
     def inverse() -> None:
         work[...] = coefficients
-        transform.inverse(work, layout, predictors, layout.levels)
+        transform.inverse([work], layout, predictors, layout.levels)
 
     seconds = medians(
         {

@@ -131,7 +131,5 @@ def covers(shape: tuple[int, int], closed: Closed, windows: Sequence[tuple[tuple
     if area != max(shape[0] - 1, 1) * max(shape[1] - 1, 1):
         return False
     return not any(
-        a < f and e < b and c < h and g < d
-        for k, (a, b, c, d) in enumerate(cells)
-        for e, f, g, h in cells[:k]
+        a < f and e < b and c < h and g < d for k, (a, b, c, d) in enumerate(cells) for e, f, g, h in cells[:k]
     )

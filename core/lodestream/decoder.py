@@ -16,8 +16,8 @@ from .container.model import ByteRange, Header, Index
 from .container.pieces import windows
 from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
-from .errors import CorruptStreamError, OptionError, TruncatedStreamError
 from .digest import DIGEST, values_digest
+from .errors import CorruptStreamError, OptionError, TruncatedStreamError
 from .georeference import level_geotransform
 from .parts import level_masks
 from .reconstruction import Coded, Progress, Reconstruction
@@ -57,6 +57,7 @@ class View:
     _state: NDArray[np.int8] = field(repr=False, compare=False)
     _corrected: bool = field(repr=False, compare=False)
     _metadata: dict[str, Any] = field(repr=False, compare=False)
+    _digest: dict[str, Any] = field(repr=False, compare=False)
 
     @property
     def points(self) -> NDArray[Any]:
@@ -115,7 +116,7 @@ class View:
         if not 0 <= level <= header.levels:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
-        digest = values.pop(DIGEST, self._metadata.get(DIGEST))
+        digest = self._digest.get(DIGEST)
         grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest)
         masks = level_masks(header.parts, header.layout, level, header.masks)
         blocks = []
@@ -132,9 +133,7 @@ class View:
             raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got others", header.length)
         if not finest and header.channels == 1 and len(blocks) == 1:
             shape = blocks[0].shape
-            values["geotransform"] = level_geotransform(
-                values.get("geotransform"), header.shape, shape, header.closed
-            )
+            values["geotransform"] = level_geotransform(values.get("geotransform"), header.shape, shape, header.closed)
         return Surface(blocks=blocks, metadata=values)
 
 
@@ -151,6 +150,7 @@ class Decoder:
         self.metadata: dict[str, Any] | None = None
         self.layers: list[View] = []
         self._values: dict[str, Any] = {}
+        self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
         self._frames = FrameReader()
         self._slices: Slices | None = None
         self._early: list[tuple[int, bytes]] = []
@@ -272,7 +272,8 @@ class Decoder:
         else:
             place = ByteRange(frame.offset, frame.end - frame.offset)
             index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
-            self.index = replace(with_level_bytes(index), metadata_values=self.metadata or {})
+            known = with_level_bytes(index)
+            self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
 
     def _take_footer(self, data: Bytes) -> None:
         offset, length = self._frames.position, sections.FOOTER_LENGTH
@@ -334,6 +335,8 @@ class Decoder:
         return figures
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
+        if DIGEST in values:
+            self._digest[DIGEST] = values.pop(DIGEST)
         self.metadata = values
         self._values.update(values)
 
@@ -356,6 +359,7 @@ class Decoder:
                 state,
                 corrected,
                 self._values,
+                self._digest,
             )
         )
 

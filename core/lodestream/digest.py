@@ -12,7 +12,7 @@ from .surface import Block
 __all__ = ["DIGEST", "values_digest"]
 
 #: Its key in a container's metadata.
-DIGEST = "sha256"
+DIGEST = "values_sha256"
 
 
 def values_digest(blocks: Iterable[Block]) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .kernels import kernel
 from .layout import Layout
 from .lifting import forward_step
+from .predictors import predictor
 from .surface import Closed
 from .transform import allocate, forward, inverse
 
@@ -81,7 +82,7 @@ def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout
     mask : bool, shape (row, column)
         True where a point is valid.
     layout : Layout
-        As the channel will be coded.
+        As the channel will be coded, of one grid.
 
     Returns
     -------
@@ -92,16 +93,16 @@ def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout
     if mask.all() or not mask.any():
         return settled
     low, high = coordinates[mask].min(), coordinates[mask].max()
-    work = allocate(layout.shape)
-    rows, columns = layout.shapes[0]
+    work = allocate(layout.grids[0].shape)
+    rows, columns = layout.shape(0, 0)
     work[...] = settled
-    predictors = forward(work, layout)
+    predictors = forward([work], layout)
     threshold = _FIRST_THRESHOLD * max(2, int(np.median(np.abs(work[::3, ::3]))))
     while threshold:
         coarsest = work[:rows, :columns].copy()
         work[np.abs(work) <= threshold] = 0
         work[:rows, :columns] = coarsest
-        inverse(work, layout, predictors, layout.levels)
+        inverse([work], layout, predictors, layout.levels)
         np.copyto(settled, np.clip(work, low, high), where=~mask)
         threshold >>= 1
         if threshold:
@@ -113,11 +114,11 @@ def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout
 def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8]) -> None:
     """The forward transform with predictors that are known."""
     for level in range(layout.levels, 0, -1):
-        rows, columns = layout.shapes[level]
-        for axis, step in enumerate(layout.steps(level)):
+        rows, columns = layout.shape(0, level)
+        for axis, step in enumerate(layout.steps(0, level)):
             if step.midpoints:
-                a, b = (int(x) for x in predictors[level - 1, axis])
-                forward_step(values[:rows, :columns], axis, step, (a, b))
+                rule = predictor(predictors, layout.grids[0], step, level, axis)
+                forward_step(values[:rows, :columns], axis, step, rule)
 
 
 def _fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: Closed, sweeps: int) -> None:

@@ -256,7 +256,5 @@ def coordinate_distances(
         compared.append((points[chosen], picture[chosen]))
     if len(compared) == 1 and compared[0][0].ndim == 3:
         return distances(*compared[0], len(lattices))
-    points, picture = (
-        np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
-    )
+    points, picture = (np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2))
     return distances(points, picture, len(lattices))

@@ -1,4 +1,4 @@
-"""A surface on its way into the encoder: holes filled, lattices chosen, blocks cut into parts, each vertex counted once."""
+"""A surface on its way into the encoder: holes filled, lattices chosen, blocks cut, vertices counted once."""
 
 from __future__ import annotations
 
@@ -99,6 +99,10 @@ class Preparation:
         curves = len(arrays) - len(self.parts)
         if self.arrangement is None:
             lattice.coordinates(self.channel(0, channel), out=arrays[0])
+            if (mask := self.surface.blocks[0].mask) is not None:
+                from .fill import settle_holes  # only where there is one
+
+                arrays[0][...] = settle_holes(arrays[0], mask, self.layout)
             return arrays
         known: set[int] = set()
         for number, part in enumerate(self.parts):
@@ -168,7 +172,13 @@ class Preparation:
             valid = _lines(np.ones(part.shape, np.bool_) if mask is None else take(mask, part))
             for place, line in enumerate(_lines(window)):
                 wraps = part.closed[place // 2]  # such an axis has no ends
-                if sides[place] is None and not wraps and len(line) > 1 and valid[place].all() and (line == line[0]).all():
+                if (
+                    sides[place] is None
+                    and not wraps
+                    and len(line) > 1
+                    and valid[place].all()
+                    and (line == line[0]).all()
+                ):
                     sides[place] = Side(len(curves), False)
                     curves.append(Curve(1))
             first, last, left, right = sides

@@ -20,10 +20,11 @@ from lodestream.container import Header
 from lodestream.encoder import _Channel, _TileCoder
 from lodestream.lattice import Lattice
 from lodestream.layout import Layout
+from lodestream.predictors import default_predictors, predictor
 from lodestream.reconstruction import Coded, Reconstruction
 from lodestream.tiles import TileTable, gather
 
-__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "uncompiled"]
+__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "shapes_of", "uncompiled"]
 
 Ints = NDArray[np.int32]
 #: (tile, channel, first pass, passes), in coding order.
@@ -40,6 +41,20 @@ def planes_of(layout: Layout, coefficients: Ints) -> list[int]:
     ]
 
 
+def shapes_of(layout: Layout) -> list[tuple[int, int]]:
+    """Shapes of a single grid at every level, coarsest first."""
+    return [layout.shape(0, level) for level in range(layout.levels + 1)]
+
+
+def effective(layout: Layout, predictors: NDArray[np.int8]) -> NDArray[np.int8]:
+    """The (a, b) of every step of a single grid: int8, shape (level, axis, 2)."""
+    rules = np.zeros((layout.levels, 2, 2), np.int8)
+    for level in range(layout.levels):
+        for axis, step in enumerate(layout.steps(0, level + 1)):
+            rules[level, axis] = predictor(predictors, layout.grids[0], step, level + 1, axis)
+    return rules
+
+
 def passes_of(layout: Layout, coefficients: Ints) -> list[int]:
     """Coding passes of every tile."""
     return [pass_count(planes) for planes in planes_of(layout, coefficients)]
@@ -50,8 +65,8 @@ def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]
     table = TileTable.of(layout)
     bands = np.ones(len(table.bands))
     coder = _TileCoder(
-        table,
-        [_Channel(gather(table, c), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
+        [table] * len(channels),
+        [_Channel(gather(table, [c]), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
     )
     return [
         Coded(tile, channel, first, passes, coder.code(tile, channel, first + 1, passes), 0)
@@ -63,11 +78,13 @@ def header_for(layout: Layout, channels: int) -> Header:
     """A header of int32 values that are their own lattice coordinates."""
     return Header(
         dtype=np.dtype(np.int32),
-        shape=layout.shape,
-        closed=layout.closed,
+        blocks=((layout.grids[0].shape, layout.grids[0].closed),),
+        arrangement=None,
+        point_channels=channels,
         flat=False,
+        attributes=(),
         lattices=(Lattice("affine", 0.0, 1.0),) * channels,
-        predictors=np.zeros((channels, layout.levels, 2, 2), np.int8),
+        predictors=np.stack([default_predictors(layout)] * channels),
         extent=1.0,
         fraction=0,
         empty=(0,) * channels,
@@ -86,9 +103,9 @@ def decode_runs(layout: Layout, channels: int, coded: Iterable[Coded], state: li
     reader._decode(reader.length)
     decoded = []
     for channel, tiles in enumerate(reader._tiles):
-        coefficients = np.zeros(layout.shape, np.int32)
+        coefficients = np.zeros(layout.grids[0].shape, np.int32)
         for tile in range(len(layout.tiles)):
-            tiles.spread(tile, state[tile][channel], coefficients)
+            tiles.spread(tile, state[tile][channel], [coefficients])
         decoded.append(coefficients)
     return decoded
 

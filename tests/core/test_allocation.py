@@ -23,7 +23,7 @@ def curves_for(layout: Layout, channels: int, seed: int) -> list[TileCurve]:
 
 
 layouts = st.builds(
-    Layout,
+    Layout.single,
     st.tuples(st.integers(1, 80), st.integers(1, 80)),
     st.tuples(st.booleans(), st.booleans()),
     st.tuples(st.integers(2, 5), st.integers(2, 5)),
@@ -63,7 +63,7 @@ def test_slopes_never_rise_towards_lower_planes_and_keep_the_sum(planes: int, se
 
 
 def test_layers_are_spaced_in_the_logarithm_of_their_bytes() -> None:
-    layout = Layout((500, 500), (False, False), (5, 5))
+    layout = Layout.single((500, 500), (False, False), (5, 5))
     rng = np.random.default_rng(0)
     curves = [
         TileCurve(tile, 0, np.full(16, 800.0), rng.uniform(1, 4) * 4.0 ** np.arange(16.0))
@@ -92,7 +92,7 @@ def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
 
 
 def test_nothing_to_send_is_one_layer() -> None:
-    layout = Layout((5, 5), (False, False), (7, 7))
+    layout = Layout.single((5, 5), (False, False), (7, 7))
     states = assign_layers([], layout, 3)
     assert len(states) == 1
     assert states[0].shape == (len(layout.tiles), 3)

@@ -67,7 +67,7 @@ def test_any_coefficients_come_back_in_runs_split_anyhow(
     density: float,
     seed: int,
 ) -> None:
-    layout = Layout(shape, closed, tile)
+    layout = Layout.single(shape, closed, tile)
     channels = [coefficients(shape, bits, density, seed + n) for n in range(count)]
     runs, end = random_runs(np.random.default_rng(seed), layout, channels)
     coded = encode_runs(layout, channels, runs)
@@ -78,7 +78,7 @@ def test_any_coefficients_come_back_in_runs_split_anyhow(
 
 @pytest.mark.parametrize("fill", [2**28 - 1, -(2**28 - 1), 1, -1, 0])
 def test_the_largest_and_smallest_coefficients_come_back(fill: int) -> None:
-    layout = Layout((40, 33), (False, False), (4, 4))
+    layout = Layout.single((40, 33), (False, False), (4, 4))
     values = np.full((40, 33), fill, np.int32)
     runs, end = random_runs(np.random.default_rng(0), layout, [values])
     coded = encode_runs(layout, [values], runs)
@@ -87,7 +87,7 @@ def test_the_largest_and_smallest_coefficients_come_back(fill: int) -> None:
 
 
 def test_noise_that_cannot_be_compressed_stays_within_its_buffer() -> None:
-    layout = Layout((150, 150), (False, False), (7, 7))
+    layout = Layout.single((150, 150), (False, False), (7, 7))
     values = np.random.default_rng(1).integers(-(2**28) + 1, 2**28, (150, 150), np.int32)
     runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values))]
     coded = encode_runs(layout, [values], runs)
@@ -96,7 +96,7 @@ def test_noise_that_cannot_be_compressed_stays_within_its_buffer() -> None:
 
 
 def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
-    layout = Layout((33, 33), (False, True), (3, 3))
+    layout = Layout.single((33, 33), (False, True), (3, 3))
     values = coefficients((33, 33), 12, 1.0, 7)
     tops = planes_of(layout, values)
     for plane in (0, 1, 4, 11):
@@ -113,7 +113,7 @@ def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
 
 @pytest.mark.parametrize("cut", [9, 10])
 def test_passes_known_beyond_a_state_do_not_show_in_it(cut: int) -> None:
-    layout = Layout((20, 20), (False, False), (3, 3))
+    layout = Layout.single((20, 20), (False, False), (3, 3))
     values = coefficients((20, 20), 10, 1.0, 8)
     counts = passes_of(layout, values)
     coarse = [(tile, 0, count - 1, count - cut) for tile, count in enumerate(counts) if count > cut]
@@ -125,7 +125,7 @@ def test_passes_known_beyond_a_state_do_not_show_in_it(cut: int) -> None:
 
 
 def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None:
-    layout = Layout((30, 30), (False, False), (4, 4))
+    layout = Layout.single((30, 30), (False, False), (4, 4))
     values = coefficients((30, 30), 9, 0.5, 9)
     runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values)) if count]
     coded = encode_runs(layout, [values], runs)
@@ -139,7 +139,7 @@ def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None
 
 
 def test_gains_are_the_squared_errors_of_what_is_known() -> None:
-    layout = Layout((25, 18), (False, False), (3, 3))
+    layout = Layout.single((25, 18), (False, False), (3, 3))
     table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
     counts = passes_of(layout, values)
     reader = Reconstruction(header_for(layout, 1))
@@ -152,9 +152,9 @@ def test_gains_are_the_squared_errors_of_what_is_known() -> None:
         rows = table.of_tile(tile)
         weights = np.arange(1.0, len(rows) + 1)
         errors = np.zeros(count + 1)
-        pass_gains(rows, weights, count, gather(table, values), reader._tiles[0].early, errors)
+        pass_gains(rows, weights, count, gather(table, [values]), reader._tiles[0].early, errors)
         for remaining in range(count + 1):
-            known = np.zeros(layout.shape, np.int32)
+            known = np.zeros(layout.grids[0].shape, np.int32)
             reader._tiles[0].spread(tile, remaining, known)
             squares = (values.astype(np.int64) - known) ** 2
             bands = layout.tiles[tile].bands
@@ -170,7 +170,7 @@ def digest() -> str:
     for seed, (shape, closed) in enumerate(
         [((9, 14), (False, True)), ((1, 21), (False, False)), ((17, 3), (True, True))]
     ):
-        layout = Layout(shape, closed, (2, 3))
+        layout = Layout.single(shape, closed, (2, 3))
         channels = [coefficients(shape, 13, 0.6, seed), coefficients(shape, 28, 1.0, seed + 50)]
         runs, end = random_runs(np.random.default_rng(seed), layout, channels)
         coded = encode_runs(layout, channels, runs)

@@ -5,16 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestream.encoder import tile_exponents
 from lodestream.errors import InputError
 from lodestream.layout import Layout, tile_bounds
+from lodestream.preparation import tile_exponents
 from lodestream.tiles import TileTable, gather
 
 from . import lifting_reference as reference
+from .coding import shapes_of
 
 closures = st.tuples(st.booleans(), st.booleans())
 layouts = st.builds(
-    Layout,
+    Layout.single,
     st.tuples(st.integers(1, 120), st.integers(1, 120)),
     closures,
     st.tuples(st.integers(1, 5), st.integers(1, 5)),
@@ -23,25 +24,25 @@ layouts = st.builds(
 
 @given(layouts)
 def test_levels_count_back_from_the_surface(layout: Layout) -> None:
-    assert layout.shapes == reference.shapes(layout.shape, layout.closed)
-    assert layout.levels == len(layout.shapes) - 1
+    assert shapes_of(layout) == reference.shapes(layout.grids[0].shape, layout.grids[0].closed)
+    assert layout.levels == len(shapes_of(layout)) - 1
     for level in range(1, layout.levels + 1):
-        rows, columns = layout.steps(level)
-        assert (rows.length, columns.length) == layout.shapes[level]
-        assert (rows.coarse, columns.coarse) == layout.shapes[level - 1]
+        rows, columns = layout.steps(0, level)
+        assert (rows.length, columns.length) == shapes_of(layout)[level]
+        assert (rows.coarse, columns.coarse) == shapes_of(layout)[level - 1]
 
 
 @given(layouts)
 def test_tiles_partition_the_array(layout: Layout) -> None:
-    held = np.zeros(layout.shape, np.int32)
+    held = np.zeros(layout.grids[0].shape, np.int32)
     for tile in layout.tiles:
         for band in tile.bands:
             assert min(band.shape) > 0
             held[slice(*band.rows), slice(*band.columns)] += 1
-            assert band.rows[1] <= layout.shapes[tile.level][0]
-            assert band.columns[1] <= layout.shapes[tile.level][1]
+            assert band.rows[1] <= shapes_of(layout)[tile.level][0]
+            assert band.columns[1] <= shapes_of(layout)[tile.level][1]
             if tile.level:
-                coarse = layout.shapes[tile.level - 1]
+                coarse = shapes_of(layout)[tile.level - 1]
                 for span, nodes, detail in zip((band.rows, band.columns), coarse, band.kind, strict=True):
                     assert (span[0] >= nodes) == detail
                     assert detail or span[1] <= nodes
@@ -67,7 +68,7 @@ def test_a_parent_contains_its_children_s_family(layout: Layout) -> None:
         parent = layout.tiles[tile.parent]
         assert parent.level == tile.level - 1
         bands = {band.kind: (band, row) for band, row in zip(parent.bands, table.of_tile(tile.parent), strict=True)}
-        halved = [a != b for a, b in zip(*layout.shapes[tile.level - 2 : tile.level], strict=True)]
+        halved = [a != b for a, b in zip(*shapes_of(layout)[tile.level - 2 : tile.level], strict=True)]
         for band, row in zip(tile.bands, table.of_tile(number), strict=True):
             place, stride, down, right = (int(x) for x in row[5:9])
             if band.kind not in bands:
@@ -89,8 +90,9 @@ def test_a_parent_contains_its_children_s_family(layout: Layout) -> None:
 @given(layouts)
 def test_flat_arrays_hold_every_coefficient_once_in_a_frame_of_zeros(layout: Layout) -> None:
     table = TileTable.of(layout)
-    values = np.arange(1, 1 + layout.shape[0] * layout.shape[1], dtype=np.int32).reshape(layout.shape)
-    flat = gather(table, values)
+    shape = layout.grids[0].shape
+    values = np.arange(1, 1 + shape[0] * shape[1], dtype=np.int32).reshape(shape)
+    flat = gather(table, [values])
     assert flat.size == table.size
     np.testing.assert_array_equal(np.sort(flat[flat != 0]), values.ravel())
     for number, tile in enumerate(layout.tiles):
@@ -123,4 +125,4 @@ def test_tiles_of_narrow_surfaces_are_long(shape: tuple[int, int], tile: tuple[i
 
 def test_an_empty_grid_is_refused() -> None:
     with pytest.raises(InputError, match="0 x 5"):
-        Layout((0, 5), (False, False), (7, 7))
+        Layout.single((0, 5), (False, False), (7, 7))

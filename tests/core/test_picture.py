@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lodestream.lattice import Lattice
 from lodestream.measure import distances
-from lodestream.picture import coordinate_distances, store_values
+from lodestream.picture import Original, coordinate_distances, store_values
 from lodestream.transform import PADDING
 
 DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
@@ -48,9 +48,12 @@ def test_distances_are_those_of_the_picture(dtype: str) -> None:
             for channel, lattice in enumerate(lattices):
                 store_values(lattice, (numbers[channel, :, : shape[1]], fraction), picture, channel)
             original = np.roll(picture, 1, axis=1)
-            found = coordinate_distances(original, lattices, numbers, [fraction] * geometric)
+            found = coordinate_distances([Original(original, None)], lattices, [numbers], [fraction] * geometric)
             assert found == pytest.approx(distances(original, picture, geometric), rel=1e-12, abs=0)
-            assert coordinate_distances(picture, lattices, numbers, [fraction] * geometric) == (0.0, 0.0)
+            assert coordinate_distances([Original(picture, None)], lattices, [numbers], [fraction] * geometric) == (
+                0.0,
+                0.0,
+            )
 
 
 def test_attributes_have_no_part_in_distances() -> None:
@@ -60,6 +63,6 @@ def test_attributes_have_no_part_in_distances() -> None:
         store_values(LATTICES[0], (numbers[channel, :, :30], 0), points, channel)
     points[..., 3:] = 1e30
     points[4, 5, 2] += 1024.0
-    rms, worst = coordinate_distances(points, LATTICES[:1] * 3, numbers, [0, 0, 0])
+    rms, worst = coordinate_distances([Original(points, None)], LATTICES[:1] * 3, [numbers], [0, 0, 0])
     assert worst == pytest.approx(1024.0, rel=1e-3)
     assert rms == pytest.approx(worst / np.sqrt(600))

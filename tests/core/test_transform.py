@@ -18,6 +18,7 @@ from lodestream.transform import (
 )
 
 from . import lifting_reference as reference
+from .coding import effective, shapes_of
 from .reference import dense_coarsen
 
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
@@ -44,14 +45,18 @@ def load(values: NDArray[Any]) -> NDArray[np.int32]:
 def test_all_levels_are_those_of_the_reference(closed: tuple[bool, bool]) -> None:
     for shape, fit in itertools.product(SHAPES, (True, False)):
         for original in (grid(shape, 2**24), smooth(shape, 2**20)):
-            layout, values = Layout(shape, closed, (7, 7)), load(original)
-            predictors = forward(values, layout, fit)
-            assert predictors.shape == (layout.levels, 2, 2)
-            np.testing.assert_array_equal(values, reference.forward_grid(original, closed, predictors))
-            for level, (rows, columns) in enumerate(layout.shapes):
+            layout, values = Layout.single(shape, closed, (7, 7)), load(original)
+            predictors = forward([values], layout, fit)
+            assert predictors.shape == (layout.levels, 3, 2)
+            np.testing.assert_array_equal(
+                values, reference.forward_grid(original, closed, effective(layout, predictors))
+            )
+            for level, (rows, columns) in enumerate(shapes_of(layout)):
                 corner = load(values)
-                inverse(corner, layout, predictors, level)
-                expected = reference.inverse_grid(values[:rows, :columns].astype(np.int64), closed, predictors)
+                inverse([corner], layout, predictors, level)
+                expected = reference.inverse_grid(
+                    values[:rows, :columns].astype(np.int64), closed, effective(layout, predictors)
+                )
                 np.testing.assert_array_equal(corner[:rows, :columns], expected)
             np.testing.assert_array_equal(corner, original)
 
@@ -62,26 +67,26 @@ def test_levels_are_within_four_steps_of_the_dense_optimum(closed: tuple[bool, b
     for shape in SHAPES:
         signs = 2 * grid(shape, 1).clip(0, 1) - 1
         for original, bound in ((grid(shape, 2**20), 4.0), (signs * 2**20, 4.0), (signs * 2**24, 16.0)):
-            layout, values, best = Layout(shape, closed, (7, 7)), load(original), original.astype(np.float64)
-            predictors = forward(values, layout)
+            layout, values, best = Layout.single(shape, closed, (7, 7)), load(original), original.astype(np.float64)
+            predictors = forward([values], layout)
             for level in range(layout.levels - 1, -1, -1):
                 best = dense_coarsen(best, closed)
                 corner = load(values)
-                inverse(corner, layout, predictors, level)
-                assert layout.shapes[level] == best.shape
+                inverse([corner], layout, predictors, level)
+                assert shapes_of(layout)[level] == best.shape
                 assert np.abs(corner[: best.shape[0], : best.shape[1]] - best).max() <= bound
 
 
 def test_adversarial_surfaces_stay_within_28_bits() -> None:
     for shape, closed in itertools.product([(33, 33), (64, 50), (129, 20)], CLOSURES):
-        layout = Layout(shape, closed, (7, 7))
+        layout = Layout.single(shape, closed, (7, 7))
         i, j = np.indices(shape)
         for signs in ((i + j) % 2, i // 2 % 2 ^ j % 2, i % 2, (i // 2 + j // 2) % 2, i < shape[0] // 2):
             original = np.where(signs, 2**24, -(2**24))
             values = load(original)
-            predictors = forward(values, layout, fit=False)
+            predictors = forward([values], layout, fit=False)
             assert np.abs(values).max() < 2**COEFFICIENT_BITS
-            inverse(values, layout, predictors, layout.levels)
+            inverse([values], layout, predictors, layout.levels)
             np.testing.assert_array_equal(values, original)
 
 
@@ -89,45 +94,45 @@ def test_adversarial_surfaces_stay_within_28_bits() -> None:
 def test_hostile_coefficients_are_those_of_exact_integers(closed: tuple[bool, bool]) -> None:
     extreme = 2**COEFFICIENT_BITS - 1
     for shape in [(5, 3), (9, 6), (13, 22), (26, 25)]:
-        layout = Layout(shape, closed, (7, 7))
+        layout = Layout.single(shape, closed, (7, 7))
         for seed, predictor in enumerate([(127, -127), (127, 127), (-127, 127), (16, 0)]):
             hostile = np.where(grid(shape, 1, seed) > 0, extreme, -extreme)
             predictors = np.full((layout.levels, 2, 2), predictor, np.int8)
             values = load(hostile)
-            inverse(values, layout, predictors, layout.levels)
-            expected = reference.inverse_grid(hostile.astype(object), closed, predictors)
+            inverse([values], layout, predictors, layout.levels)
+            expected = reference.inverse_grid(hostile.astype(object), closed, effective(layout, predictors))
             np.testing.assert_array_equal(values.astype(object), expected)
             assert np.abs(values).max() <= CLAMP
 
 
 def test_the_fit_makes_details_smaller_than_the_fixed_rules() -> None:
     original = smooth((65, 80), 2**20)
-    layout = Layout((65, 80), (False, False), (7, 7))
+    layout = Layout.single((65, 80), (False, False), (7, 7))
     sizes = []
     for fit in (True, False):
         values = load(original)
-        predictors = forward(values, layout, fit)
+        predictors = forward([values], layout, fit)
         sizes.append(np.log2(1 + np.abs(values.astype(np.float64))).sum())
     assert not predictors[layout.levels - 1].any()
     assert sizes[0] < 0.7 * sizes[1]
 
 
 def test_only_long_axes_have_predictors_of_their_own() -> None:
-    layout = Layout((200, 9), (False, True), (7, 7))
+    layout = Layout.single((200, 9), (False, True), (7, 7))
     own, others = set(fitted_steps(layout)), default_predictors(layout)
-    assert own == {(level, 0) for level in range(layout.levels) if layout.shapes[level][0] >= 24}
+    assert own == {(level, 0) for level in range(layout.levels) if shapes_of(layout)[level][0] >= 24}
     for level, axis in itertools.product(range(layout.levels), (0, 1)):
         assert tuple(others[level, axis]) == ((0, 0) if (level, axis) in own else (16, 0))
 
 
 def test_synthesis_norms_are_what_a_coefficient_adds() -> None:
-    layout = Layout((129, 129), (True, True), (7, 7))
+    layout = Layout.single((129, 129), (True, True), (7, 7))
     predictors = np.zeros((layout.levels, 2, 2), np.int8)
     predictors[:] = 16, 0
     norms = synthesis_norms(layout, predictors)
     unit = 2**16
     for level in range(layout.levels - 2, layout.levels + 1):
-        shape, coarse = layout.shapes[level], layout.shapes[level - 1]
+        shape, coarse = shapes_of(layout)[level], shapes_of(layout)[level - 1]
         for kind in itertools.product((0, 1), repeat=2):
             if kind == (0, 0):
                 continue
@@ -136,7 +141,7 @@ def test_synthesis_norms_are_what_a_coefficient_adds() -> None:
             )
             values = allocate((129, 129))
             values[place] = unit
-            inverse(values, layout, predictors, layout.levels)
+            inverse([values], layout, predictors, layout.levels)
             measured = float((values.astype(np.float64) ** 2).sum()) / unit**2
             assert norms[level, kind[0], kind[1]] == pytest.approx(measured, rel=0.02)
 

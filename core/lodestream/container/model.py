@@ -238,7 +238,7 @@ class Index:
     """Where everything lies in a complete container.
 
     ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``pieces`` of it stand in
-    the order of `lodestream.pieces.windows`. ``size`` is the file's.
+    the order of `pieces.windows`. ``size`` is the file's, ``digest`` the SHA-256 of the values where all are exact.
     """
 
     header: Header
@@ -251,6 +251,7 @@ class Index:
     index: ByteRange
     size: int
     metadata_values: Mapping[str, Any] = field(default_factory=dict)
+    digest: str | None = None
 
     @property
     def surface_end(self) -> int:

@@ -29,6 +29,4 @@ def windows(header: Header) -> Iterator[Window]:
         for top in range(0, rows, height):
             for left in range(0, columns, width):
                 for channel in range(header.channels):
-                    yield Window(
-                        channel, block, (top, min(top + height, rows)), (left, min(left + width, columns))
-                    )
+                    yield Window(channel, block, (top, min(top + height, rows)), (left, min(left + width, columns)))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from ..digest import DIGEST
 from ..errors import CorruptStreamError, TruncatedStreamError
 from . import sections
 from .frames import FrameReader, whole_section
@@ -42,7 +43,9 @@ def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
     if index.size != size:
         raise CorruptStreamError(f"expected a container of {index.size} bytes, got {size}", tail)
     metadata = index.metadata
-    return replace(index, metadata_values=read_metadata(read(metadata.offset, metadata.length), metadata))
+    values = read_metadata(read(metadata.offset, metadata.length), metadata)
+    digest = values.pop(DIGEST, None)
+    return replace(index, metadata_values=values, digest=digest)
 
 
 def _read_header(read: Callable[[int, int], bytes], size: int) -> Header:
@@ -119,5 +122,6 @@ def describe(index: Index) -> dict[str, Any]:
         "layers": [{"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers],
         "bytes": index.size,
         "exact": header.exact,
+        "sha256": index.digest,
         "metadata": dict(index.metadata_values),
     }

@@ -347,9 +347,7 @@ def serialize_pieces(figures: tuple[float, float], pieces: Sequence[bytes]) -> b
     return bytes(out.data) + b"".join(pieces)
 
 
-def parse_pieces(
-    payload: memoryview, offset: int, count: int
-) -> tuple[tuple[float, float], list[tuple[bytes, int]]]:
+def parse_pieces(payload: memoryview, offset: int, count: int) -> tuple[tuple[float, float], list[tuple[bytes, int]]]:
     """The errors that an exactness section, which stands at ``offset``, leaves; its pieces and their places."""
     fields = FieldReader(payload, offset)
     figures = _figures(fields)
