@@ -46,11 +46,9 @@ async def upload(request: Request, parts: Parts) -> Response:
     try:
         received = await uploads.receive(request, folder, parts.settings, chosen.filename)
         record = await asyncio.to_thread(_record, received, chosen, parts)
-        record, new = await asyncio.to_thread(parts.storage.add, record, folder)
+        record, _ = await parts.builder.accept(record, folder)
     finally:
         await asyncio.to_thread(remove, folder)
-    if new:
-        parts.builder.submit(record)
     content = _present(record, parts, request, full=True)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
     status = 200 if content["state"] == "ready" else 202
@@ -110,6 +108,7 @@ def _record(received: uploads.Upload, chosen: options.SurfaceOptions, parts: Sta
         filenames=tuple(name or "" for name in names),
         upload_bytes=received.size,
         options=chosen.chosen,
+        upload_sha256=received.digest.hexdigest(),
     )
 
 
