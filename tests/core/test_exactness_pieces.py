@@ -40,14 +40,14 @@ def assert_comes_back(original: Values, restored: Values) -> bytes:
 def test_any_values_restore_any_others(dtype: str, data: st.DataObject) -> None:
     kind = np.dtype(dtype)
     if kind.kind in "iu":
-        anything = usual = st.integers(int(np.iinfo(kind).min), int(np.iinfo(kind).max))
-        original = data.draw(arrays.arrays(kind, 30, elements=anything))
+        integers = st.integers(int(np.iinfo(kind).min), int(np.iinfo(kind).max))
+        original, restored = (data.draw(arrays.arrays(kind, 30, elements=integers)) for _ in range(2))
     else:
-        width = 32 if kind.itemsize == 4 else 64
-        usual = st.floats(allow_nan=False, allow_infinity=False, width=width)  # type: ignore[assignment]
+        finite = st.floats(allow_nan=False, allow_infinity=False, width=32 if kind.itemsize == 4 else 64)
         # Patterns rather than values: every NaN is one of its own.
         original = data.draw(arrays.arrays(f"u{kind.itemsize}", 30)).view(kind)
-    assert_comes_back(original, data.draw(arrays.arrays(kind, 30, elements=usual)))
+        restored = data.draw(arrays.arrays(kind, 30, elements=finite))
+    assert_comes_back(original, restored)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -165,21 +165,20 @@ def test_every_prefix_is_refused() -> None:
         decode_piece(restored, data + b"\0", 0)
 
 
+def samples() -> list[tuple[Values, Values]]:
+    """Originals and what a lattice restores of them."""
+    wide = (normal("float64", 300) * 1e9).astype(np.int64)
+    floats = [normal(dtype, 300) for dtype in ("float32", "float64")]
+    return [(wide, wide // 1000 * 1000), *((values, on_lattice(values, 1e-4)) for values in floats)]
+
+
 def test_the_compiled_coder_does_what_the_plain_one_does() -> None:
     script = (
         "from lodestream.exactness import decode_piece, encode_piece\n"
-        "from tests.core.test_exactness_pieces import normal, on_lattice\n"
-        "for dtype in ('float32', 'float64', 'int64'):\n"
-        "    values = normal(dtype, 300)\n"
-        "    values = (values * 1e9 if dtype == 'int64' else values).astype(dtype)\n"
-        "    restored = on_lattice(values, 1000.0 if dtype == 'int64' else 1e-4)\n"
+        "from tests.core.test_exactness_pieces import samples\n"
+        "for values, restored in samples():\n"
         "    data = encode_piece(values, restored)\n"
         "    assert decode_piece(restored, data, 0).tobytes() == values.tobytes()\n"
         "    print(data.hex())"
     )
-    expected = []
-    for dtype in ("float32", "float64", "int64"):
-        values = normal(dtype, 300)
-        values = (values * 1e9 if dtype == "int64" else values).astype(dtype)
-        expected.append(encode_piece(values, on_lattice(values, 1000.0 if dtype == "int64" else 1e-4)).hex())
-    assert uncompiled(script).split() == expected
+    assert uncompiled(script).split() == [encode_piece(*sample).hex() for sample in samples()]
