@@ -17,7 +17,6 @@ from ..errors import FormatError
 from ..seams import merge
 from ..surface import Surface
 from .attributes import COLOR, group
-from .lzf import decompress
 from .source import Source, number
 
 __all__ = ["read", "sniff"]
@@ -187,6 +186,8 @@ def _read_binary(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
 
 def _read_compressed(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
     """Read fields that stand one after another, compressed together; what fills up a page after them is left."""
+    from .lzf import decompress  # compiled, so not before a file needs it
+
     promised = header.points * header.record.itemsize
     source.check_expansion(promised)
     with source.path.open("rb") as file:
