@@ -31,12 +31,15 @@ class Sender:
     ----------
     sent : int
         Bytes of the container that have been handed out.
+    layers : int
+        Layers or levels that have been handed out; from the first one on there is something to draw.
     why : str or None
         Why the stream ended, once it has.
     """
 
     def __init__(self, index: Index, container: str) -> None:
         self.sent = 0
+        self.layers = 0
         self.why: str | None = None
         self._index = index
         self._container = container
@@ -85,6 +88,8 @@ class Sender:
         event = self._outbox.popleft()
         if isinstance(event, Segments):
             self.sent += len(event.data)
+        elif isinstance(event, Layer):
+            self.layers += 1
         elif isinstance(event, End):
             self.why = event.why
         return self._connection.send(event)

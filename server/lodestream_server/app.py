@@ -5,16 +5,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
+from fastapi.middleware.cors import CORSMiddleware
 
 import lodestream
 
-from . import examples, files, pages, problems, streams, surfaces
+from . import files, interface, pages, problems, streams, surfaces
+from .access import Access
 from .containers import Containers
+from .gate import Gate
 from .jobs import Builder
+from .limits import Limits
+from .metrics import Metrics
+from .observation import Observation
 from .routing import State
 from .settings import Settings
 from .storage import Storage
@@ -39,14 +43,22 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     -------
     FastAPI
         An ASGI application. It opens its folder when it starts and leaves it when it ends.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        When there is no token where one is needed, or the token file cannot be used.
     """
     chosen = Settings() if settings is None else settings
+    access, metrics = Access(chosen), Metrics()
 
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
         storage = await asyncio.to_thread(Storage, chosen.data)
-        builder = Builder(storage, chosen)
-        app.state.parts = State(chosen, storage, builder, Containers(storage))
+        builder = Builder(storage, chosen, metrics.built)
+        limits = Limits(chosen, storage.root, lambda: len(storage), lambda: builder.pending)
+        metrics.watch(storage.root, lambda: len(storage), lambda: builder.pending)
+        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics)
         try:
             builder.start()
             yield
@@ -68,21 +80,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    app.state.metrics = metrics
+    app.openapi = lambda: interface.describe(app)  # type: ignore[method-assign]
+    # The last one is the first that a request meets.
+    app.add_middleware(Gate, access=access)
+    if chosen.origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=chosen.origins,
+            allow_methods=["DELETE", "GET", "HEAD", "POST"],
+            allow_headers=["authorization", "if-none-match", "if-range", "range"],
+            expose_headers=["content-range", "etag", "location", "retry-after", "x-request-id"],
+        )
+    app.add_middleware(Observation, metrics=metrics)
     return app
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    if app.openapi_schema is None:
-        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        components = schema.setdefault("components", {}).setdefault("schemas", {})
-        # What the framework assumes of validation errors is not what is answered.
-        for name in ("HTTPValidationError", "ValidationError"):
-            components.pop(name, None)
-        for operations in schema["paths"].values():
-            for operation in operations.values():
-                if "422" in operation["responses"]:
-                    operation["responses"]["422"] = problems.responses(422)[422]
-        components["Problem"] = examples.PROBLEM_SCHEMA
-        app.openapi_schema = schema
-    return app.openapi_schema

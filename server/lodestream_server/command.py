@@ -6,17 +6,16 @@ Only what the parser needs is imported here: whoever runs another command does n
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import sys
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
+
+from .table import GROUPS, TABLE, Setting
 
 if TYPE_CHECKING:
     from .settings import Settings
 
-__all__ = ["register", "serve"]
-
-_OPTIONS = ("host", "port", "data", "insecure")
+__all__ = ["add_option", "chosen_settings", "register", "serve"]
 
 
 def register(subparsers: Any) -> None:
@@ -24,22 +23,35 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "serve",
         help="start a server",
-        description="Start a server. Each option is also an environment variable: LODESTREAM_HOST and so on.",
+        description="Start a server. Each option is an environment variable too: --max-streams is "
+        "LODESTREAM_MAX_STREAMS. The command line wins. Sizes may be written like 500MB or 4GiB.",
         allow_abbrev=False,
     )
-    parser.add_argument("--host", metavar="H", help="address to listen on (default: 127.0.0.1)")
-    parser.add_argument("--port", metavar="P", type=_port, help="port to listen on; 0 takes a free one (default: 8000)")
-    parser.add_argument(
-        "--data", metavar="DIR", type=Path, help="folder of uploads and containers (default: lodestream-data)"
-    )
-    parser.add_argument(
-        "--insecure",
-        action="store_true",
-        default=None,
-        help="listen on an address that others can reach: there is no access control yet, whoever reaches the port may "
-        "read, upload and delete",
-    )
+    groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
+    for setting in TABLE.values():
+        add_option(groups[setting.group], setting)
     parser.set_defaults(run=serve)
+
+
+def add_option(parser: Any, setting: Setting) -> None:
+    """Offer a setting as an option; what is not given is None, so that the environment is asked."""
+    words = f"{setting.meaning} (default: {setting.default_text})".replace("%", "%%")
+    if setting.default is False:
+        parser.add_argument(setting.option, action=argparse.BooleanOptionalAction, help=words)
+    else:
+        metavar = setting.metavar or setting.kind.metavar
+        parser.add_argument(setting.option, metavar=metavar, type=_type(setting), help=words)
+
+
+def _type(setting: Setting) -> Callable[[str], Any]:
+    # argparse hides the message of any other exception behind "invalid value".
+    def take(text: str) -> Any:
+        try:
+            return setting.take(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return take
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -49,58 +61,39 @@ def serve(args: argparse.Namespace) -> int:
     ------
     OptionError
         When a variable of the environment has a value that cannot be used.
+    LodestreamError
+        When others can reach the address, and there is no token.
     """
-    given = {name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
-    settings = _settings(given)
-    if not (settings.insecure or _is_loopback(settings.host)):
-        print(
-            f"lodestream: expected --insecure with the address {settings.host}, which others can reach: "
-            "there is no access control yet",
-            file=sys.stderr,
-        )
-        # 2 is for what the command line alone shows.
-        return 2 if "host" in given else 1
-    return _run(settings)
+    settings = chosen_settings(args)
+    from .logs import configure
+    from .running import make_server, raise_file_limit
+
+    server = make_server(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
+    configure(settings.log_format, settings.log_level)
+    raise_file_limit(settings)
+    server.run()
+    return 0 if server.started else 1
 
 
-def _settings(given: dict[str, Any]) -> Settings:
+def chosen_settings(args: argparse.Namespace) -> Settings:
+    """What the command line says, and the environment where it says nothing.
+
+    Raises
+    ------
+    OptionError
+        When a variable of the environment has a value that cannot be used.
+    """
     from pydantic import ValidationError
 
     from lodestream.errors import OptionError
 
     from .settings import Settings
 
+    given = {name: value for name in TABLE if (value := getattr(args, name, None)) is not None}
     try:
         return Settings(**given)
     except ValidationError as error:
         first = error.errors()[0]
-        name = "_".join(map(str, first["loc"])).upper()
-        raise OptionError(f"LODESTREAM_{name}: {first['msg']}, got {first['input']!r}") from None
-
-
-def _run(settings: Settings) -> int:
-    import logging
-
-    from .running import make_server
-
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("lodestream_server").setLevel(logging.INFO)
-    server = make_server(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
-    server.run()
-    return 0 if server.started else 1
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def _port(text: str) -> int:
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"expected 0 to 65535, got {port}")
-    return port
+        name = "_".join(map(str, first["loc"]))
+        variable = TABLE[name].variable if name in TABLE else name
+        raise OptionError(f"{variable}: {first['msg'].removeprefix('Value error, ')}") from None

@@ -1,4 +1,8 @@
-"""Files that are on disk, whole, when these functions return: everything that the server writes goes through here."""
+"""Files that are on disk, whole, when these functions return: everything that the server writes goes through here.
+
+Every step that changes the disk is a method of `Disk`, and all of them are made on one object, `disk`: tests put
+another there, to fill the disk at any step or to lose what was never synchronised.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,48 @@ import secrets
 import shutil
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
-__all__ = ["NewFile", "remove", "rename", "sync_folder", "write_file"]
+__all__ = ["Disk", "NewFile", "disk", "make_folder", "remove", "rename", "sync_folder", "write_file"]
+
+
+class Disk:
+    """The steps in which the server changes its folder, each of which may fail for want of space."""
+
+    def make_folder(self, path: Path) -> None:
+        """Make a folder."""
+        path.mkdir()
+
+    def create(self, path: Path) -> BinaryIO:
+        """Open a new file for writing."""
+        # Unbuffered: the bytes reach the file in `write`, and nothing is left to fail when it is closed.
+        return path.open("xb", buffering=0)
+
+    def write(self, file: BinaryIO, data: bytes) -> None:
+        """Append bytes, all of them."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[file.write(rest) :]
+
+    def sync(self, handle: int, path: Path) -> None:
+        """Put a file's bytes, or a folder's names, on disk."""
+        os.fsync(handle)
+
+    def rename(self, source: Path, target: Path) -> None:
+        """Give a file or folder another name, in place of what has it."""
+        source.replace(target)
+
+    def unlink(self, path: Path) -> None:
+        """Remove a file, if there is one."""
+        path.unlink(missing_ok=True)
+
+    def remove_folder(self, path: Path) -> None:
+        """Remove a folder with what is in it."""
+        shutil.rmtree(path, ignore_errors=True)
+
+
+#: What the functions below work on.
+disk = Disk()
 
 
 class NewFile:
@@ -21,11 +64,11 @@ class NewFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = 0
-        self._file = path.open("xb")
+        self._file = disk.create(path)
 
     def write(self, data: bytes) -> None:
         """Append bytes."""
-        self._file.write(data)
+        disk.write(self._file, data)
         self.size += len(data)
 
     def __enter__(self) -> Self:
@@ -39,13 +82,18 @@ class NewFile:
         try:
             with self._file:
                 if kind is None:
-                    self._file.flush()
-                    os.fsync(self._file.fileno())
+                    disk.sync(self._file.fileno(), self.path)
         except OSError:
-            self.path.unlink(missing_ok=True)
+            disk.unlink(self.path)
             raise
         if kind is not None:
-            self.path.unlink(missing_ok=True)
+            disk.unlink(self.path)
+
+
+def make_folder(path: Path) -> Path:
+    """Make a folder; its name is on disk once the folder around it is synchronised."""
+    disk.make_folder(path)
+    return path
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -57,9 +105,9 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def rename(source: Path, target: Path) -> None:
-    """Give a file or folder that is on disk its final place."""
+    """Give a file or folder that is on disk its final place; it is gone if that fails."""
     try:
-        source.replace(target)
+        disk.rename(source, target)
     except OSError:
         remove(source)
         raise
@@ -68,16 +116,16 @@ def rename(source: Path, target: Path) -> None:
 
 def remove(path: Path) -> None:
     """Remove a file or a folder with what is in it; nothing happens if there is none."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
+    if path.is_dir() and not path.is_symlink():
+        disk.remove_folder(path)
     else:
-        path.unlink(missing_ok=True)
+        disk.unlink(path)
 
 
 def sync_folder(path: Path) -> None:
     """Put the names in a folder on disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(handle)
+        disk.sync(handle, path)
     finally:
         os.close(handle)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "UPLOAD", "answer"]
+__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "TICKET", "UPLOAD", "answer"]
 
 CONTAINER_TYPE = "application/vnd.lodestream.container"
 
@@ -21,6 +21,8 @@ QUEUED: dict[str, Any] = {
     "options": {"precision": "0.5"},
     "container": None,
 }
+
+TICKET: dict[str, Any] = {"ticket": "4pXnJ2bQ...", "seconds": 60.0}
 
 _FIGURES: dict[str, Any] = {
     "shape": [344, 403],

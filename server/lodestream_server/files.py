@@ -56,7 +56,9 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     """A container never changes: its name is the hash of its content, which is its strong ETag."""
     path = parts.storage.container(sha256)
     etag = f'"{sha256}"'
-    headers = {"etag": etag, "cache-control": "public, max-age=31536000, immutable"}
+    # What needs a token must not come out of a shared cache for those who have none.
+    shared = "public" if parts.settings.public_reads else "private"
+    headers = {"etag": etag, "cache-control": f"{shared}, max-age=31536000, immutable"}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         unchanged.headers.update(headers)
@@ -71,7 +73,7 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     "/surfaces/{surface}/levels/{level}",
     summary="Fetch one level as a file",
     response_class=Response,
-    responses={200: examples.LEVEL, 304: {"description": "The client has it"}, **responses(404, 409, 422, 424)},
+    responses={200: examples.LEVEL, 304: {"description": "The client has it"}, **responses(404, 409, 422, 424, 503)},
 )
 async def level(
     request: Request,

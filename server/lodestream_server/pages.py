@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 import lodestream
 
 from . import examples
+from .gate import caller_of
 from .routing import Parts, readable
 
 __all__ = ["router"]
@@ -60,3 +61,30 @@ async def readyz(parts: Parts) -> Response:
     if parts.builder.ready:
         return JSONResponse({"status": "ready"})
     return JSONResponse({"status": "starting"}, 503, {"retry-after": "1"})
+
+
+@readable(
+    router,
+    "/metrics",
+    summary="Figures for Prometheus",
+    response_class=Response,
+    responses={200: {"description": "The figures", "content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+async def metrics(parts: Parts) -> Response:
+    """What the server has counted and measured since it started."""
+    return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
+
+
+@router.post(
+    "/v1/tickets",
+    status_code=201,
+    summary="Get a ticket for a stream",
+    responses={201: examples.answer("A ticket, and the seconds for which it is valid", examples.TICKET)},
+)
+async def ticket(request: Request, parts: Parts) -> Response:
+    """Give what a browser puts in a stream's ``open``, since it can send no header with a WebSocket."""
+    caller = caller_of(request)
+    assert caller is not None  # the gate asks for one here
+    tickets = parts.access.tickets
+    content = {"ticket": tickets.issue(caller.key), "seconds": tickets.seconds}
+    return JSONResponse(content, 201, {"cache-control": "no-store"})

@@ -5,13 +5,16 @@ from __future__ import annotations
 import errno
 import http
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from fastapi.requests import HTTPConnection
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.routing import Route
 
 from lodestream.errors import (
@@ -24,15 +27,32 @@ from lodestream.errors import (
     TooLargeError,
 )
 
-__all__ = ["PROBLEM_EXAMPLE", "BuildFailedError", "NotReadyError", "SlowUploadError", "install", "problem", "responses"]
+__all__ = [
+    "PROBLEM_EXAMPLE",
+    "BadTokenError",
+    "BuildFailedError",
+    "BusyError",
+    "ForeignOriginError",
+    "FullError",
+    "NoTokenError",
+    "NotReadyError",
+    "SlowUploadError",
+    "SmallScopeError",
+    "TooManyError",
+    "answer",
+    "install",
+    "problem",
+    "responses",
+]
 
 _log = logging.getLogger(__name__)
 _MEDIA_TYPE = "application/problem+json"
-_RETRY_SECONDS = 1
 
 
 class NotReadyError(LodestreamError):
     """The surface is still being built."""
+
+    headers: ClassVar = {"retry-after": "1"}
 
 
 class BuildFailedError(LodestreamError):
@@ -40,7 +60,45 @@ class BuildFailedError(LodestreamError):
 
 
 class SlowUploadError(LodestreamError):
-    """Nothing came of an upload for too long."""
+    """Nothing, or too little, came of an upload for too long."""
+
+
+class NoTokenError(LodestreamError):
+    """A token is needed, and none came."""
+
+    headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream"'}
+
+
+class BadTokenError(LodestreamError):
+    """A token or a ticket came that is not known, or no longer."""
+
+    headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="invalid_token"'}
+
+
+class SmallScopeError(LodestreamError):
+    """A token came that does not allow this."""
+
+    headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="insufficient_scope"'}
+
+
+class ForeignOriginError(LodestreamError):
+    """The page of another site asks."""
+
+
+class TooManyError(LodestreamError):
+    """One client has as much at the same time as it may."""
+
+    headers: ClassVar = {"retry-after": "5"}
+
+
+class BusyError(LodestreamError):
+    """The server has as much at the same time as it can."""
+
+    headers: ClassVar = {"retry-after": "10"}
+
+
+class FullError(LodestreamError):
+    """There is no room for more surfaces."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +117,13 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (InputError, _Answer(422, "bad-input", "Input that cannot be used")),
     (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
     (SlowUploadError, _Answer(408, "idle", "Nothing was heard for too long")),
+    (NoTokenError, _Answer(401, "no-token", "A token is needed")),
+    (BadTokenError, _Answer(403, "bad-token", "A token that is not known, or no longer")),
+    (SmallScopeError, _Answer(403, "small-scope", "A token that does not allow this")),
+    (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
+    (TooManyError, _Answer(429, "too-many", "More at the same time than one client may have")),
+    (BusyError, _Answer(503, "busy", "As much to do as the server can; come back")),
+    (FullError, _Answer(507, "full", "There is no room for more")),
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
     (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
@@ -79,6 +144,7 @@ PROBLEM_EXAMPLE = {
 def install(app: FastAPI) -> None:
     """Answer every error of an application with a problem document."""
     app.add_exception_handler(LodestreamError, _raised)
+    app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(OSError, _raised)
     app.add_exception_handler(Exception, _raised)
     app.add_exception_handler(HTTPException, _refused)
@@ -111,12 +177,21 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
-async def _raised(request: Request, error: Exception) -> Response:
+async def _raised(request: HTTPConnection, error: Exception) -> Response:
+    return answer(request, error)
+
+
+def answer(request: HTTPConnection, error: Exception) -> Response:
+    """The problem document for an error."""
     status, code, title, detail = problem(error)
     if status >= 500:
-        _log.error("%s %s: %s", request.method, request.url.path, error, exc_info=error)
-    headers = {"retry-after": str(_RETRY_SECONDS)} if isinstance(error, NotReadyError) else {}
-    return _document(request, status, code, title, detail, headers)
+        _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
+    return _document(request, status, code, title, detail, getattr(error, "headers", {}))
+
+
+async def _gone(request: HTTPConnection, error: Exception) -> Response:
+    # Nobody is there to read it.
+    return _document(request, 400, "gone", "The client has gone", "the body ended before it was whole", {})
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -151,8 +226,9 @@ async def _invalid(request: Request, error: Exception) -> Response:
 
 
 def _document(
-    request: Request, status: int, code: str, title: str, detail: str, headers: dict[str, str]
+    request: HTTPConnection, status: int, code: str, title: str, detail: str, headers: Mapping[str, str]
 ) -> JSONResponse:
+    request.app.state.metrics.failed(code)
     content = {
         "type": f"urn:lodestream:{code}",
         "title": title,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from typing import Any, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 __all__ = ["Record", "State"]
 
@@ -35,6 +38,13 @@ class Record:
         SHA-256 of the container, once ready.
     info : mapping or None
         What ``lodestream info --json`` prints, once ready.
+    upload_sha256 : str or None
+        SHA-256 over the files and their lengths, as `uploads.Upload` computes it; None where an earlier version of the
+        server took the upload, or where the upload is lost.
+    attempts : int
+        Builds that were begun and of whose end nothing is known: the server itself died under them.
+    upload_lost : bool
+        The upload was damaged and set aside; the container is all there is.
     """
 
     id: str
@@ -47,14 +57,31 @@ class Record:
     reason: str | None = None
     container: str | None = None
     info: dict[str, Any] | None = field(default=None, repr=False)
+    upload_sha256: str | None = None
+    attempts: int = 0
+    upload_lost: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` takes."""
         return asdict(self)
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Record:
-        """The record that these values came from; what a later version has added is left out."""
-        known = {item.name for item in fields(cls)}
-        chosen = {name: value for name, value in values.items() if name in known}
-        return cls(**{**chosen, "filenames": tuple(chosen["filenames"])})
+    def from_json(cls, values: Any) -> Record:
+        """The record that these values came from; what a later version has added is left out.
+
+        Raises
+        ------
+        ValueError
+            When they are not those of a record, in one line.
+        """
+        try:
+            return _adapter().validate_python(values)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            place = ".".join(map(str, first["loc"])) or "record"
+            raise ValueError(f"{place}: {first['msg']}") from None
+
+
+@cache
+def _adapter() -> TypeAdapter[Record]:
+    return TypeAdapter(Record)

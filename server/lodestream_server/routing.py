@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
@@ -11,8 +10,11 @@ from fastapi import APIRouter, Depends
 from fastapi.requests import HTTPConnection
 from fastapi.responses import Response
 
+from .access import Access
 from .containers import Containers
 from .jobs import Builder
+from .limits import Limits, Turnstile
+from .metrics import Metrics
 from .settings import Settings
 from .storage import Storage
 
@@ -32,7 +34,14 @@ class State:
     storage: Storage
     builder: Builder
     containers: Containers
-    decoding: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
+    access: Access
+    limits: Limits
+    metrics: Metrics
+    decoding: Turnstile = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Let as many wait for a level as the settings say."""
+        object.__setattr__(self, "decoding", Turnstile(self.settings.max_level_requests))
 
 
 def _parts(connection: HTTPConnection) -> State:

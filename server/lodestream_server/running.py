@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import resource
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,12 +16,19 @@ from lodestream.errors import LodestreamError
 from lodestream.messages import MAX_MESSAGE
 
 from .app import create_app
+from .connections import connections
 from .settings import Settings
 
-__all__ = ["Server", "make_server", "running_server"]
+__all__ = ["Server", "make_server", "raise_file_limit", "running_server"]
+
+_log = logging.getLogger(__name__)
 
 _START_SECONDS = 60.0
-_GRACEFUL_SECONDS = 5
+_GRACEFUL_SECONDS = 4
+
+# A connection and the container that is sent over it, and what everything else needs.
+_FILES_EACH = 2
+_OTHER_FILES = 200
 
 # A ping waits behind what is in flight: a full window of 256 KiB takes 33 s on a link of 64 kbit/s.
 _PING_INTERVAL = 20.0
@@ -49,12 +58,17 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
     settings : Settings
     listening : callable
         Called with the server's address once it accepts connections.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        As `create_app` does.
     """
     config = uvicorn.Config(
         create_app(settings),
         host=settings.host,
         port=settings.port,
-        http="h11",
+        http=connections(settings),
         ws="websockets-sansio",
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.
@@ -66,8 +80,28 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         log_config=None,
         access_log=False,
         server_header=False,
+        root_path=settings.root_path,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
     )
     return Server(config, listening)
+
+
+def raise_file_limit(settings: Settings) -> None:
+    """Let this process open as many files as it may need, or as many as the system lets it."""
+    needed = _FILES_EACH * settings.max_connections + _OTHER_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    if soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    if allowed < needed:
+        _log.warning(
+            "%d connections may need %d open files and this process may open %d: raise the limit (ulimit -n) or set "
+            "LODESTREAM_MAX_CONNECTIONS",
+            settings.max_connections,
+            needed,
+            allowed,
+        )
 
 
 @contextmanager

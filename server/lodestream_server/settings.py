@@ -1,35 +1,78 @@
-"""What an operator may choose, in one table: name, default, limits and meaning."""
+"""The settings of a server: the table's values, checked, from the environment or from whoever makes a server."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from .table import PREFIX, TABLE
 
 __all__ = ["Settings"]
 
 
+def _field(name: str) -> Any:
+    setting = TABLE[name]
+    default: dict[str, Any] = (
+        {"default_factory": setting.default} if callable(setting.default) else {"default": setting.default}
+    )
+    return Field(description=setting.meaning, **default)
+
+
 class Settings(BaseSettings):
-    """Settings of a server; each can be given as an environment variable with the prefix ``LODESTREAM_``."""
+    """Settings of a server; each is an environment variable with the prefix ``LODESTREAM_`` too.
 
-    model_config = SettingsConfigDict(env_prefix="LODESTREAM_", frozen=True, extra="forbid")
+    `lodestream_server.table` says what each of them means.
+    """
 
-    host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 takes a free one")
-    insecure: bool = Field(
-        default=False, description="listen on an address that others can reach, without access control"
-    )
-    data: Path = Field(default=Path("lodestream-data"), description="folder of uploads and containers")
-    upload_bytes: int = Field(default=4 << 30, ge=1, description="most bytes of one upload")
-    upload_files: int = Field(default=64, ge=1, description="most files of one upload")
-    max_vertices: int = Field(default=1 << 28, ge=1, description="most vertices of one surface")
-    workers: int = Field(
-        default_factory=lambda: max(1, (os.cpu_count() or 1) - 1), ge=1, description="builds at the same time"
-    )
-    build_seconds: float = Field(default=3600.0, gt=0, description="longest time of one build")
-    idle_seconds: float = Field(
-        default=60.0, gt=0, description="longest silence of a stream's client before it is closed"
-    )
-    bye_seconds: float = Field(default=10.0, gt=0, description="longest wait for a client's bye after the end")
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
+
+    host: str = _field("host")
+    port: int = _field("port")
+    data: Path = _field("data")
+    root_path: str = _field("root_path")
+    trusted_proxies: Annotated[tuple[str, ...], NoDecode] = _field("trusted_proxies")
+    insecure: bool = _field("insecure")
+    token_file: Path | None = _field("token_file")
+    public_reads: bool = _field("public_reads")
+    origins: Annotated[tuple[str, ...], NoDecode] = _field("origins")
+    ticket_seconds: float = _field("ticket_seconds")
+    upload_bytes: int = _field("upload_bytes")
+    upload_files: int = _field("upload_files")
+    max_uploads: int = _field("max_uploads")
+    max_vertices: int = _field("max_vertices")
+    max_surfaces: int = _field("max_surfaces")
+    keep_free: int | None = _field("keep_free")
+    max_connections: int = _field("max_connections")
+    max_streams: int = _field("max_streams")
+    max_client_streams: int = _field("max_client_streams")
+    max_level_requests: int = _field("max_level_requests")
+    max_builds: int = _field("max_builds")
+    workers: int = _field("workers")
+    build_memory: int = _field("build_memory")
+    build_seconds: float = _field("build_seconds")
+    idle_seconds: float = _field("idle_seconds")
+    upload_rate: int = _field("upload_rate")
+    head_seconds: float = _field("head_seconds")
+    bye_seconds: float = _field("bye_seconds")
+    log_format: str = _field("log_format")
+    log_level: str = _field("log_level")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _take(cls, value: Any, info: Any) -> Any:
+        return TABLE[info.field_name].take(value)
+
+    @field_validator("root_path")
+    @classmethod
+    def _rooted(cls, value: str) -> str:
+        if value and (not value.startswith("/") or value.endswith("/")):
+            raise ValueError(f"expected a path that begins with a slash and does not end with one, got {value!r}")
+        return value
+
+    @property
+    def tokens(self) -> Path:
+        """The file of token hashes, whether or not there is one."""
+        return self.data / "tokens.json" if self.token_file is None else self.token_file

@@ -17,15 +17,18 @@ from fastapi.responses import JSONResponse
 from starlette.websockets import WebSocketDisconnect
 
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
-from lodestream.messages import CODES, SUBPROTOCOL, MessageError
+from lodestream.messages import CODES, SUBPROTOCOL, MessageError, Open
 from lodestream.protocol import State
 from lodestream.sender import Sender
+from lodestream.wire import parse
 
+from .access import Caller, anybody
 from .containers import OpenContainer
 from .files import ready
-from .problems import BuildFailedError, NotReadyError
+from .gate import caller_of
+from .logs import event
+from .problems import BadTokenError, BuildFailedError, BusyError, NoTokenError, NotReadyError, TooManyError
 from .routing import Parts
-from .settings import Settings
 
 __all__ = ["router"]
 
@@ -47,25 +50,69 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         await _refuse_handshake(socket)
         return
     await socket.accept(subprotocol=SUBPROTOCOL)
+    caller = caller_of(socket)
     try:
-        record = ready(parts, surface)
-        container = await asyncio.to_thread(parts.containers.open, record.container or "")
-    except LodestreamError as error:
-        await _refuse(socket, _code(error), str(error))
+        with parts.limits.stream((caller or anybody(socket)).key):
+            first = None
+            if caller is None:
+                # Nothing is told of the surface, not even whether it exists, before the ticket was seen.
+                first = await _first_message(socket, parts.settings.head_seconds)
+                caller = parts.access.redeem(_ticket(first))
+            record = ready(parts, surface)
+            container = await asyncio.to_thread(parts.containers.open, record.container or "")
+            await _stream(_Session(socket, container, parts, first), surface, caller)
+    except WebSocketDisconnect:
         return
+    except LodestreamError as error:
+        parts.metrics.failed(_code(error))
+        await _refuse(socket, _code(error), str(error))
+
+
+async def _stream(session: _Session, surface: str, caller: Caller) -> None:
     started = time.monotonic()
-    session = _Session(socket, container, parts.settings)
+    event(_log, "stream opened", surface=surface, client=caller.name)
+    session.metrics.stream_opened()
     try:
         await session.run()
     finally:
-        container.close()
-        _log.info(
-            "stream of %s ended: %s, %d bytes in %.3f s",
-            surface,
-            session.result,
-            session.sent,
-            time.monotonic() - started,
+        session.close()
+        session.metrics.stream_ended(session.result, session.sent, session.saved)
+        event(
+            _log,
+            "stream ended",
+            surface=surface,
+            client=caller.name,
+            result=session.result,
+            bytes=session.sent,
+            saved=session.saved,
+            first_surface=session.first_surface,
+            seconds=time.monotonic() - started,
         )
+
+
+async def _first_message(socket: WebSocket, patience: float) -> bytes:
+    try:
+        async with asyncio.timeout(patience):
+            return await _message(socket)
+    except TimeoutError:
+        raise _SilentError(f"expected open within {patience:g} s") from None
+
+
+async def _message(socket: WebSocket) -> bytes:
+    message = await socket.receive()
+    if message["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(message.get("code", 1006), message.get("reason"))
+    data: bytes | None = message.get("bytes")
+    if data is None:
+        raise MessageError("bad-message", "expected a binary message, got text")
+    return data
+
+
+def _ticket(message: bytes) -> str | None:
+    first = parse(message)
+    if not isinstance(first, Open):
+        raise MessageError("out-of-turn", f"expected open, got {first.type}")
+    return first.ticket
 
 
 class _SilentError(LodestreamError):
@@ -79,13 +126,19 @@ class _Session:
     ----------
     result : str
         How it ended, in a word, for the log.
+    first_surface : float or None
+        Seconds from the client's open to the first layer's being sent.
     """
 
-    def __init__(self, socket: WebSocket, container: OpenContainer, settings: Settings) -> None:
+    def __init__(self, socket: WebSocket, container: OpenContainer, parts: Parts, first: bytes | None) -> None:
         self.result = "lost"
+        self.first_surface: float | None = None
+        self.metrics = parts.metrics
+        self._first = first
+        self._opened = 0.0
         self._socket = socket
         self._container = container
-        self._settings = settings
+        self._settings = parts.settings
         self._sender = Sender(container.index, container.sha256)
         self._heard = asyncio.Event()
 
@@ -94,11 +147,22 @@ class _Session:
         """Bytes of the container that were sent."""
         return self._sender.sent
 
+    @property
+    def saved(self) -> int:
+        """Bytes of the container that were not sent, since the target was met or the client had seen enough."""
+        return 0 if self._sender.why in (None, "complete") else self._container.index.size - self._sender.sent
+
+    def close(self) -> None:
+        """Close the container."""
+        self._container.close()
+
     async def run(self) -> None:
         """Stream until the client says bye, is refused, or is gone."""
         try:
             await self._both()
-        except WebSocketDisconnect:
+        except WebSocketDisconnect as gone:
+            if gone.code == CODES["restarting"].close:
+                self.result = "restarting"
             return
         except (LodestreamError, OSError) as error:
             await self._fail(_code(error), str(error) if isinstance(error, LodestreamError) else "see the server's log")
@@ -124,12 +188,8 @@ class _Session:
 
     async def _receive(self) -> None:
         while self._sender.state is not State.CLOSED:
-            message = await self._socket.receive()
-            if message["type"] == "websocket.disconnect":
-                raise WebSocketDisconnect(message.get("code", 1006), message.get("reason"))
-            data = message.get("bytes")
-            if data is None:
-                raise MessageError("bad-message", "expected a binary message, got text")
+            data, self._first = self._first or await _message(self._socket), None
+            self._opened = self._opened or time.monotonic()
             self._sender.receive(data)
             self._heard.set()
 
@@ -139,6 +199,9 @@ class _Session:
             if message is not None:
                 async with self._patience(self._settings.idle_seconds, "the client to take what was sent"):
                     await self._socket.send_bytes(message)
+                if self._sender.layers and self.first_surface is None:
+                    self.first_surface = time.monotonic() - self._opened
+                    self.metrics.first_surface(self.first_surface)
             elif (wanted := self._sender.wanted()) is not None:
                 self._sender.provide(wanted, await asyncio.to_thread(self._container.read, wanted))
             else:
@@ -167,6 +230,7 @@ class _Session:
 
     async def _fail(self, code: str, detail: str) -> None:
         self.result = code
+        self.metrics.failed(code)
         self._sender.fail(code, detail)
         message = self._sender.next_message()
         if message is not None:
@@ -187,6 +251,10 @@ def _code(error: Exception) -> str:
         (NotFoundError, "not-found"),
         (NotReadyError, "not-ready"),
         (BuildFailedError, "failed"),
+        (NoTokenError, "no-token"),
+        (BadTokenError, "bad-token"),
+        (TooManyError, "too-many"),
+        (BusyError, "busy"),
         (StreamError, "damaged"),
     )
     return next((code for kind, code in known if isinstance(error, kind)), "internal")

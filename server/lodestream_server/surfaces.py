@@ -32,7 +32,7 @@ router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
         200: examples.answer("The same surface is there already", examples.READY, location=True),
-        **responses(408, 413, 422, 507),
+        **responses(408, 413, 422, 503, 507),
     },
 )
 async def upload(request: Request, parts: Parts) -> Response:
@@ -42,15 +42,15 @@ async def upload(request: Request, parts: Parts) -> Response:
     options that are known already give the surface that is there.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
-    folder = await asyncio.to_thread(parts.storage.new_upload)
-    try:
-        received = await uploads.receive(request, folder, parts.settings, chosen.filename)
-        record = await asyncio.to_thread(_record, received, chosen, parts)
-        record, new = await asyncio.to_thread(parts.storage.add, record, folder)
-    finally:
-        await asyncio.to_thread(remove, folder)
-    if new:
-        parts.builder.submit(record)
+    async with parts.limits.upload(request) as watched:
+        folder = await asyncio.to_thread(parts.storage.new_upload)
+        try:
+            received = await uploads.receive(watched, folder, parts.settings, chosen.filename)
+            record = await asyncio.to_thread(_record, received, chosen, parts)
+            record, _ = await parts.builder.accept(record, folder)
+        finally:
+            await asyncio.to_thread(remove, folder)
+    parts.metrics.uploaded(received.size)
     content = _present(record, parts, request, full=True)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
     status = 200 if content["state"] == "ready" else 202
@@ -110,6 +110,7 @@ def _record(received: uploads.Upload, chosen: options.SurfaceOptions, parts: Sta
         filenames=tuple(name or "" for name in names),
         upload_bytes=received.size,
         options=chosen.chosen,
+        upload_sha256=received.digest.hexdigest(),
     )
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import resource
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
     from lodestream import Surface
 
-__all__ = ["CLOSED", "UNNAMED", "Built", "Job", "Refused", "build", "read_progress", "warm"]
+__all__ = ["CLOSED", "UNNAMED", "Built", "Job", "Refused", "build", "limit_memory", "read_progress", "warm"]
 
 _log = logging.getLogger(__name__)
 
@@ -94,8 +96,17 @@ def build(job: Job) -> Built | Refused:
         return _build(job)
     except LodestreamError as error:
         return Refused(str(error))
-    except MemoryError:
-        return Refused("expected a surface that fits into memory, got a larger one")
+
+
+def limit_memory(most: int | None) -> None:
+    """Let this process have no more than so many bytes; beyond them it gets MemoryError, or ends.
+
+    What is counted is memory that it can write to and shares with nobody: neither code nor files that are mapped for
+    reading. None is no limit.
+    """
+    if most is not None:
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
 def read_progress(folder: Path) -> float:
@@ -156,9 +167,10 @@ def _reporter(folder: Path) -> Callable[[float], None]:
         now = time.monotonic()
         if now - last >= _REPORT_SECONDS:
             last = now
-            # Renamed, so that the server never reads half a number; not worth a sync.
+            # Renamed, so that the server never reads half a number; not worth a sync, nor an end if the disk is full.
             new = folder / f"{_PROGRESS}.new"
-            new.write_text(f"{min(max(fraction, 0.0), 1.0):.4f}")
-            new.replace(folder / _PROGRESS)
+            with suppress(OSError):
+                new.write_text(f"{min(max(fraction, 0.0), 1.0):.4f}")
+                new.replace(folder / _PROGRESS)
 
     return report

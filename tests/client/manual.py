@@ -10,7 +10,8 @@ from pathlib import Path
 from lodestream_client.__main__ import main
 
 PATH = Path(__file__).parents[2] / "docs" / "cli.md"
-COMMANDS = ("demo", "serve", "encode", "decode", "info", "push", "pull", "list", "rm")
+COMMANDS = ("demo", "serve", "token", "encode", "decode", "info", "push", "pull", "list", "rm")
+ACTIONS = {"token": ("create", "list", "revoke")}
 
 _INTRODUCTION = """\
 # The command line
@@ -42,7 +43,9 @@ def help_of(*command: str) -> str:
 def render() -> str:
     """The whole page."""
     sections = [_INTRODUCTION, f"```text\n{help_of()}```\n"]
-    sections += [f"## {command}\n\n```text\n{help_of(command)}```\n" for command in COMMANDS]
+    for command in COMMANDS:
+        sections.append(f"## {command}\n\n```text\n{help_of(command)}```\n")
+        sections += [f"```text\n{help_of(command, action)}```\n" for action in ACTIONS.get(command, ())]
     return "\n".join(sections)
 
 

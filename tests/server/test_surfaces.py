@@ -219,6 +219,8 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     assert set(schema["paths"]) == {
         "/healthz",
         "/readyz",
+        "/metrics",
+        "/v1/tickets",
         "/v1/surfaces",
         "/v1/surfaces/{surface}",
         "/v1/surfaces/{surface}/container",
@@ -228,7 +230,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
     assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "closed", "name", "filename"}
-    assert set(post["responses"]) == {"200", "202", "408", "413", "422", "507"}
+    assert set(post["responses"]) == {"200", "202", "401", "403", "408", "413", "422", "503", "507"}
     example = post["responses"]["202"]["content"]["application/json"]["example"]
     real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()
     # The framework leaves nulls out of examples.

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from ..errors import FormatError, InputError, OptionError
 from ..seams import restore
 from ..surface import Closed, Surface
-from . import geotiff, npy, npz, obj, plot3d, ply
+from . import bezier, geotiff, npy, npz, obj, pcd, plot3d, ply
 from .source import DEFAULT_MAX_VERTICES, Source
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
@@ -78,8 +78,10 @@ _FORMATS = (
     Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
     Format("npz", (".npz",), npz.sniff, npz.read, options={"array": "name of the array that is the surface"}),
     Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options={"band": "number of the band, from 1"}),
-    Format("ply", (".ply",), ply.sniff, write=ply.write),
+    Format("ply", (".ply",), ply.sniff, ply.read, ply.write),
     Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
+    Format("pcd", (".pcd",), pcd.sniff, pcd.read),
+    Format("bpt", (bezier.SUFFIX,), bezier.sniff, bezier.read, options=bezier.OPTIONS),
     Format("plot3d", plot3d.SUFFIXES, plot3d.sniff, plot3d.read, options=plot3d.READ_OPTIONS, more=plot3d.MORE),
 )
 

@@ -33,8 +33,8 @@ READ_OPTIONS: Mapping[str, str] = {
     **{name: words for name, (_, words) in OPTIONS.items()},
 }
 
-#: Points along an axis that a file without a suffix may have, to be taken for PLOT3D.
-_MAX_POINTS = 1 << 20
+#: What the first two integers of a file may be, to be taken for PLOT3D.
+_MAX_FIRST = 1 << 20
 
 #: Reference numbers at the start of a Q file.
 _REFERENCES = ("mach", "alpha", "reynolds", "time")
@@ -51,7 +51,7 @@ def sniff(head: bytes, suffix: str) -> bool:
     if len(head) < 8 or not head.translate(None, bytes(range(9, 14)) + bytes(range(32, 127))):
         return False
     pairs = (struct.unpack_from(f"{endian}2i", head) for endian in "<>")
-    return bool(suffix) or any(min(pair) > 0 and max(pair) <= _MAX_POINTS for pair in pairs)
+    return any(min(pair) > 0 and max(pair) <= _MAX_FIRST for pair in pairs)
 
 
 def read(source: Source) -> Surface:

@@ -1,4 +1,4 @@
-"""PLY, binary and little-endian, written only."""
+"""PLY: range grids read; any surface written, binary and little-endian."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError, TooLargeError
 from ..surface import Surface
+from . import range_grid
+from .ply_elements import read_header
 from .quads import columns, edges, quads
-from .source import number
+from .source import Source, number
 
-__all__ = ["sniff", "write"]
+__all__ = ["read", "sniff", "write"]
 
 _NAMES = {"f4": "float", "f8": "double"}
 _MAX_INDEX = 2**31 - 1
@@ -25,6 +27,15 @@ _EXACT = {"f4": 2**24, "f8": 2**53}
 def sniff(head: bytes, suffix: str) -> bool:
     """Whether a file begins like PLY."""
     return head.startswith((b"ply\n", b"ply\r"))
+
+
+def read(source: Source) -> Surface:
+    """Read a range grid."""
+    header = read_header(source.path)
+    names = [element.name for element in header.elements]
+    if range_grid.ELEMENT in names:
+        return range_grid.read(source, header)
+    raise FormatError(f"expected a PLY file with {range_grid.ELEMENT}, got elements {', '.join(names) or 'none'}")
 
 
 def write(surface: Surface, file: BinaryIO) -> None:

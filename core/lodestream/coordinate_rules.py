@@ -1,0 +1,180 @@
+"""Rules of coordinates that follow their index, found so that every value is made again bit for bit.
+
+A *rule* is a list of plain numbers, evaluated in float64 in the order shown and rounded to the type of the points::
+
+    [origin, step]                          origin + step k           k: the column for x, the row for y
+    [origin, step, scale]                   (origin + step k) / scale
+    [origin, last, true]                    origin + (last - origin) / (n - 1) k; at the end, last (numpy.linspace)
+    [origin, across, down, shift]           across (column + shift) + down (row + shift) + origin
+    [v0, v1, v2, ..., "values"]             the numbers themselves, of each column for x, of each row for y
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["VALUES", "Rule", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
+
+Rule = list[Any]
+
+#: Ends a rule that holds the numbers themselves.
+VALUES = "values"
+
+_SAMPLE = 64
+
+
+def evaluate(
+    rule: Sequence[Any], row: NDArray[np.float64], column: NDArray[np.float64], down: bool
+) -> NDArray[np.float64]:
+    """Float64 values that broadcast to (H, W), at rows (H, 1) and columns (1, W)."""
+    place = row if down else column
+    if rule[-1] == VALUES:
+        values = np.asarray(rule[:-1], np.float64)
+        return np.interp(place.ravel(), np.arange(len(values)), values).reshape(place.shape)
+    if len(rule) == 2:
+        return np.asarray(place * float(rule[1]) + float(rule[0]))
+    if rule[-1] is True:
+        origin, last, _ = map(float, rule)
+        values = place * ((last - origin) / (place.size - 1)) + origin
+        values.reshape(-1)[-1] = last
+        return np.asarray(values)
+    if len(rule) == 3:
+        return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
+    origin, across, by_row, shift = map(float, rule)
+    return np.asarray((column + shift) * across + (row + shift) * by_row + origin)
+
+
+def rounded(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Float64 values in a type of points: the nearest float or the nearest integer."""
+    return (values if dtype.kind == "f" else np.rint(values)).astype(dtype)
+
+
+def bits(values: NDArray[Any]) -> NDArray[Any]:
+    """Values to compare bit by bit, so that -0.0 is not 0.0."""
+    return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
+
+
+def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule | None:
+    """The rule that makes every value of an evenly spaced axis again, bit for bit.
+
+    Parameters
+    ----------
+    line : array of shape (N,)
+        Coordinates in order, of any type of points.
+    known : bool array of shape (N,), optional
+        The others may be anything.
+
+    Returns
+    -------
+    list or None
+        One of the first four kinds of rules of the module; None where there is none, also where all are the same.
+    """
+    index = np.arange(len(line)) if known is None else np.flatnonzero(known)
+    values = line[index]
+    if len(values) < 2 or not np.isfinite(values).all() or not _nearly_even(index, values):
+        return None
+    sample = np.unique(np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).round().astype(int))
+    for rule in _candidates(index, values):
+        if all(_makes(rule, len(line), index[part], values[part]) for part in (sample, slice(None))):
+            return [plain(number) for number in rule]
+    return None
+
+
+def _makes(rule: Rule, length: int, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
+    if rule[-1] is True:  # depends on the last index, and is cheap to make whole
+        made = evaluate(rule, np.zeros((1, 1)), np.arange(length, dtype=np.float64)[None, :], False)[0, index]
+    else:
+        made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
+    return np.array_equal(bits(rounded(made, values.dtype)), bits(values))
+
+
+def plain(number: Any) -> Any:
+    """Whole numbers as integers, which take fewer bytes; -0.0 is none."""
+    whole = number is not True and number == int(number) and str(number) != "-0.0"
+    return int(number) if whole else number
+
+
+def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
+    """Whether values of different places lie on a line, but for rounding."""
+    exact = values.astype(np.float64)
+    step = (exact[-1] - exact[0]) / float(index[-1] - index[0])
+    rounding = np.finfo(values.dtype).eps if values.dtype.kind == "f" else 0.0
+    allowed = 4 * rounding * float(np.abs(exact).max()) + (0.0 if rounding else 0.5) + 1e-9 * abs(step)
+    away = np.abs(exact[0] + step * (index - index[0]) - exact).max()
+    return bool(step) and bool(away <= min(allowed, abs(step) / 4)) and float(np.abs(exact).max()) < 2**53
+
+
+def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule]:
+    """Rules that may have made these values, the likely ones first."""
+    ends = [float(values[0]), float(values[-1])]
+    steps = _steps(index, values)
+    firsts = [ends[0], float(str(values[0]))] if values.dtype.kind == "f" else ends[:1]
+    if index[0] == 0:
+        yield from ([first, step] for first in dict.fromkeys(firsts) for step in steps)
+        yield from ([first, last, True] for first, last in (ends, [float(str(values[0])), float(str(values[-1]))]))
+    if values.dtype == np.float32:
+        yield from _stabbed(index, values, steps[0])
+    for step in steps:
+        for origin in neighbours(ends[0] - (index[0] + 0.5) * step):
+            yield [origin, step, 0, 0.5]
+        if index[0] > 0:
+            yield from ([origin, step] for origin in neighbours(ends[0] - index[0] * step))
+    for scale in (*(10.0**places for places in range(1, 10)), float(np.rint(1 / steps[0]))):
+        step = float(np.rint(steps[0] * scale))
+        origin = float(np.rint(ends[0] * scale)) - step * int(index[0])
+        if scale > 1 and step and abs(origin) < 2**53:
+            yield [origin, step, scale]
+
+
+def _steps(index: NDArray[np.int64], values: NDArray[Any]) -> list[float]:
+    exact = values.astype(np.float64)
+    mean = float((exact[-1] - exact[0]) / (index[-1] - index[0]))
+    first = float((exact[1] - exact[0]) / (index[1] - index[0]))
+    decimals = [float(f"{mean:.{digits}g}") for digits in range(1, 17)]
+    parts = [1 / float(np.rint(1 / mean))] if abs(mean) < 1 else []
+    return [step for step in dict.fromkeys((mean, first, *parts, *decimals, *neighbours(mean))) if step]
+
+
+def neighbours(value: float) -> list[float]:
+    """A number, decimals close to it, and the numbers right beside it."""
+    found = [value, *(float(f"{value:.{digits}g}") for digits in (15, 14, 13, 12, 10, 8))]
+    below = above = value
+    for _ in range(3):
+        below, above = float(np.nextafter(below, -np.inf)), float(np.nextafter(above, np.inf))
+        found += [below, above]
+    return list(dict.fromkeys(found))
+
+
+def _stabbed(index: NDArray[np.int64], values: NDArray[Any], step: float) -> Iterator[Rule]:
+    """Lines that pass within the rounding of every value, if there are any: one that starts at the first, and any.
+
+    The room that a slope leaves for the origin is a concave function of the slope, so that its peak is found by thirds.
+    """
+    exact = values.astype(np.float64)
+    above = (np.nextafter(values, np.float32(np.inf)).astype(np.float64) - exact) / 2
+    below = (exact - np.nextafter(values, np.float32(-np.inf)).astype(np.float64)) / 2
+
+    later = index > 0
+    for first in (exact[0], float(str(values[0]))) if index[0] == 0 else (0.0,):
+        bottoms = (exact[later] - below[later] - first) / index[later]
+        tops = (exact[later] + above[later] - first) / index[later]
+        yield [float(first), float(bottoms.max() + tops.min()) / 2]
+
+    def origins(slope: float) -> tuple[float, float]:
+        rest = exact - slope * index
+        return float((rest - below).max()), float((rest + above).min())
+
+    spread = 2 * float((above + below).max()) / float(index[-1] - index[0])
+    low, high = step - spread, step + spread
+    for _ in range(80):
+        one, two = low + (high - low) / 3, high - (high - low) / 3
+        rooms = [top - bottom for bottom, top in (origins(one), origins(two))]
+        low, high = (one, high) if rooms[0] < rooms[1] else (low, two)
+    slope = (low + high) / 2
+    bottom, top = origins(slope)
+    if bottom <= top:
+        yield [(bottom + top) / 2, slope]

@@ -1,0 +1,98 @@
+"""The log: lines of words and fields, for people or as JSON, each with the id of the request that it belongs to."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import secrets
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from typing import Any
+
+__all__ = ["configure", "event", "new_request", "request_id"]
+
+_FIELDS = "lodestream_fields"
+_request: ContextVar[str | None] = ContextVar("lodestream_request", default=None)
+_USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
+_PLAIN = re.compile(r"[A-Za-z0-9._:/@+*,;<>()\[\]-]+", re.ASCII)
+
+
+def configure(style: str, level: str) -> None:
+    """Write the log to standard error.
+
+    Parameters
+    ----------
+    style : "text" or "json"
+    level : str
+        The least that is worth a line, of what this server says; libraries are heard from ``warning`` on.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Json() if style == "json" else _Text())
+    handler.addFilter(_is_worth_a_line)
+    root = logging.getLogger()
+    root.handlers = [handler]
+    root.setLevel(logging.WARNING)
+    logging.getLogger("lodestream_server").setLevel(level.upper())
+
+
+def event(log: logging.Logger, words: str, level: int = logging.INFO, **fields: Any) -> None:
+    """Say that something has happened, and what is known of it."""
+    log.log(level, words, extra={_FIELDS: fields})
+
+
+def new_request(offered: str | None) -> str:
+    """Begin a request; its id, which is what the client or a proxy calls it, if that is usable."""
+    name = offered if offered is not None and _USABLE_ID.fullmatch(offered) else secrets.token_hex(8)
+    _request.set(name)
+    return name
+
+
+def request_id() -> str | None:
+    """The id of the request that is being answered."""
+    return _request.get()
+
+
+def _is_worth_a_line(record: logging.LogRecord) -> bool:
+    # uvicorn says so of every handshake that is refused with an answer, which is in order.
+    return record.msg != "ASGI callable returned without completing handshake."
+
+
+def _fields(record: logging.LogRecord) -> dict[str, Any]:
+    fields = dict(getattr(record, _FIELDS, {}))
+    if (name := request_id()) is not None:
+        fields["request"] = name
+    return fields
+
+
+class _Text(logging.Formatter):
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's name
+        pairs = "".join(f" {key}={_value(value)}" for key, value in _fields(record).items() if value is not None)
+        return _line(super().formatMessage(record)) + pairs
+
+
+class _Json(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        document = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_fields(record),
+        }
+        if record.exc_info:
+            document["error"] = self.formatException(record.exc_info)
+        return json.dumps(document, default=str)
+
+
+def _value(value: Any) -> str:
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text)
+
+
+def _line(text: str) -> str:
+    # What a stranger sent must not be able to begin a line of its own, or to move a terminal's cursor.
+    return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)

@@ -1,0 +1,75 @@
+"""What is written down of every request: an id, a line in the log, figures."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from .logs import event, new_request
+from .metrics import Metrics
+
+__all__ = ["Observation"]
+
+_log = logging.getLogger(__name__)
+
+# Probes come every few seconds and say nothing.
+_QUIET = {"/healthz", "/readyz", "/metrics"}
+_METHODS = {"DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT"}
+
+
+class Observation:
+    """ASGI middleware around everything else.
+
+    Parameters
+    ----------
+    app : ASGI application
+    metrics : Metrics
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, and watch."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        name = new_request(Headers(scope=scope).get("x-request-id"))
+        started = time.monotonic()
+        status = 0
+
+        async def named(message: Message) -> None:
+            nonlocal status
+            if message["type"] in ("http.response.start", "websocket.accept", "websocket.http.response.start"):
+                status = message.get("status", 101)
+                message.setdefault("headers", [])
+                MutableHeaders(scope=message).append("x-request-id", name)
+            await send(message)
+
+        try:
+            await self._app(scope, receive, named)
+        finally:
+            # The log of a stream tells more than that its handshake was accepted.
+            if status != 101:
+                self._write(scope, status, time.monotonic() - started)
+
+    def _write(self, scope: Scope, status: int, seconds: float) -> None:
+        # What strangers may choose, paths and methods, must not make a figure each.
+        route = getattr(scope.get("route"), "path", "none")
+        method = scope.get("method", "WEBSOCKET")
+        self._metrics.answered(method if method in _METHODS | {"WEBSOCKET"} else "other", route, status, seconds)
+        client = scope.get("client")
+        event(
+            _log,
+            "request",
+            logging.DEBUG if scope["path"] in _QUIET else logging.INFO,
+            method=method[:20],
+            path=scope["path"][:200],
+            status=status,
+            seconds=seconds,
+            client=client[0] if client else None,
+        )

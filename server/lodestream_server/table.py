@@ -1,0 +1,342 @@
+"""What an operator may choose, in one table: name, default, limits and meaning.
+
+`settings` reads it from the environment, `command` offers it on the command line, `docs/settings.md` is written from
+it. Nothing heavy is imported here: the command line's parser is made from this table, whatever the command.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
+
+#: What the names of environment variables begin with.
+PREFIX = "LODESTREAM_"
+
+_UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
+_UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("kmgt", 1)}
+_TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a value is written.
+
+    Attributes
+    ----------
+    expected : str
+        What it has to be, in words.
+    metavar : str
+        What stands for it in a command line.
+    parse : callable
+        From text to the value; ValueError when the text is none.
+    show : callable
+        From the value to text that `parse` takes.
+    """
+
+    expected: str
+    metavar: str
+    parse: Callable[[str], Any]
+    show: Callable[[Any], str] = str
+
+
+def _size(text: str) -> int:
+    found = re.fullmatch(r"(\d{1,18})(\.\d{1,9})? ?([a-z]{0,3})", text.lower(), re.ASCII)
+    unit = None if found is None else _UNITS.get(found[3].removesuffix("b"))
+    if found is None or unit is None:
+        raise ValueError
+    size: int = int(found[1]) * unit + round(float(found[2] or 0) * unit)
+    return size
+
+
+def _show_size(size: int) -> str:
+    for power, letter in reversed(tuple(enumerate("KMGT", 1))):
+        if size and size % 1024**power == 0:
+            return f"{size // 1024**power}{letter}iB"
+    return str(size)
+
+
+def _switch(text: str) -> bool:
+    if text.lower() not in _TRUE + _FALSE:
+        raise ValueError
+    return text.lower() in _TRUE
+
+
+def _path(text: str) -> Path:
+    if not text or "\0" in text:
+        raise ValueError
+    return Path(text)
+
+
+def _list(text: str) -> tuple[str, ...]:
+    return tuple(filter(None, (part.strip() for part in text.split(","))))
+
+
+def _choice(*words: str) -> Kind:
+    def parse(text: str) -> str:
+        if text not in words:
+            raise ValueError
+        return text
+
+    return Kind(f"one of {', '.join(words)}", "{" + ",".join(words) + "}", parse)
+
+
+_TEXT = Kind("text", "TEXT", str)
+_INTEGER = Kind("an integer", "N", int)
+_SECONDS = Kind("seconds", "S", float, lambda value: f"{value:g}")
+_SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", _size, _show_size)
+_SWITCH = Kind("yes or no", "", _switch, lambda value: "yes" if value else "no")
+_PATH = Kind("a path", "PATH", _path)
+_LIST = Kind("words separated by commas", "A,B", _list, ",".join)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One thing that an operator may choose.
+
+    Attributes
+    ----------
+    name : str
+        Field of `Settings`; upper case and with `PREFIX` a variable of the environment; with hyphens an option.
+    kind : Kind
+    default : value, or callable that gives it
+    meaning : str
+        What it is, in a line.
+    group : str
+        Key of `GROUPS`.
+    least, most : number or None
+        Limits, themselves allowed.
+    above : number or None
+        Limit, itself not allowed.
+    metavar : str
+        What stands for the value on the command line; the kind's own if empty.
+    usual : str
+        What the default is, in words, where it is not the same everywhere.
+    """
+
+    name: str
+    kind: Kind
+    default: Any
+    meaning: str
+    group: str
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    metavar: str = ""
+    usual: str = ""
+
+    @property
+    def variable(self) -> str:
+        """The variable of the environment."""
+        return PREFIX + self.name.upper()
+
+    @property
+    def option(self) -> str:
+        """The option of the command line."""
+        return "--" + self.name.replace("_", "-")
+
+    @property
+    def default_text(self) -> str:
+        """The default, in words."""
+        return self.usual or self.kind.show(self.default)
+
+    @property
+    def limits(self) -> str:
+        """The limits, in words; empty if there are none."""
+        if self.above is not None:
+            return f"more than {self.kind.show(self.above)}"
+        if not self.least and self.most is None:
+            return ""
+        least = self.kind.show(self.least)
+        return f"at least {least}" if self.most is None else f"{least} to {self.kind.show(self.most)}"
+
+    def take(self, value: Any) -> Any:
+        """The value that some text stands for, or the value itself, once it is within the limits.
+
+        Raises
+        ------
+        ValueError
+            When it is not.
+        """
+        if isinstance(value, str):
+            try:
+                value = self.kind.parse(value)
+            except ValueError:
+                raise ValueError(f"expected {self.kind.expected}, got {value!r}") from None
+        if isinstance(value, int | float) and not isinstance(value, bool) and not self._within(value):
+            limits = self.limits or "at least 0"
+            raise ValueError(f"expected {self.kind.expected}, {limits}, got {value}")
+        return value
+
+    def _within(self, value: float) -> bool:
+        # Written so that NaN is outside.
+        return (
+            (self.least is None or value >= self.least)
+            and (self.most is None or value <= self.most)
+            and (self.above is None or self.above < value < float("inf"))
+        )
+
+
+def _processors() -> int:
+    return max(1, (os.cpu_count() or 1) - 1)
+
+
+def _half_the_memory() -> int:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    # In a container the machine's memory is not what may be used.
+    for limit in (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")):
+        try:
+            memory = min(memory, int(limit.read_text()))
+        except (OSError, ValueError):
+            continue
+    return max(memory // 2, 1 << 30)
+
+
+#: The groups of settings, and what they are about.
+GROUPS: Mapping[str, str] = {
+    "network": "where the server listens, and how it is reached",
+    "access": "who may do what",
+    "limits": "how much is taken",
+    "time": "how long is waited",
+    "operation": "what the operator sees",
+}
+
+_SETTINGS = (
+    Setting("host", _TEXT, "127.0.0.1", "address to listen on", "network", metavar="H"),
+    Setting("port", _INTEGER, 8000, "port to listen on; 0 takes a free one", "network", 0, 65535, metavar="P"),
+    Setting("data", _PATH, Path("lodestream-data"), "folder of uploads and containers", "network", metavar="DIR"),
+    Setting(
+        "root_path",
+        _TEXT,
+        "",
+        "path under which a reverse proxy shows this server, such as /maps; the proxy takes it off",
+        "network",
+        metavar="PATH",
+        usual="none",
+    ),
+    Setting(
+        "trusted_proxies",
+        _LIST,
+        (),
+        "addresses or networks of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto are believed",
+        "network",
+        metavar="A,B",
+        usual="none",
+    ),
+    Setting(
+        "insecure",
+        _SWITCH,
+        False,
+        "serve without tokens on an address that others can reach: while there is no token, whoever reaches the port "
+        "may read, upload and delete",
+        "access",
+    ),
+    Setting(
+        "token_file",
+        _PATH,
+        None,
+        "file of token hashes, as `lodestream token` writes it",
+        "access",
+        metavar="FILE",
+        usual="tokens.json in the data folder",
+    ),
+    Setting("public_reads", _SWITCH, False, "let anyone list, look at and stream surfaces without a token", "access"),
+    Setting(
+        "origins",
+        _LIST,
+        (),
+        "origins of other sites whose pages may use this server, such as https://maps.example.org",
+        "access",
+        metavar="A,B",
+        usual="none",
+    ),
+    Setting("ticket_seconds", _SECONDS, 60.0, "how long a ticket for a browser's stream is valid", "access", above=0),
+    Setting("upload_bytes", _SIZE, 4 << 30, "most bytes of one upload", "limits", 1),
+    Setting("upload_files", _INTEGER, 64, "most files of one upload", "limits", 1),
+    Setting("max_uploads", _INTEGER, 64, "most uploads at the same time", "limits", 1),
+    Setting("max_vertices", _INTEGER, 1 << 28, "most vertices of one surface", "limits", 1),
+    Setting("max_surfaces", _INTEGER, 100_000, "most surfaces", "limits", 1),
+    Setting(
+        "keep_free",
+        _SIZE,
+        None,
+        "disk space that uploads leave free",
+        "limits",
+        0,
+        usual="1GiB, or a twentieth of the disk if that is less",
+    ),
+    Setting("max_connections", _INTEGER, 5000, "most connections of all kinds at the same time", "limits", 1),
+    Setting("max_streams", _INTEGER, 2000, "most streams at the same time", "limits", 1),
+    Setting(
+        "max_client_streams",
+        _INTEGER,
+        1000,
+        "most streams at the same time of one client: of one token, or without one of one address",
+        "limits",
+        1,
+    ),
+    Setting(
+        "max_level_requests",
+        _INTEGER,
+        32,
+        "most requests for levels at the same time; one is worked on, the others wait",
+        "limits",
+        1,
+    ),
+    Setting("max_builds", _INTEGER, 1000, "most builds that wait or run", "limits", 1),
+    Setting(
+        "workers",
+        _INTEGER,
+        _processors,
+        "builds at the same time",
+        "limits",
+        1,
+        usual="one less than there are processors",
+    ),
+    Setting(
+        "build_memory",
+        _SIZE,
+        _half_the_memory,
+        "most memory of one build",
+        "limits",
+        64 << 20,
+        usual="half of the memory there is",
+    ),
+    Setting("build_seconds", _SECONDS, 3600.0, "longest time of one build", "time", above=0),
+    Setting(
+        "idle_seconds",
+        _SECONDS,
+        60.0,
+        "longest silence of a client, in a stream, an upload or an answer that it does not take",
+        "time",
+        above=0,
+    ),
+    Setting(
+        "upload_rate",
+        _SIZE,
+        1024,
+        "least bytes a second of an upload, over each stretch of idle_seconds; 0 for no such limit",
+        "time",
+        0,
+    ),
+    Setting("head_seconds", _SECONDS, 20.0, "longest time in which the head of a request has to come", "time", above=0),
+    Setting(
+        "bye_seconds", _SECONDS, 10.0, "longest wait for a client's bye after the end of a stream", "time", above=0
+    ),
+    Setting("log_format", _choice("text", "json"), "text", "how the log is written to standard error", "operation"),
+    Setting(
+        "log_level",
+        _choice("debug", "info", "warning", "error"),
+        "info",
+        "what is worth a line in the log",
+        "operation",
+    ),
+)
+
+#: The settings by name, in the order in which they are shown.
+TABLE: Mapping[str, Setting] = {setting.name: setting for setting in _SETTINGS}

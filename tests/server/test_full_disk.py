@@ -1,0 +1,172 @@
+"""A disk that is full at any step: 507, nothing half-written, nothing acknowledged is lost, and the server goes on."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from lodestream_server import durable, jobs, worker
+from lodestream_server.storage import Storage
+from tests.server import slow
+from tests.server.disks import CountingDisk, FullDisk
+from tests.server.helpers import eventually, hills, npy, push, settled
+from tests.server.programs import server
+from tests.server.test_builds import running
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
+
+
+def files(data: Path) -> set[Path]:
+    return {path for path in data.rglob("*") if path.is_file()}
+
+
+def test_an_upload_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    # No build disturbs the count of steps, nor what is compared.
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        kept = http.post("/v1/surfaces", content=npy(hills(seed=1))).json()
+        eventually(lambda: http.get(kept["url"]).json()["state"] == "building" or None, "the build to begin")
+        before = files(data)
+        counting = CountingDisk()
+        monkeypatch.setattr(durable, "disk", counting)
+        made = http.post("/v1/surfaces", content=npy(hills(seed=2)))
+        assert made.status_code == 202
+        steps = list(counting.steps)
+        assert set(steps) == {"make_folder", "create", "write", "sync", "rename"}
+        assert http.delete(made.headers["location"]).status_code == 204
+        for lasting in (False, True):
+            for step in range(len(steps)):
+                monkeypatch.setattr(durable, "disk", FullDisk(step, lasting=lasting))
+                answer = http.post("/v1/surfaces", content=npy(hills(seed=2)))
+                assert (answer.status_code, answer.json()["code"]) == (507, "disk-full"), (step, steps[step])
+                assert files(data) == before, (step, steps[step])
+                assert [entry["id"] for entry in http.get("/v1/surfaces").json()["surfaces"]] == [kept["id"]]
+        monkeypatch.setattr(durable, "disk", durable.Disk())
+        (data / "go").touch()
+        assert push(http, npy(hills(seed=2)))["state"] == "ready"
+        assert settled(http, kept["url"])["state"] == "ready"
+
+
+def test_a_second_upload_of_what_failed_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        failed = push(http, npy(hills())[:-1])
+        for step in range(100):
+            monkeypatch.setattr(durable, "disk", FullDisk(step))
+            answer = http.post("/v1/surfaces", content=npy(hills())[:-1])
+            if answer.status_code == 202:
+                break
+            assert answer.status_code == 507
+            # Whether the failure is still known, or was forgotten for want of room: no upload is left.
+            assert http.get(failed["url"]).json().get("state") in (None, "failed")
+            assert list((data / "uploads").iterdir()) == []
+        assert step > 5
+        assert settled(http, failed["url"])["state"] == "failed"
+
+
+def test_a_build_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.full_at_each_step)
+    with running(data) as http:
+        surface = push(http, npy(hills()))
+        assert surface["state"] == "ready"
+        # Creating, writing and synchronising the container failed once each.
+        assert (data / "fuller").read_text() == "4"
+
+
+def test_keeping_what_was_built_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        location = http.post("/v1/surfaces", content=npy(hills())).headers["location"]
+        eventually(lambda: http.get(location).json()["state"] == "building" or None, "the build to begin")
+        monkeypatch.undo()
+        monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
+        full = FullDisk(0, lasting=True)
+        monkeypatch.setattr(durable, "disk", full)
+        (data / "go").touch()
+        waiting = eventually(lambda: http.get(location).json()["reason"], "the build to wait")
+        assert waiting == "waits for room on the server's disk"
+        assert http.get(location).json()["state"] == "queued"
+        assert list((data / "containers").iterdir()) == []
+        for step in range(100):
+            disk = FullDisk(step)
+            monkeypatch.setattr(durable, "disk", disk)
+            surface = settled(http, location)
+            assert surface["state"] == "ready", step
+            if len(disk.steps) <= step:
+                break
+            # Another time from the start: this one found the disk full, waited and came through.
+            assert http.delete(location).status_code == 204
+            monkeypatch.setattr(durable, "disk", durable.Disk())
+            assert http.post("/v1/surfaces", content=npy(hills())).headers["location"] == location
+        assert step > 3
+
+
+def test_a_failure_that_cannot_be_written_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data, build_seconds=0.5) as http:
+        location = http.post("/v1/surfaces", content=npy(hills())).headers["location"]
+        eventually(lambda: http.get(location).json()["state"] == "building" or None, "the build to begin")
+        monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
+        assert settled(http, location)["reason"] == "the build took longer than 0.5 s"
+    monkeypatch.undo()
+    storage = Storage(data)
+    assert [(record.state, record.reason) for record in storage.records()] == [("failed", "the upload is gone")]
+    storage.close()
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    durable.write_file(path, b"old")
+    for step in range(4):
+        monkeypatch.setattr(durable, "disk", FullDisk(step))
+        with pytest.raises(OSError, match="space"):
+            durable.write_file(path, b"new")
+        assert path.read_bytes() == b"old"
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def can_mount() -> bool:
+    """Whether a small disk can be had: in name spaces of its own, which asks nobody's permission on most machines."""
+    if shutil.which("unshare") is None:
+        return False
+    command = ["unshare", "-Urm", "mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", "/tmp"]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not can_mount(), reason="no small disk can be mounted on this machine")
+def test_a_disk_that_is_really_small(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    mount = f'mount -t tmpfs -o size=1m tmpfs "{tmp_path}/disk" && exec "$0" "$@"'
+    with (
+        server(tmp_path / "disk", ["unshare", "-Urm", "sh", "-c", mount], keep_free=0) as running_there,
+        running_there.client() as http,
+    ):
+        made, refused = [], []
+        for seed in range(12):
+            answer = http.post("/v1/surfaces", content=npy(hills(150, 150, seed=seed)))
+            if answer.status_code == 202:
+                made.append(answer.headers["location"])
+            else:
+                # Either the server saw that there is too little room, or the disk said so.
+                assert answer.status_code == 507, answer.text
+                refused.append(seed)
+        assert made
+        assert refused
+        listed = [entry["url"] for entry in http.get("/v1/surfaces", params={"limit": 100}).json()["surfaces"]]
+        assert sorted(listed) == sorted(made)
+        # Where there is no room for a container, its build waits until there is.
+        while made:
+            states = [http.get(location).json()["state"] for location in made]
+            assert set(states) <= {"queued", "building", "ready"}
+            http.delete(made.pop(0)).raise_for_status()
+        assert push(http, npy(hills(150, 150)))["state"] == "ready"

@@ -1,0 +1,140 @@
+"""Processes that are killed, run out of memory, hang, or lose their parent."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lodestream_server.processes import Call, Pool, ProcessDiedError, UnforeseenError
+from lodestream_server.worker import limit_memory
+from tests.server import slow
+from tests.server.helpers import PATIENCE, eventually
+
+_MEMORY = 512 << 20
+
+
+@asynccontextmanager
+async def pool(size: int = 1) -> AsyncIterator[Pool]:
+    made = Pool(size, partial(limit_memory, _MEMORY))
+    try:
+        yield made
+    finally:
+        await asyncio.to_thread(made.close)
+
+
+async def ask(made: Pool, function: Callable[..., Any], *args: Any, seconds: float | None = None) -> Any:
+    async with asyncio.timeout(PATIENCE):
+        return await made.run(Call(function, args, seconds))
+
+
+def gone(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_a_process_killed_while_it_idles_harms_nobody() -> None:
+    async def check() -> None:
+        async with pool() as made:
+            first = await ask(made, slow.number)
+            assert await ask(made, slow.number) == first
+            os.kill(first, signal.SIGKILL)
+            # At once, before anybody can have noticed, and again when it is known.
+            second = await ask(made, slow.number)
+            assert second not in (first, os.getpid())
+            assert await ask(made, slow.number) == second
+
+    asyncio.run(check())
+
+
+def test_what_happens_to_a_call_is_told_and_the_next_one_works(tmp_path: Path) -> None:
+    async def check() -> None:
+        async with pool() as made:
+            with pytest.raises(ProcessDiedError, match="SIGKILL") as died:
+                await ask(made, slow.kill, None)
+            assert died.value.exitcode == -signal.SIGKILL
+            with pytest.raises(ProcessDiedError, match="exit code 3"):
+                await ask(made, os._exit, 3)
+            with pytest.raises(MemoryError):
+                await ask(made, slow.hoard, None)
+            with pytest.raises(TimeoutError):
+                await ask(made, slow.sleep, tmp_path / "begun", seconds=0.5)
+            with pytest.raises(UnforeseenError, match="ZeroDivisionError") as raised:
+                await ask(made, slow.raise_error, ZeroDivisionError("secret"))
+            assert "secret" in raised.value.traceback
+            with pytest.raises(UnforeseenError) as raised:
+                await ask(made, slow.raise_error, OSError(28, "full"))
+            assert raised.value.errno == 28
+            # What a function raises is no reason to give its process up.
+            process = await ask(made, slow.number)
+            with pytest.raises(UnforeseenError):
+                await ask(made, slow.raise_error, KeyError())
+            assert await ask(made, slow.number) == process
+
+    asyncio.run(check())
+
+
+def test_a_cancelled_call_has_ended_when_it_says_so(tmp_path: Path) -> None:
+    async def check() -> None:
+        async with pool() as made:
+            begun = tmp_path / "begun"
+            call = Call(slow.sleep, (begun,))
+            task = asyncio.create_task(made.run(call))
+            waiting = asyncio.create_task(made.run(Call(slow.number, before=partial(pytest.fail, "it began"))))
+            await asyncio.to_thread(eventually, begun.exists, "the call to begin")
+            assert call.begun.is_set()
+            for each in (waiting, task):
+                each.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await each
+            assert gone(int(begun.read_text()))
+            assert await ask(made, slow.number)
+
+    asyncio.run(check())
+
+
+def test_closing_kills_what_runs(tmp_path: Path) -> None:
+    async def check() -> None:
+        begun = tmp_path / "begun"
+        async with pool() as made:
+            task = asyncio.create_task(made.run(Call(slow.sleep, (begun,))))
+            await asyncio.to_thread(eventually, begun.exists, "the call to begin")
+        with pytest.raises(ProcessDiedError):
+            await task
+        assert gone(int(begun.read_text()))
+        assert not [thread for thread in threading.enumerate() if thread.name.startswith("lodestream-process")]
+
+    asyncio.run(check())
+
+
+def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    program = (
+        "import asyncio, pathlib, sys\n"
+        "from lodestream_server.processes import Call, Pool\n"
+        "from tests.server import slow\n"
+        "if __name__ == '__main__':\n"
+        "    asyncio.run(Pool(1).run(Call(slow.sleep, (pathlib.Path(sys.argv[1]),))))\n"
+    )
+    script = tmp_path / "parent.py"
+    script.write_text(program)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen([sys.executable, str(script), str(begun)], env=environment) as parent:
+        eventually(begun.exists, "the call to begin")
+        child = int(begun.read_text())
+        assert not gone(child)
+        parent.kill()
+    assert eventually(lambda: gone(child), "the process to end with its parent")
