@@ -18,7 +18,7 @@ from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .digest import DIGEST, values_digest
 from .errors import CorruptStreamError, OptionError, TruncatedStreamError
-from .georeference import level_geotransform
+from .heights import level_metadata, to_xyz
 from .parts import level_masks
 from .reconstruction import Coded, Progress, Reconstruction
 from .surface import Block, Surface
@@ -129,12 +129,28 @@ class View:
             if mask is not None and not mask.any():
                 mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
             blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=mask, attributes=named))
-        if self.complete and finest and header.exact and digest is not None and digest != values_digest(blocks):
-            raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got others", header.length)
-        if not finest and header.channels == 1 and len(blocks) == 1:
-            shape = blocks[0].shape
-            values["geotransform"] = level_geotransform(values.get("geotransform"), header.shape, shape, header.closed)
-        return Surface(blocks=blocks, metadata=values)
+        surface = Surface(blocks=blocks)
+        if not finest and len(blocks) == 1 and header.point_channels == 1:
+            coarse = level_metadata(
+                {**values, **_plane(header)}, header.shape, surface.shape, header.closed, header.levels - level
+            )
+            surface.metadata.update({key: coarse.pop(key) for key in _plane(header)})
+            values = coarse
+        else:
+            surface.metadata.update(_plane(header))
+        if header.plane is not None:
+            surface = to_xyz(surface)
+        if self.complete and finest and header.exact and digest is not None:
+            found = values_digest(surface.blocks)
+            if digest != found:
+                raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
+        surface.metadata = values
+        return surface
+
+
+def _plane(header: Header) -> dict[str, Any]:
+    """The metadata by which heights that came with x and y get them back, see `lodestream.heights`."""
+    return {} if header.plane is None else {"grid": header.plane["grid"]}
 
 
 class Decoder:

@@ -154,6 +154,7 @@ class _Encoding:
             exact=False,
             corrected=False,
             layer_count=0,
+            plane=prepared.plane,
             masked=any(mask is not None for mask in masks),
             hole=_hole(surface),
             holes=tuple(block.holes for block in surface.blocks),
@@ -166,7 +167,7 @@ class _Encoding:
         self.progress(0.8)
         metadata = dict(surface.metadata)
         if lossless:
-            metadata[DIGEST] = values_digest(_as_returned(surface, self.header.hole))
+            metadata[DIGEST] = values_digest(_as_returned(prepared.given, self.header.hole))
         coded = self._coded(states, figures)
         container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
         self.progress(1.0)

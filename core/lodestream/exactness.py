@@ -459,13 +459,3 @@ def restore(restored: NDArray[Any], payload: bytes, offset: int) -> NDArray[Any]
     delta = (folded >> one) ^ (~(folded & one) + one)
     bits = _ordered(np.ascontiguousarray(restored)).ravel() + delta
     return _from_ordered(bits, restored.dtype).reshape(restored.shape)
-
-
-def encode_piece(original: NDArray[Any], restored: NDArray[Any]) -> bytes:
-    """See `difference`."""
-    return difference(original, restored)
-
-
-def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[Any]:
-    """See `restore`."""
-    return restore(restored, data, offset)

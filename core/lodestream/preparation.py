@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .arrangement import Arrangement, Curve, Part, Side, grids_of
 from .container.model import AttributeKind
+from .heights import to_heights
 from .lattice import Lattice
 from .layout import Layout
 from .measure import extent_of
@@ -33,7 +34,10 @@ class Preparation:
 
     Attributes
     ----------
-    surface : Surface
+    given, surface : Surface
+        As it came, and as it is coded: heights alone where x and y follow a rule.
+    plane : mapping or None
+        That rule.
     arrays : list, one for each block, of lists of arrays, shape (row, column, channel)
         Points, then each attribute; without holes.
     geometric : int
@@ -51,6 +55,8 @@ class Preparation:
     """
 
     def __init__(self, surface: Surface, precisions: Precisions) -> None:
+        self.given = surface
+        surface, self.plane = _heights(surface)
         self.surface = surface
         self.arrays = [_filled(block) for block in surface.blocks]
         first = surface.blocks[0]
@@ -172,13 +178,8 @@ class Preparation:
             valid = _lines(np.ones(part.shape, np.bool_) if mask is None else take(mask, part))
             for place, line in enumerate(_lines(window)):
                 wraps = part.closed[place // 2]  # such an axis has no ends
-                if (
-                    sides[place] is None
-                    and not wraps
-                    and len(line) > 1
-                    and valid[place].all()
-                    and (line == line[0]).all()
-                ):
+                pole = not wraps and len(line) > 1 and valid[place].all() and (line == line[0]).all()
+                if sides[place] is None and pole:
                     sides[place] = Side(len(curves), False)
                     curves.append(Curve(1))
             first, last, left, right = sides
@@ -222,6 +223,8 @@ class Preparation:
 
 
 TILE_BITS = 14
+#: Numbers of the rules of x and y that a header may hold.
+_LONGEST_RULES = 16
 
 
 def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
@@ -233,6 +236,24 @@ def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
     if narrow > 1 << (TILE_BITS // 2):
         return TILE_BITS // 2, TILE_BITS // 2
     return (rows, TILE_BITS - rows) if shape[0] <= shape[1] else (TILE_BITS - rows, rows)
+
+
+def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
+    """Heights in place of x, y and z where a short rule makes x and y again, and that rule."""
+    block = surface.blocks[0]
+    if (
+        len(surface.blocks) > 1
+        or "angles" in surface.metadata
+        or (block.mask is not None and surface.dtype.kind != "f")
+    ):
+        return surface, None
+    heights = to_heights(surface)
+    if heights is None:
+        return surface, None
+    rules = heights.metadata.pop("grid")
+    if sum(map(len, rules)) > _LONGEST_RULES:
+        return surface, None
+    return heights, {"grid": rules}
 
 
 def _lines(array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:

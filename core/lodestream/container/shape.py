@@ -125,12 +125,8 @@ def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]
             raise CorruptStreamError(f"expected a curve of {length} points at a clamped side, got {curve}", start)
         sides.append(side)
     cut = (rows, columns) != ((0, shape[0]), (0, shape[1]))
-    if (
-        flags > 127
-        or min(lengths) < 1
-        or (cut and any(closed))
-        or any(c and not w for c, w in zip(closed, whole, strict=True))
-    ):
+    opens = (closed[0] and not whole[0]) or (closed[1] and not whole[1])
+    if flags > 127 or min(lengths) < 1 or (cut and any(closed)) or opens:
         raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
     first, last, left, right = sides
     return Part(
