@@ -17,7 +17,7 @@ from .container.pieces import windows
 from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
 from .digest import DIGEST, values_digest
-from .errors import CorruptStreamError, OptionError, TruncatedStreamError
+from .errors import CorruptStreamError, InputError, OptionError, TruncatedStreamError
 from .heights import level_metadata, to_xyz
 from .parts import level_masks
 from .reconstruction import Coded, Progress, Reconstruction
@@ -139,7 +139,10 @@ class View:
         else:
             surface.metadata.update(_plane(header))
         if header.plane is not None:
-            surface = to_xyz(surface)
+            try:
+                surface = to_xyz(surface)
+            except InputError as error:
+                raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
         if self.complete and finest and header.exact and digest is not None:
             found = values_digest(surface.blocks)
             if digest != found:
