@@ -199,11 +199,11 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "expands at most 2048 times, got .* bytes that promise 313,600,000",
     ),
     # GeoTIFF
-    "nodata": (
+    "nothing but nodata": (
         "a.tif",
-        lambda: tiff([[[1, 2, 3], [4, -9, 6]]], nodata=-9),
+        lambda: tiff(np.full((1, 2, 3), -9), nodata=-9),
         InputError,
-        r"a value everywhere, got nodata \(-9\) at 1 of 6 points, first at row 1, column 1",
+        "at least one valid point, got 2 x 3 holes",
     ),
     "NaN in a GeoTIFF": (
         "a.tif",

@@ -144,12 +144,14 @@ def test_geotiff_of_several_bands_takes_the_one_named(tmp_path: Path) -> None:
     pytest.importorskip("rasterio")
     bands = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
     write_tiff(tmp_path / "two.tif", bands)
-    with pytest.raises(FormatError, match="one band of heights, got 2 bands: choose with band=1 to band=2"):
-        formats.read(tmp_path / "two.tif")
-    np.testing.assert_array_equal(formats.read(tmp_path / "two.tif", band="2").points, bands[1])
-    for band, message in (("3", "band= from 1 to 2, got 3"), ("red", "band= a whole number, got 'red'")):
+    for band in (1, 2):
+        surface = formats.read(tmp_path / "two.tif", band=str(band)) if band > 1 else formats.read(tmp_path / "two.tif")
+        np.testing.assert_array_equal(surface.points, bands[band - 1])
+        assert list(surface.attributes) == [f"band_{3 - band}"]
+        np.testing.assert_array_equal(surface.attributes[f"band_{3 - band}"], bands[2 - band])
+    for name, message in (("3", "band= from 1 to 2, got 3"), ("red", "band= a whole number, got 'red'")):
         with pytest.raises(OptionError, match=message):
-            formats.read(tmp_path / "two.tif", band=band)
+            formats.read(tmp_path / "two.tif", band=name)
 
 
 def test_geotiff_looks_for_nothing_beside_it(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from ..errors import FormatError, InputError, OptionError
 from ..seams import restore
 from ..surface import Closed, Surface
-from . import bezier, geotiff, npy, npz, obj, pcd, plot3d, ply
+from . import ascii_grid, bezier, geotiff, npy, npz, obj, pcd, plot3d, ply, srtm_hgt, usgs_dem
 from .source import DEFAULT_MAX_VERTICES, Source
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
@@ -77,7 +77,10 @@ _CLOSED: Mapping[str, Closed | None] = {
 _FORMATS = (
     Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
     Format("npz", (".npz",), npz.sniff, npz.read, options={"array": "name of the array that is the surface"}),
-    Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options={"band": "number of the band, from 1"}),
+    Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options=geotiff.READ_OPTIONS),
+    Format("esri-ascii", (".asc",), ascii_grid.sniff, ascii_grid.read),
+    Format("usgs-dem", (".dem",), usgs_dem.sniff, usgs_dem.read),
+    Format("srtm-hgt", (".hgt",), srtm_hgt.sniff, srtm_hgt.read, options=srtm_hgt.READ_OPTIONS, named=srtm_hgt.named),
     Format("ply", (".ply",), ply.sniff, ply.read, ply.write),
     Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
     Format("pcd", (".pcd",), pcd.sniff, pcd.read),

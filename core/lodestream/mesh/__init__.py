@@ -19,8 +19,13 @@ Both hold at every level of the surface and both may be missing.
         surface has several blocks.
     ``part`` : int
         Blocks of different parts share no vertex even where they touch. Missing: 0.
-    ``left_out`` : {"shape": [H, W], "cells": [r * W + c, ...]}
-        Cells that have no face although their corners are valid; holds only for a grid of that shape.
+    ``left_out`` : map
+        Cells that have no face although their corners are valid.
+    ``crossed`` : map
+        Cells that are cut along the other diagonal.
+
+    The last two hold the shape of the grid of cells and a text, see `pack_cells`. They are for a grid of that shape
+    only, and say nothing about coarser levels.
 
 ``poles``
     A list of the sides of blocks that are collapsed to one point, each a map of ``block`` (its number from 0), ``side``
@@ -30,7 +35,8 @@ Both hold at every level of the surface and both may be missing.
         The side is one vertex of the mesh, and each cell beside it one triangle. The points of the side may differ in
         their attributes: the triangle of cell (r, c) takes those of the side's point in its own column c (or row r).
     "degenerate"
-        The side is one vertex, and each cell beside it a quad that names this vertex twice in a row.
+        The side is one vertex, and each cell beside it a quad that names this vertex twice in a row, with the
+        attributes of two points of the side.
     "repeated"
         The side is as many vertices as it has points; nothing has to be done on the way out.
 

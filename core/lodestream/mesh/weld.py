@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..surface import Block, Surface
+from .cells import unpack_cells
 
 __all__ = ["SIDES", "Faces", "Weld", "face_map", "faces_of", "side_of", "weld"]
 
@@ -244,49 +245,58 @@ def _faces(
     below, right = (r + 1) % rows, (c + 1) % width
     corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
     corners = corners.reshape(-1, 4)
-    corners = corners[_kept(block, faces, corners - points[0, 0])]
+    kept = _kept(block, faces, corners - points[0, 0], (down, across))
+    corners = corners[kept]
     ends = joined[corners]
     collapsed = (ends == np.roll(ends, -1, axis=1)).any(axis=1)
     quads, fans = corners[~collapsed], np.empty((0, 3), np.int64)
+    folded = quads[:0]
     if collapsed.any():
         fans, folded = _fans(corners[collapsed], ends[collapsed])
-        if degenerate:
-            quads, fans = np.concatenate([quads, folded]), fans[:0]
+        fans, folded = (fans[:0], folded) if degenerate else (fans, folded[:0])
     diagonal = faces.get("diagonal")
     if diagonal is not None:
-        halves = ((0, 1, 2), (0, 2, 3)) if diagonal == "main" else ((0, 1, 3), (1, 2, 3))
-        cut = np.stack([quads[:, half] for half in halves], axis=1).reshape(-1, 3)
-        quads, fans = quads[:0], np.concatenate([cut, fans])
+        main = np.full(len(quads), diagonal == "main")
+        crossed = unpack_cells(faces.get("crossed"), (down, across))
+        if crossed is not None:
+            main ^= crossed.reshape(-1)[kept][~collapsed]
+        quads, fans = quads[:0], np.concatenate([_halves(quads, main), fans])
+    quads = np.concatenate([quads, folded])
     if faces.get("reversed"):
         quads, fans = quads[:, (0, 3, 2, 1)], fans[:, (0, 2, 1)]
     return quads, fans
 
 
-def _kept(block: Block, faces: Mapping[str, Any], corners: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which cells have a face; `corners` are numbers of points of the block, the first of a cell at (r, c)."""
+def _halves(quads: NDArray[np.int64], main: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Two triangles for each quad, cut from its first to its third corner, or else from its second to its fourth."""
+    turned = np.where(main[:, None], quads, np.roll(quads, -1, axis=1))
+    return turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+
+
+def _kept(
+    block: Block, faces: Mapping[str, Any], corners: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Which of the cells have a face; `corners` are numbers of points of the block."""
     kept: NDArray[np.bool_] = np.ones(len(corners), np.bool_)
     if block.mask is not None:
         kept &= block.mask.reshape(-1)[corners].all(axis=1)
-    left_out = faces.get("left_out")
-    if left_out is not None and tuple(left_out["shape"]) == block.shape:
-        kept &= ~np.isin(corners[:, 0], np.asarray(left_out["cells"], np.int64))
+    left_out = unpack_cells(faces.get("left_out"), shape)
+    if left_out is not None:
+        kept &= ~left_out.reshape(-1)
     return kept
 
 
 def _fans(corners: NDArray[np.int64], ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Cells with a collapsed edge, as triangles and as quads that name a vertex twice.
 
-    Of the two ends of such an edge, the one in the cell's own row and column stays. Cells that collapse to a line or a
-    point have no face.
+    Of the two ends of such an edge, the one in the cell's own row and column stays in the triangle. Cells that collapse
+    to a line or a point have no face.
     """
     gone = np.zeros(corners.shape, np.bool_)
-    folded = corners.copy()
     for stays, goes in ((0, 1), (0, 3), (1, 2), (3, 2)):
-        equal = ends[:, stays] == ends[:, goes]
-        gone[:, goes] |= equal
-        folded[equal, goes] = folded[equal, stays]
+        gone[:, goes] |= ends[:, stays] == ends[:, goes]
     single = (gone.sum(axis=1) == 1) & (ends[:, 0] != ends[:, 2]) & (ends[:, 1] != ends[:, 3])
-    return corners[single][~gone[single]].reshape(-1, 3), folded[single]
+    return corners[single][~gone[single]].reshape(-1, 3), corners[single]
 
 
 def _compressed(

@@ -75,7 +75,7 @@ class _Draft:
 
 def _drafts(number: int, block: LatticeBlock, cuts: Cuts) -> list[_Draft]:
     bands = [_bands(cuts, (number, axis)) for axis in (0, 1)]
-    closed = tuple(block.closed[axis] and not cuts.of((number, axis)) for axis in (0, 1))
+    closed = tuple(block.closed[axis] and not cuts.at[(number, axis)] for axis in (0, 1))
     return [
         _Draft(number, (rows, columns), (closed[0], closed[1]), (rows_flipped, columns_flipped), (i, j))
         for i, (rows, rows_flipped) in enumerate(bands[0])
@@ -85,7 +85,7 @@ def _drafts(number: int, block: LatticeBlock, cuts: Cuts) -> list[_Draft]:
 
 def _bands(cuts: Cuts, axis: tuple[int, int]) -> list[tuple[_Window, bool]]:
     """Windows of an axis, and whether they are flipped for the sake of a closed axis."""
-    length, places = cuts.lengths[axis], cuts.of(axis)
+    length, places = cuts.lengths[axis], sorted(cuts.at[axis])
     if axis not in cuts.closed:
         places = [0, *places, length - 1]
     elif places:

@@ -148,6 +148,8 @@ def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) ->
     firm = np.flatnonzero(edges.firm)
     order = firm[np.lexsort((firm, high[firm], low[firm]))]
     same = (low[order[1:]] == low[order[:-1]]) & (high[order[1:]] == high[order[:-1]])
+    if not same.any():
+        return []
     one, other = order[:-1][same], order[1:][same]
     i, j = edges.position[one], edges.position[other]
     sign = np.where(edges.start[one] == edges.start[other], 1, -1)
@@ -155,7 +157,7 @@ def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) ->
     pairs = np.stack([edges.side[one], edges.side[other], sign, shift, i])
     pairs = pairs[:, np.lexsort(pairs[::-1])]
     fresh = (np.diff(pairs[:4]) != 0).any(axis=0) | (np.diff(pairs[4]) != 1)
-    starts = np.concatenate([[0], np.flatnonzero(fresh) + 1]) if pairs.size else np.empty(0, np.intp)
+    starts = np.concatenate([[0], np.flatnonzero(fresh) + 1])
     lasts = np.concatenate([starts[1:], [pairs.shape[1]]]) - 1
     links: list[Link] = []
     for begin, end in zip(starts, lasts, strict=True):

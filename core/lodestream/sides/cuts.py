@@ -7,7 +7,7 @@ such rims begin at the same point and run the same way round. Where that cannot 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -15,10 +15,14 @@ from .contacts import Axis, Link
 
 __all__ = ["Cuts", "Turn", "find_cuts"]
 
-#: Parts that any surface may be split into, and as many more for each of its blocks. Splitting stays far below that
-#: where blocks meet at corners, or like bricks; what exceeds it are contacts by chance or axes that wind round and
-#: round, where pieces would soon be too small to be worth coding.
-PARTS, PARTS_OF_BLOCK = 1024, 16
+#: Parts that any surface may be split into, and as many more for each of its blocks. Blocks that meet at corners stay
+#: whole; brick walls of 32 x 32 blocks come to 32 parts a block; what goes beyond are contacts by chance, and axes that
+#: wind round and round, where parts would be too small to be worth coding.
+PARTS, PARTS_OF_BLOCK = 64, 32
+#: Where that is exceeded, so many times fewer must do for contacts that split anything.
+_SPARING = 8
+
+_Place = tuple[Axis, int]
 
 
 @dataclass(frozen=True)
@@ -46,28 +50,20 @@ class Cuts:
 
     lengths: dict[Axis, int]
     closed: set[Axis]
-    at: dict[Axis, set[int]] = field(default_factory=dict)
+    at: dict[Axis, set[int]] = field(default_factory=lambda: defaultdict(set))
     turns: dict[Axis, Turn] = field(default_factory=dict)
-
-    def of(self, axis: Axis) -> list[int]:
-        """Positions of cuts, in order."""
-        return sorted(self.at.get(axis, ()))
 
     def pieces(self, axis: Axis) -> int:
         """Number of pieces that the axis falls into."""
-        cuts = len(self.at.get(axis, ()))
+        cuts = len(self.at[axis])
         return max(cuts, 1) if axis in self.closed else cuts + 1
-
-
-class _TooManyPartsError(Exception):
-    """Splitting does not come to an end within the limit."""
 
 
 def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis], links: Sequence[Link]) -> Cuts:
     """Find where blocks must be split so that all contacts end at ends of parts.
 
-    Where there would be more than ``1024 + 16 blocks`` parts, the shortest contacts that lead beyond the limit are
-    given up: sides that touch there are coded separately.
+    Where that makes more than 64 + 32 ``blocks`` parts, contacts are taken one by one, the longest first, and those
+    given up that lead to more than 8 + 4 ``blocks``: there, sides that touch are coded separately.
 
     Parameters
     ----------
@@ -85,101 +81,156 @@ def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]
     Cuts
     """
     limit = PARTS + PARTS_OF_BLOCK * len(lengths) // 2
-    try:
-        return _Splitting(lengths, closed, sides, links, limit).cuts
-    except _TooManyPartsError:
-        kept: list[Link] = []
-        best = Cuts(lengths, closed)
-        batches = [sorted(links, key=lambda link: link.first - link.last)]
-        while batches:
-            batch = batches.pop()
-            try:
-                best = _Splitting(lengths, closed, sides, kept + batch, limit).cuts
-                kept += batch
-            except _TooManyPartsError:
-                middle = len(batch) // 2
-                if middle:
-                    batches += [batch[middle:], batch[:middle]]
-        return best
+    contacts = _Seams(lengths, closed, sides).contacts(links)
+    # Every contact is at least one of the four sides of a part.
+    if len(contacts) <= 4 * limit:
+        splitting = _Splitting(lengths, closed, sides, limit)
+        if splitting.add(contacts):
+            return splitting.cuts
+    contacts.sort(key=lambda contact: -contact.edges)
+    splitting = _Splitting(lengths, closed, sides, limit // _SPARING)
+    for contact in contacts[: 4 * limit]:
+        splitting.add([contact])
+    return splitting.cuts
+
+
+@dataclass(frozen=True)
+class _Contact:
+    """A contact as a whole: its links, each seen from both sides, and the places where it ends."""
+
+    links: tuple[Link, ...]
+    ends: tuple[_Place, ...]
+
+    @property
+    def edges(self) -> int:
+        """Length of the contact."""
+        return sum(link.last - link.first for link in self.links) // 2
+
+
+class _Seams:
+    """Joins links that are one contact across the seam of a closed side."""
+
+    def __init__(self, lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]) -> None:
+        self._around = [lengths[axis] if axis in closed else 0 for axis in sides]
+        self._sides = sides
+
+    def contacts(self, links: Iterable[Link]) -> list[_Contact]:
+        """Contacts, in the order of their first links."""
+        seen = [view for link in links for view in (link, link.turned)]
+        begins = {self._place(link, link.first): number for number, link in enumerate(seen)}
+        joined: dict[int, list[int]] = {number: [number, number ^ 1] for number in range(0, len(seen), 2)}
+        owner = {number: number & ~1 for number in range(len(seen))}
+        ends: dict[int, list[_Place]] = defaultdict(list)
+        continued = set()
+        for number, link in enumerate(seen):
+            after = begins.get(self._place(link, link.last))
+            if after is None or self._folds(link, link.last):
+                ends[number].append(self._end(link, link.last))
+                continue
+            continued.add(after)
+            one, other = sorted((owner[number], owner[after]))
+            if one != other:
+                for moved in joined.pop(other):
+                    owner[moved] = one
+                    joined[one].append(moved)
+        for number, link in enumerate(seen):
+            if number not in continued:
+                ends[number].append(self._end(link, link.first))
+        return [
+            _Contact(
+                tuple(seen[number] for number in numbers), tuple(end for number in numbers for end in ends[number])
+            )
+            for numbers in joined.values()
+        ]
+
+    def _place(self, link: Link, position: int) -> tuple[int, int, int, int, int]:
+        here, there = self._norm(link.source, position), self._norm(link.target, link.at(position))
+        return link.source, link.target, link.sign, here, there
+
+    def _norm(self, side: int, position: int) -> int:
+        around = self._around[side]
+        return position % around if around else position
+
+    def _end(self, link: Link, position: int) -> _Place:
+        return self._sides[link.source], self._norm(link.source, position)
+
+    def _folds(self, link: Link, position: int) -> bool:
+        """Whether the side turns back on itself there."""
+        source, target, sign, here, there = self._place(link, position)
+        return source == target and sign == -1 and here == there
 
 
 class _Splitting:
-    def __init__(
-        self, lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis], links: Iterable[Link], limit: int
-    ) -> None:
+    """Cuts that grow contact by contact."""
+
+    def __init__(self, lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis], limit: int) -> None:
         self.cuts = Cuts(lengths, closed)
         self._sides = sides
         self._limit = limit
         self._parts = len(lengths) // 2
-        self._links: dict[Axis, list[Link]] = {}
-        for link in links:
-            for seen in (link, link.turned):
-                self._links.setdefault(sides[seen.source], []).append(seen)
-        for axis, place in self._ends():
-            self._split(axis, place)
-        while (found := self._disagreement()) is not None:
-            self._split(*found)
+        self._links: dict[Axis, list[Link]] = defaultdict(list)
 
-    def _norm(self, side: int, position: int) -> int:
-        """Position on a side; of a closed one, 0 and its length are the same."""
-        axis = self._sides[side]
-        return position % self.cuts.lengths[axis] if axis in self.cuts.closed else position
+    def add(self, contacts: Sequence[_Contact]) -> bool:
+        """Split for these contacts; if that makes too many parts, leave everything as it was and say no."""
+        parts, turns, made = self._parts, self.cuts.turns, list[_Place]()
+        pending: list[_Place] = []
+        for contact in contacts:
+            pending.extend(contact.ends)
+            for link in contact.links:
+                axis = self._sides[link.source]
+                self._links[axis].append(link)
+                pending.extend(found for place in sorted(self.cuts.at[axis]) for found in self._images(link, place))
+        fits = self._split(pending, made)
+        while fits and (found := self._disagreement()) is not None:
+            fits = self._split([found], made)
+        if not fits:
+            for axis, place in made:
+                self.cuts.at[axis].discard(place)
+            for contact in contacts:
+                for link in contact.links:
+                    self._links[self._sides[link.source]].remove(link)
+            self._parts, self.cuts.turns = parts, turns
+        return fits
 
-    def _ends(self) -> list[tuple[Axis, int]]:
-        """Where contacts end, but those that go on across the seam of a closed side."""
-        ends: list[tuple[Link, int, bool]] = []
-        known: set[tuple[int, int, int, int, int, bool]] = set()
-        for link in (link for links in self._links.values() for link in links):
-            for place, is_last in ((link.first, False), (link.last, True)):
-                ends.append((link, place, is_last))
-                known.add((*self._key(link, place), is_last))
-        found = []
-        for link, place, is_last in ends:
-            key = self._key(link, place)
-            folded = link.source == link.target and link.sign == -1 and key[3] == key[4]
-            if folded or (*key, not is_last) not in known:
-                found.append((self._sides[link.source], key[3]))
-        return found
+    def _images(self, link: Link, place: int) -> list[_Place]:
+        """Where the link has a cut of its source on its target."""
+        source = self._sides[link.source]
+        seam = source in self.cuts.closed and place == 0
+        places = (0, self.cuts.lengths[source]) if seam else (place,)
+        return [(self._sides[link.target], link.at(at)) for at in places if link.first <= at <= link.last]
 
-    def _key(self, link: Link, place: int) -> tuple[int, int, int, int, int]:
-        there = self._norm(link.target, link.at(place))
-        return link.source, link.target, link.sign, self._norm(link.source, place), there
-
-    def _split(self, axis: Axis, place: int) -> None:
-        """Cut an axis, and all that is linked with it there."""
-        pending = deque([(axis, place)])
+    def _split(self, pending: list[_Place], made: list[_Place]) -> bool:
+        """Cut axes, and all that is linked with them there; False as soon as there are too many parts."""
         while pending:
-            axis, place = pending.popleft()
+            axis, place = pending.pop()
             length = self.cuts.lengths[axis]
             if axis in self.cuts.closed:
                 place %= length
             elif not 0 < place < length - 1:
                 continue
-            known = self.cuts.at.setdefault(axis, set())
-            if place in known:
+            if place in self.cuts.at[axis]:
                 continue
             pieces = self.cuts.pieces(axis)
-            known.add(place)
-            across = self.cuts.pieces((axis[0], 1 - axis[1]))
-            self._parts += (self.cuts.pieces(axis) - pieces) * across
+            self.cuts.at[axis].add(place)
+            made.append((axis, place))
+            self._parts += (self.cuts.pieces(axis) - pieces) * self.cuts.pieces((axis[0], 1 - axis[1]))
             if self._parts > self._limit:
-                raise _TooManyPartsError
-            places = (0, length) if axis in self.cuts.closed and place == 0 else (place,)
-            for link in self._links.get(axis, ()):
-                pending.extend(
-                    (self._sides[link.target], link.at(at)) for at in places if link.first <= at <= link.last
-                )
+                return False
+            for link in self._links[axis]:
+                pending.extend(self._images(link, place))
+        return True
 
-    def _disagreement(self) -> tuple[Axis, int] | None:
+    def _disagreement(self) -> _Place | None:
         """Turn closed axes so that linked ones agree; the first that cannot, and where to cut it."""
-        self.cuts.turns = turns = {}
-        for root in sorted(self._links):
-            if root not in self.cuts.closed or self.cuts.at.get(root) or root in turns:
+        turns: dict[Axis, Turn] = {}
+        self.cuts.turns = turns
+        for root in sorted(self.cuts.closed):
+            if self.cuts.at[root] or root in turns:
                 continue
             turns[root] = Turn()
-            pending = deque([root])
+            pending = [root]
             while pending:
-                axis = pending.popleft()
+                axis = pending.pop()
                 for link in self._links[axis]:
                     target = self._sides[link.target]
                     length = self.cuts.lengths[target]

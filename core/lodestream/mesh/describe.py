@@ -1,0 +1,145 @@
+"""What is known of recognised grids beside their nodes: cells, poles, joints, and words for all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..surface import Closed
+from .cells import pack_cells
+from .grid import Grid
+from .patchwork import Quads
+from .weld import SIDES
+
+__all__ = ["RecognisedBlock", "describe_cells", "join_blocks", "poles_of", "shape_words", "with_tips"]
+
+
+@dataclass(frozen=True, slots=True)
+class RecognisedBlock:
+    """One grid of a mesh.
+
+    Attributes
+    ----------
+    vertices : int64 array of shape (H, W)
+        Vertex of the mesh at each node; -1 at holes.
+    closed : (bool, bool)
+        Which axes wrap.
+    rows : mapping of str to int64 arrays of shape (H, W)
+        For each attribute of corners the row of its values at each node; -1 at holes.
+    faces, poles
+        What `lodestream.mesh` describes, for this block.
+    """
+
+    vertices: NDArray[np.int64]
+    closed: Closed
+    rows: Mapping[str, NDArray[np.int64]]
+    faces: Mapping[str, Any]
+    poles: tuple[Mapping[str, str], ...]
+
+
+def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
+    """Say how faces go round, which cells have none although their corners are there, and how they are cut in two."""
+    faces: dict[str, Any] = {"reversed": True} if grid.reversed else {}
+    there = grid.corners >= 0
+    full = there.copy()
+    for axis in (0, 1):
+        following = np.roll(full, -1, axis)
+        full &= following
+        if not grid.closed[axis]:
+            full = full[:-1] if axis == 0 else full[:, :-1]
+    missing = full & (grid.faces < 0)
+    if missing.any():
+        faces["left_out"] = pack_cells(missing)
+    cut = (grid.faces >= 0) & quads.cut[grid.faces]
+    if not cut.any():
+        return faces
+    # A diagonal joins the first and third corners of its quad.
+    own = quads.corners.reshape(-1)[grid.corners[: cut.shape[0], : cut.shape[1]]]
+    rows = quads.corners[grid.faces]
+    main = cut & ((rows[..., 0] == own) | (rows[..., 2] == own))
+    anti = cut & ~main
+    mostly_main = bool(main.sum() >= anti.sum())
+    faces["diagonal"] = "main" if mostly_main else "anti"
+    crossed = anti if mostly_main else main
+    if crossed.any():
+        faces["crossed"] = pack_cells(crossed)
+    return faces
+
+
+def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -> NDArray[np.int32]:
+    """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column."""
+    corners = corners.copy()
+    line, tips = corners[SIDES[side]], 4 * faces[SIDES[side]]
+    line[: len(tips)] = tips
+    line[len(tips) :] = tips[-1]
+    return corners
+
+
+def poles_of(
+    vertices: NDArray[np.int64], closed: Closed, points: NDArray[Any], kinds: Mapping[str, str]
+) -> tuple[Mapping[str, str], ...]:
+    """The sides of a grid that are collapsed to a point; `kinds` are those that are one vertex."""
+    poles = []
+    for side, place in SIDES.items():
+        line = vertices[place]
+        if side in kinds:
+            poles.append({"side": side, "kind": kinds[side]})
+        elif not closed["column" in side] and len(line) > 2 and (line >= 0).all():
+            places = points[line]
+            if (places == places[0]).all():
+                poles.append({"side": side, "kind": "repeated"})
+    return tuple(poles)
+
+
+def join_blocks(blocks: Sequence[RecognisedBlock], points: NDArray[Any]) -> tuple[list[RecognisedBlock], int]:
+    """Say of each block whether its sides are joined to others, or to each other.
+
+    The second result is the number of vertices that will be joined although they only lie at the same place.
+    """
+    borders = [_border(block) for block in blocks]
+    found, count = np.unique(np.concatenate(borders), return_counts=True)
+    shared = found[count > 1]
+    result, among = [], []
+    for block, border in zip(blocks, borders, strict=True):
+        joined = bool(np.isin(border, shared).any())
+        if joined:
+            among.append(border)
+        if joined != (len(blocks) > 1):
+            block = replace(block, faces={**block.faces, "joined": joined})
+        result.append(block)
+    if not among:
+        return result, 0
+    together = np.unique(np.concatenate(among))
+    return result, len(together) - len(np.unique(points[together] + 0, axis=0))
+
+
+def _border(block: RecognisedBlock) -> NDArray[np.int64]:
+    """Vertices on the open sides of a block, each node once and each pole once."""
+    border = np.zeros(block.vertices.shape, np.bool_)
+    for side, place in SIDES.items():
+        if not block.closed["column" in side]:
+            border[place] = True
+    poles = []
+    for pole in block.poles:
+        if pole["kind"] != "repeated":
+            border[SIDES[pole["side"]]] = False
+            poles.append(block.vertices[SIDES[pole["side"]]][0])
+    border &= block.vertices >= 0
+    return np.concatenate([block.vertices[border], np.unique(poles).astype(np.int64)])
+
+
+def shape_words(blocks: Sequence[RecognisedBlock]) -> str:
+    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"."""
+    shapes = [block.vertices.shape for block in blocks]
+    if len(blocks) == 1:
+        kind = ("grid", "cylinder", "torus")[sum(blocks[0].closed)]
+        return f"{kind}, {shapes[0][0]} x {shapes[0][1]}"
+    sizes = sorted(set(shapes), key=lambda shape: (shape[0] * shape[1], shape))
+    if len(sizes) == 1:
+        return f"{len(blocks)} blocks, {sizes[0][0]} x {sizes[0][1]} each"
+    least, most = sizes[0], sizes[-1]
+    return f"{len(blocks)} blocks, {least[0]} x {least[1]} to {most[0]} x {most[1]}"

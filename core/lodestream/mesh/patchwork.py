@@ -1,0 +1,249 @@
+"""Meshes of triangles and quads made meshes of quads: fans unfolded at their poles, triangles paired."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from .halfedges import Corners, find_pieces, find_twins, find_umbrellas
+from .poles import find_fans, find_poles, unfold
+from .polygons import Mesh, Polygons, name_faces
+from .triangles import pair_in_order, pair_triangles
+
+__all__ = ["Quads", "make_quads"]
+
+_REGULAR = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Quads:
+    """Quads that are wound alike.
+
+    Attributes
+    ----------
+    corners : int32 array of shape (Q, 4)
+        Vertices from the number of the mesh's vertices on stand for one at a pole.
+    twins : int32 array of shape (4 Q,)
+    origin : int64 array of shape (Q,)
+        The face of the file that each is, or the first of two triangles that it is made of.
+    cut : bool array of shape (Q,)
+        Quads made of two triangles, which meet between their first and third corners.
+    attributes : int32 array of shape (A, Q, 4)
+        See `Polygons`.
+    torn : tuple of int
+        Attributes whose corners differ inside a quad.
+    pole_of : int32 array
+        The mesh's vertex of each further vertex.
+    folded : bool array
+        Whether each further vertex is from quads with a repeated vertex.
+    choices : tuple of str
+        In words, choices between diagonals that fit equally well.
+    """
+
+    corners: Corners
+    twins: NDArray[np.int32]
+    origin: NDArray[np.int64]
+    cut: NDArray[np.bool_]
+    attributes: NDArray[np.int32]
+    torn: tuple[int, ...]
+    pole_of: NDArray[np.int32]
+    folded: NDArray[np.bool_]
+    choices: tuple[str, ...]
+
+
+def make_quads(mesh: Mesh, polygons: Polygons) -> Quads:
+    """Make a mesh all quads.
+
+    Raises
+    ------
+    FormatError
+        When triangles are neither round a pole nor the halves of quads. The first of them are named.
+    """
+    corners, twins = polygons.corners, polygons.twins
+    none = np.zeros(0, np.int32)
+    if (corners[:, 3] >= 0).all():
+        cut = np.zeros(len(corners), np.bool_)
+        return Quads(corners, twins, polygons.origin, cut, polygons.attributes, (), none, np.zeros(0, np.bool_), ())
+    umbrella = np.empty(4 * len(corners), np.int32)
+    valence = np.empty(4 * len(corners), np.int32)
+    valence = valence[: find_umbrellas(corners, twins, umbrella, valence)]
+    pole, edges, choices = _poles_and_pairs(mesh, polygons, umbrella, valence)
+    tips = (umbrella >= 0) & pole[umbrella]
+    fan = tips.reshape(-1, 4).any(axis=1)
+    stray = polygons.folded & ~tips.reshape(-1, 4)[:, 0]
+    if stray.any():
+        raise FormatError(
+            f"expected a quad that names a vertex twice to lie at a pole there, got "
+            f"{name_faces(mesh, polygons.origin[stray])}"
+        )
+    new, attributes = corners.copy(), polygons.attributes.copy()
+    pole_of = np.empty(2 * int(fan.sum()), np.int32)
+    extra = unfold(
+        corners,
+        twins,
+        umbrella,
+        pole,
+        polygons.folded,
+        polygons.attributes,
+        len(mesh.vertices),
+        new,
+        attributes,
+        pole_of,
+    )
+    folded = np.zeros(extra, np.bool_)
+    ends = new[polygons.folded][:, (0, 3)] - len(mesh.vertices)
+    folded[ends.reshape(-1)] = True
+    kept, cut = np.ones(len(corners), np.bool_), np.zeros(len(corners), np.bool_)
+    torn = _join_pairs(polygons, edges, new, attributes, kept, cut)
+    new, attributes = new[kept], np.ascontiguousarray(attributes[:, kept])
+    twins, _, _ = find_twins(new, len(mesh.vertices) + extra)
+    return Quads(
+        new, twins, polygons.origin[kept], cut[kept], attributes, torn, pole_of[:extra].copy(), folded, choices
+    )
+
+
+def _poles_and_pairs(
+    mesh: Mesh, polygons: Polygons, umbrella: NDArray[np.int32], valence: NDArray[np.int32]
+) -> tuple[NDArray[np.bool_], NDArray[np.int32], tuple[str, ...]]:
+    """Which umbrellas are poles; a half-edge on the diagonal of each pair of triangles; choices in words."""
+    corners, twins = polygons.corners, polygons.twins
+    piece = np.empty(len(corners), np.int32)
+    pieces = find_pieces(corners, twins, piece)
+    triangle = corners[:, 3] < 0
+    has_triangles = np.bincount(piece[triangle], minlength=pieces) > 0
+    has_quads = np.bincount(piece[~triangle], minlength=pieces) > 0
+    mixed = (has_triangles & has_quads)[piece]
+    pole, misfits = find_fans(corners, umbrella, valence, mixed)
+    if misfits.size:
+        raise FormatError(
+            f"expected quads, or triangles only in fans round a vertex (a pole), got triangles elsewhere: "
+            f"{name_faces(mesh, polygons.origin[misfits])}; make quads of them, or all faces triangles"
+        )
+    points = mesh.vertices.astype(np.float64)
+    halves = triangle & ~mixed
+    open_faces = halves & ~polygons.folded
+    # First as they are, where every inner vertex has six triangles; then without poles; then in the order of the file.
+    inner_wrong = (valence >= 0) & (valence != _REGULAR)
+    uneven = np.zeros(pieces, np.bool_)
+    wrong_corners = (umbrella >= 0) & inner_wrong[umbrella]
+    uneven[piece[wrong_corners.reshape(-1, 4).any(axis=1)]] = True
+    uneven[piece[polygons.folded]] = True
+    edges, left, choices = _pair(corners, twins, points, np.flatnonzero(open_faces & ~uneven[piece]))
+    left = np.concatenate([left, np.flatnonzero(halves & uneven[piece])])
+    if left.size:
+        chosen = np.zeros(len(corners), np.bool_)
+        chosen[left] = True
+        _add_poles(polygons, umbrella, valence, chosen, pole)
+        fan = ((umbrella >= 0) & pole[umbrella]).reshape(-1, 4).any(axis=1)
+        more, left, why = _pair(corners, twins, points, np.flatnonzero(chosen & ~fan))
+        edges, choices = np.concatenate([edges, more]), choices + why
+    if left.size:
+        _forget_poles(umbrella, piece, left, pole)
+        stuck = np.isin(piece, piece[left]) & triangle
+        edges = edges[~stuck[edges >> 2]]
+        in_order = None if polygons.folded[stuck].any() else pair_in_order(corners, twins, np.flatnonzero(stuck))
+        if in_order is None:
+            raise FormatError(_unpaired(mesh, polygons, umbrella, valence, left))
+        edges = np.concatenate([edges, in_order])
+    return pole, edges, choices
+
+
+def _pair(
+    corners: Corners, twins: NDArray[np.int32], points: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.int64], tuple[str, ...]]:
+    """Pair some of the triangles with each other; the second result are those that could not be paired."""
+    if not faces.size:
+        return np.zeros(0, np.int32), faces, ()
+    number = np.full(len(corners), -1, np.int32)
+    number[faces] = np.arange(len(faces))
+    beside = twins.reshape(-1, 4)[faces]
+    face = number[beside >> 2]
+    inside = np.where((beside >= 0) & (face >= 0), 4 * face + (beside & 3), -1).astype(np.int32)
+    pairing = pair_triangles(np.ascontiguousarray(corners[faces]), inside.reshape(-1), points)
+    edges = 4 * faces[pairing.edges >> 2] + (pairing.edges & 3)
+    return edges.astype(np.int32), faces[pairing.unpaired], pairing.choices
+
+
+def _add_poles(
+    polygons: Polygons,
+    umbrella: NDArray[np.int32],
+    valence: NDArray[np.int32],
+    chosen: NDArray[np.bool_],
+    pole: NDArray[np.bool_],
+) -> None:
+    corners, twins = polygons.corners, polygons.twins
+    halves = np.flatnonzero(np.repeat(chosen, 4) & (umbrella >= 0))
+    corner_of = np.full(len(valence), -1, np.int32)
+    corner_of[umbrella[halves[::-1]]] = halves[::-1]
+    borders = halves[twins[halves] < 0]
+    corner_of[umbrella[borders]] = borders
+    candidates = np.flatnonzero(corner_of >= 0)
+    vertex = corners.reshape(-1)[corner_of[candidates]]
+    named = np.zeros(len(valence), np.bool_)  # vertices that quads name twice are poles if anything is
+    named[umbrella.reshape(-1, 4)[polygons.folded & chosen, 0]] = True
+    count = valence[candidates]
+    order = candidates[np.lexsort((vertex, -np.abs(count), count < 0, ~named[candidates]))]
+    find_poles(corners, twins, umbrella, valence, corner_of, order.astype(np.int32), pole)
+
+
+def _forget_poles(
+    umbrella: NDArray[np.int32], piece: NDArray[np.int32], left: NDArray[np.int64], pole: NDArray[np.bool_]
+) -> None:
+    """Take poles back in pieces that are no grid with them either."""
+    stuck = np.isin(piece, piece[left])
+    corners = umbrella.reshape(-1, 4)[stuck]
+    pole[corners[corners >= 0]] = False
+
+
+def _unpaired(
+    mesh: Mesh,
+    polygons: Polygons,
+    umbrella: NDArray[np.int32],
+    valence: NDArray[np.int32],
+    left: NDArray[np.int64],
+) -> str:
+    rows = umbrella.reshape(-1, 4)[left, :3]
+    wrong = (valence[rows] >= 0) & (valence[rows] != _REGULAR)
+    faces, corner = np.nonzero(wrong)
+    if not faces.size:
+        return (
+            f"expected triangles that are the halves of a grid's quads, got a border along which some have no "
+            f"partner: {name_faces(mesh, polygons.origin[left])}"
+        )
+    face, k = left[faces[0]], corner[0]
+    count = int(valence[rows[faces[0], k]])
+    irregular = len(np.unique(rows[wrong]))
+    return (
+        f"expected six triangles round every inner vertex (the cells of a grid cut in two), or fans round poles, got "
+        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])} "
+        f"and {irregular:,} such vertices in all: make quads of the triangles first"
+    )
+
+
+def _join_pairs(
+    polygons: Polygons,
+    edges: NDArray[np.int32],
+    corners: Corners,
+    attributes: NDArray[np.int32],
+    kept: NDArray[np.bool_],
+    cut: NDArray[np.bool_],
+) -> tuple[int, ...]:
+    """Make the first triangle of each pair the quad, drop the other; which attributes differ along diagonals."""
+    beside = polygons.twins[edges]
+    ours, k, other, m = edges >> 2, edges & 3, beside >> 2, beside & 3
+    old = polygons.corners
+    rows = [old[ours, k], old[other, (m + 2) % 3], old[ours, (k + 1) % 3], old[ours, (k + 2) % 3]]
+    corners[ours] = np.stack(rows, axis=-1)
+    torn = []
+    for number, values in enumerate(polygons.attributes):
+        differs = (values[ours, k] != values[other, (m + 1) % 3]) | (values[ours, (k + 1) % 3] != values[other, m])
+        if differs.any():
+            torn.append(number)
+        rows = [values[ours, k], values[other, (m + 2) % 3], values[ours, (k + 1) % 3], values[ours, (k + 2) % 3]]
+        attributes[number, ours] = np.stack(rows, axis=-1)
+    kept[other] = False
+    cut[ours] = True
+    return tuple(torn)

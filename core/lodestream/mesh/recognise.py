@@ -1,0 +1,318 @@
+"""Grids from the connectivity of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..surface import Block, Surface
+from .cut import irregular, trace
+from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, shape_words, with_tips
+from .develop import develop_quads
+from .grid import Grid, make_grid
+from .halfedges import find_pieces, find_umbrellas, join_pieces
+from .patchwork import Quads, make_quads
+from .polygons import Mesh, Polygons, name_faces, prepare
+from .tearing import equal_rows, sort_attributes, tear
+from .weld import SIDES
+
+__all__ = ["Recognised", "RecognisedBlock", "recognise"]
+
+#: A mesh that has to be cut into blocks is refused when they have fewer quads than this on average.
+LEAST_QUADS = 9
+
+#: More blocks are refused, as are more than this many that are small.
+MOST_BLOCKS = 4096
+MOST_SMALL_BLOCKS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """The grids that a mesh is made of.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    blocks : tuple of RecognisedBlock
+        In the order of their first faces.
+    words : str
+        What was recognised, such as "torus, 96 x 24, from triangles; 2,304 vertices".
+    """
+
+    mesh: Mesh
+    blocks: tuple[RecognisedBlock, ...]
+    words: str
+
+    def surface(self, metadata: Mapping[str, Any] | None = None) -> Surface:
+        """Make a surface of the blocks, with ``recognised``, ``faces`` and ``poles`` beside the metadata given."""
+        known = dict(metadata or {})
+        known["recognised"] = self.words
+        faces = [dict(block.faces) for block in self.blocks]
+        if any(faces):
+            known["faces"] = faces if len(faces) > 1 else faces[0]
+        poles = [{"block": number, **pole} for number, block in enumerate(self.blocks) for pole in block.poles]
+        if poles:
+            known["poles"] = poles
+        return Surface(blocks=[self._block(block) for block in self.blocks], metadata=known)
+
+    def _block(self, block: RecognisedBlock) -> Block:
+        valid = block.vertices >= 0
+        attributes = {name: values[block.vertices] for name, values in self.mesh.attributes.items()}
+        for name, rows in block.rows.items():
+            attributes[name] = self.mesh.corner_attributes[name].values[rows]
+        points = self.mesh.vertices[block.vertices]
+        if valid.all():
+            return Block(points, block.closed, attributes=attributes)
+        for values in (points, *attributes.values()):
+            values[~valid] = np.nan if values.dtype.kind == "f" else 0
+        return Block(points, block.closed, mask=valid, attributes=attributes)
+
+
+def recognise(mesh: Mesh) -> Recognised:
+    """Find the grids that the faces of a mesh make, whatever the order of its vertices and faces.
+
+    A mesh whose inner vertices have four quads is one grid for each connected piece, open or closed; triangles may be
+    the halves of quads, or fans round a pole. Any other mesh is cut along the grid lines that leave its irregular
+    vertices. Where the corners of faces have different values at a vertex, the surface has a seam. Attributes for which
+    there is no grid with such seams are left out, which `Recognised.words` says.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Faces name existing vertices.
+
+    Returns
+    -------
+    Recognised
+        The same for the same order of vertices and faces; a mesh in row order keeps it.
+
+    Raises
+    ------
+    FormatError
+        When there are no such grids, naming the first faces that do not fit and what to do about them.
+    """
+    if not len(mesh.corners):
+        raise FormatError("expected faces, got none")
+    shared, seams, left_out = sort_attributes(mesh)
+    while True:
+        attributes = (
+            np.stack([seams[name] for name in seams]) if seams else np.zeros((0, len(mesh.corners), 4), np.int32)
+        )
+        polygons = prepare(mesh, tuple(seams), attributes)
+        quads = make_quads(mesh, polygons)
+        gone = [polygons.names[number] for number in quads.torn]
+        if not gone:
+            try:
+                return _Recognition(mesh, polygons, quads, shared, left_out).result()
+            except FormatError:
+                if not seams:
+                    raise
+                torn = tear(quads, quads.twins.copy())
+                gone = [polygons.names[int(torn.argmax())]]
+        for name in gone:
+            left_out[name] = "different on too many faces side by side"
+            del seams[name]
+
+
+class _Recognition:
+    """What is known of a mesh of quads on the way to its blocks."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        polygons: Polygons,
+        quads: Quads,
+        shared: Mapping[str, NDArray[np.int32]],
+        left_out: Mapping[str, str],
+    ) -> None:
+        self.mesh = mesh
+        self.polygons = polygons
+        self.quads = quads
+        self.shared = shared
+        self.left_out = left_out
+        corners = quads.corners
+        self.twins = quads.twins.copy() if polygons.names else quads.twins
+        torn = tear(quads, self.twins)
+        self.seams = tuple(name for name, count in zip(polygons.names, torn, strict=True) if count)
+        self.umbrella = np.empty(4 * len(corners), np.int32)
+        valence = np.empty(4 * len(corners), np.int32)
+        self.valence = valence[: find_umbrellas(corners, self.twins, self.umbrella, valence)].copy()
+        # Corners of one vertex with the same attributes are the same node, whatever lies between them.
+        self.identity = corners.reshape(-1)
+        if self.seams:
+            keys = np.column_stack([self.identity, *quads.attributes.reshape(len(polygons.names), -1)])
+            self.identity = equal_rows(keys)
+        whole = np.concatenate([np.arange(len(mesh.vertices), dtype=np.int32), quads.pole_of])
+        self.vertex = whole[corners.reshape(-1)]
+        self.cuts = 0
+
+    def result(self) -> Recognised:
+        grids = self._grids()
+        piece = np.empty(len(self.quads.corners), np.int32)
+        pieces = find_pieces(self.quads.corners, self.quads.twins, piece)
+        part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
+        blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
+        blocks, merged = join_blocks(blocks, self.mesh.vertices)
+        return Recognised(self.mesh, tuple(blocks), self._words(blocks, merged))
+
+    def _grids(self) -> list[Grid]:
+        laid = develop_quads(self.quads.corners, self.twins)
+        runs = _runs(laid.piece, len(laid.turns))
+        self._check_count(len(runs))
+        grids: list[Grid] = []
+        uncut: list[int] = []
+        for number, faces in enumerate(runs):
+            grid = make_grid(faces, laid, number, self.identity, self.vertex)
+            if grid is not None and self._poles_fit(grid):
+                grids.append(grid)
+            else:
+                uncut.append(number)
+        if uncut:
+            grids += self._cut(np.isin(laid.piece, uncut))
+        return sorted(grids, key=_first_face)
+
+    def _check_count(self, count: int) -> None:
+        quads = len(self.quads.corners)
+        if count > MOST_BLOCKS or (count > MOST_SMALL_BLOCKS and quads < LEAST_QUADS * count):
+            raise FormatError(
+                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {MOST_SMALL_BLOCKS} pieces "
+                f"{LEAST_QUADS} quads in each on average, got {count:,} pieces of {quads:,} quads in all"
+                f"{self._seam_words()}: weld vertices at the same place first"
+            )
+
+    def _seam_words(self) -> str:
+        return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
+
+    def _poles_fit(self, grid: Grid) -> bool:
+        """Whether the nodes at poles fill sides of the grid."""
+        if not len(self.quads.pole_of):
+            return True
+        pole = self._at_pole(grid)
+        for side in SIDES.values():
+            if pole[side].all():
+                pole[side] = False
+        return not pole.any()
+
+    def _at_pole(self, grid: Grid) -> NDArray[np.bool_]:
+        corners = self.quads.corners.reshape(-1)
+        return (grid.corners >= 0) & (corners[grid.corners] >= len(self.mesh.vertices))
+
+    def _cut(self, chosen: NDArray[np.bool_]) -> list[Grid]:
+        """Cut the pieces of the chosen faces into blocks."""
+        corners = self.quads.corners
+        halves = np.repeat(chosen, 4) & (self.twins >= 0)
+        wrong = irregular(self.valence)
+        starts = np.flatnonzero(halves & wrong[self.umbrella])
+        # A piece without irregular vertices winds like a helix, or lies on itself: any vertex will do.
+        piece = np.empty(len(corners), np.int32)
+        pieces = find_pieces(corners, self.twins, piece)
+        has_start = np.bincount(piece[starts >> 2], minlength=pieces) > 0
+        for number in np.unique(piece[chosen & ~has_start[piece]]).tolist():
+            inside = np.flatnonzero(halves & np.repeat(piece == number, 4))
+            lowest = inside[self.vertex[inside].argmin()]
+            starts = np.concatenate([starts, inside[self.umbrella[inside] == self.umbrella[lowest]]])
+        best: tuple[int, NDArray[np.int32]] | None = None
+        for whole in (True, False):
+            cut = np.zeros(4 * len(corners), np.bool_)
+            trace(corners, self.twins, self.umbrella, self.valence, starts.astype(np.int32), whole, cut)
+            apart = np.where(cut, -1, self.twins).astype(np.int32)
+            find_pieces(corners, apart, piece)
+            count = len(np.unique(piece[chosen]))
+            if best is None or count < best[0]:
+                best = count, apart
+        assert best is not None
+        count, apart = best
+        if count > MOST_BLOCKS or int(chosen.sum()) < LEAST_QUADS * count:
+            raise FormatError(self._too_small(chosen, count, wrong))
+        self.cuts += count
+        laid = develop_quads(corners, apart)
+        grids = []
+        for number, faces in enumerate(_runs(laid.piece, len(laid.turns))):
+            if not chosen[faces[0]]:
+                continue
+            grid = make_grid(faces, laid, number, self.identity, self.vertex)
+            if grid is None or (grid.faces < 0).any() or not self._poles_fit(grid):
+                raise FormatError(
+                    f"expected a mesh that grid lines cut into rectangles, got a patch of {len(faces):,} quads that is "
+                    f"none, with {name_faces(self.mesh, self.quads.origin[faces])}"
+                )
+            grids.append(grid)
+        return grids
+
+    def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
+        at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
+        _, first = np.unique(self.umbrella[at], return_index=True)
+        at = at[np.sort(first)]
+        where = (
+            f"first at vertex {int(self.vertex[at[0]]) + 1} of {name_faces(self.mesh, self.quads.origin[at[:1] >> 2])}"
+            if at.size
+            else "and winds or lies on itself"
+        )
+        return (
+            f"expected a grid, or a mesh that grid lines cut into at most {MOST_BLOCKS:,} blocks of {LEAST_QUADS} "
+            f"quads or more on average, got {int(chosen.sum()):,} quads in {count:,} blocks{self._seam_words()}: the "
+            f"mesh has {len(at):,} irregular vertices (inner ones without four quads, outer ones with three or more), "
+            f"{where}; make it again with fewer of them, or with finer quads"
+        )
+
+    def _block(self, grid: Grid, part: int) -> RecognisedBlock:
+        quads = self.quads
+        faces = describe_cells(grid, quads)
+        if part:
+            faces["part"] = part
+        kinds = {}
+        corners = grid.corners
+        if len(quads.pole_of):
+            pole = self._at_pole(grid)
+            for side in (side for side, place in SIDES.items() if pole[place].all()):
+                number = quads.corners.reshape(-1)[grid.corners[SIDES[side]][0]] - len(self.mesh.vertices)
+                kinds[side] = "degenerate" if quads.folded[number] else "fan"
+                if not quads.folded[number]:
+                    corners = with_tips(corners, grid.faces, side)
+        valid = corners >= 0
+        vertices = np.where(valid, self.vertex[corners], -1).astype(np.int64)
+        rows = {name: np.where(valid, row_of[vertices], -1).astype(np.int64) for name, row_of in self.shared.items()}
+        for name, values in zip(self.polygons.names, quads.attributes, strict=True):
+            rows[name] = np.where(valid, values.reshape(-1)[corners], -1).astype(np.int64)
+        kept = {name: rows[name] for name in self.mesh.corner_attributes if name in rows}
+        poles = poles_of(vertices, grid.closed, self.mesh.vertices, kinds)
+        return RecognisedBlock(vertices, grid.closed, kept, faces, poles)
+
+    def _words(self, blocks: list[RecognisedBlock], merged: int) -> str:
+        used = np.zeros(len(self.mesh.vertices), np.bool_)
+        used[self.vertex] = True
+        text = shape_words(blocks) + (", from triangles" if self.quads.cut.any() else "")
+        notes = [f"{int(used.sum())} vertices"]
+        holes = sum(int((block.vertices < 0).sum()) for block in blocks)
+        notes += [f"{holes} holes"] * (holes > 0)
+        poles = len(np.unique(self.quads.pole_of))
+        poles += sum(pole["kind"] == "repeated" for block in blocks for pole in block.poles)
+        notes += [f"{poles} pole{'s' if poles > 1 else ''}"] * (poles > 0)
+        notes += [f"seam in {' and '.join(self.seams)}"] * (len(self.seams) > 0)
+        if self.cuts:
+            count = int(irregular(self.valence).sum())
+            notes.append(f"cut at {count} irregular vertices" if count else "cut open")
+        notes += dict.fromkeys(self.quads.choices)
+        notes += [f"{self.polygons.turned} faces turned round"] * (self.polygons.turned > 0)
+        notes += [f"{merged} vertices at the place of others joined to them"] * (merged > 0)
+        notes += [f"{name} left out: {why}" for name, why in self.left_out.items()]
+        alone = len(used) - int(used.sum())
+        notes += [f"{alone} vertices without a face left out"] * (alone > 0)
+        return "; ".join([text, *notes])
+
+
+def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:
+    """The faces of each piece."""
+    if pieces == 1:
+        return [np.arange(len(piece))]
+    order = np.argsort(piece, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(piece, minlength=pieces))[:-1])
+
+
+def _first_face(grid: Grid) -> int:
+    return int(grid.faces[grid.faces >= 0].min())

@@ -1,0 +1,102 @@
+"""Attributes of faces' corners: those that are the same round each vertex, and those that make seams."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels import kernel
+from .halfedges import Corners
+from .patchwork import Quads
+from .polygons import Mesh
+
+__all__ = ["equal_rows", "sort_attributes", "tear"]
+
+
+@kernel
+def rows_of_vertices(corners: Corners, rows: NDArray[np.int32], row_of: NDArray[np.int32]) -> bool:
+    """Find the one row of values that all corners at each vertex have; False when they differ somewhere.
+
+    Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face.
+    """
+    row_of[:] = -1
+    agree = True
+    for face in range(corners.shape[0]):
+        for k in range(4):
+            vertex = corners[face, k]
+            if vertex >= 0:
+                if row_of[vertex] < 0:
+                    row_of[vertex] = rows[face, k]
+                agree &= row_of[vertex] == rows[face, k]
+    return agree
+
+
+def equal_rows(values: NDArray[Any]) -> NDArray[np.int32]:
+    """Number rows of values so that equal ones, bit for bit, have the same number."""
+    packed = np.ascontiguousarray(values).reshape(len(values), -1)
+    keys = packed.view(np.dtype((np.void, packed.dtype.itemsize * packed.shape[1]))).reshape(-1)
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return first[inverse.reshape(-1)].astype(np.int32)
+
+
+def sort_attributes(mesh: Mesh) -> tuple[dict[str, NDArray[np.int32]], dict[str, NDArray[np.int32]], dict[str, str]]:
+    """Tell attributes of corners that agree at each vertex from those that do not.
+
+    Returns
+    -------
+    shared : dict of str to int32 arrays of shape (V,)
+        The row of values for each vertex.
+    seams : dict of str to int32 arrays of shape (F, 4)
+        A row of values for each corner, the same where values are equal; -1 in the last place of triangles.
+    left_out : dict of str to str
+        Why the others cannot be kept.
+    """
+    shared: dict[str, NDArray[np.int32]] = {}
+    seams: dict[str, NDArray[np.int32]] = {}
+    left_out: dict[str, str] = {}
+    there = mesh.corners >= 0
+    for name, attribute in mesh.corner_attributes.items():
+        if (attribute.corners[there] < 0).any():
+            left_out[name] = "not on all faces"
+            continue
+        row_of = np.empty(len(mesh.vertices), np.int32)
+        if rows_of_vertices(mesh.corners, attribute.corners, row_of):
+            shared[name] = row_of
+            continue
+        same = equal_rows(attribute.values)
+        rows = np.where(there, same[attribute.corners], -1).astype(np.int32)
+        if rows_of_vertices(mesh.corners, rows, row_of):
+            shared[name] = row_of
+        else:
+            seams[name] = rows
+    return shared, seams, left_out
+
+
+@kernel
+def _tear(
+    corners: NDArray[np.int32], attributes: NDArray[np.int32], twins: NDArray[np.int32], torn: NDArray[np.int64]
+) -> None:
+    """Part faces at edges where an attribute differs; count those of each attribute."""
+    for half in range(twins.size):
+        twin = twins[half]
+        if twin < half:
+            continue
+        face, k, other, m = half >> 2, half & 3, twin >> 2, twin & 3
+        differs = False
+        for a in range(attributes.shape[0]):
+            one, two = attributes[a, face], attributes[a, other]
+            if one[k] != two[(m + 1) & 3] or one[(k + 1) & 3] != two[m]:
+                torn[a] += 1
+                differs = True
+        if differs:
+            twins[half] = -1
+            twins[twin] = -1
+
+
+def tear(quads: Quads, twins: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Part faces in `twins` where an attribute differs across their edge; for each attribute the number of edges."""
+    torn = np.zeros(len(quads.attributes), np.int64)
+    _tear(quads.corners, quads.attributes, twins, torn)
+    return torn
