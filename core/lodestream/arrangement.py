@@ -1,4 +1,4 @@
-"""How a surface of several blocks is coded: parts of blocks, and the curves along which parts meet.
+"""The grids of a surface of several blocks: curves along which parts meet, and parts of blocks.
 
 A side that two parts share is a curve of its own, coded once, from which both take their points; so does a side that is
 collapsed to a point (a pole), whose curve is that one point. Curves that meet in the corner of a part have that point
@@ -7,74 +7,14 @@ in common: the first of them holds it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import product
 
-from .layout import Grid, Sides, Source
+from .layout import Grid, Source
+from .sides import Arrangement, Part, Side
 from .surface import Closed
 
-__all__ = ["Arrangement", "Curve", "Part", "Side", "grids_of"]
-
-
-@dataclass(frozen=True)
-class Side:
-    """A side of a part that is a curve; ``reversed``: the part's order along the side runs against the curve's."""
-
-    curve: int
-    reversed: bool
-
-
-@dataclass(frozen=True)
-class Part:
-    """What is coded as one grid: a window of a block, perhaps turned round.
-
-    Attributes
-    ----------
-    block : int
-    rows, columns : (int, int)
-        The window, half-open, in the block; neighbouring parts have the points at the cut in common.
-    closed : (bool, bool)
-    flipped : (bool, bool)
-        Stored back to front along that axis.
-    sides : four Side or None
-        Of the part as stored: first row, last row, first column, last column.
-    clamped : four bool
-        In the same order: that end of an axis keeps its node as it is.
-    stops : (bool, bool)
-        The axis is not coarsened further once its length is even.
-    """
-
-    block: int
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-    closed: Closed = (False, False)
-    flipped: tuple[bool, bool] = (False, False)
-    sides: tuple[Side | None, Side | None, Side | None, Side | None] = (None, None, None, None)
-    clamped: Sides = (False, False, False, False)
-    stops: tuple[bool, bool] = (False, False)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A side that is coded by itself: so many points, closed or open; a single one is a pole."""
-
-    length: int
-    closed: bool = False
-    stops: bool = False
-
-
-@dataclass(frozen=True)
-class Arrangement:
-    """Parts, block by block, and curves."""
-
-    parts: tuple[Part, ...]
-    curves: tuple[Curve, ...] = ()
+__all__ = ["covers", "grids_of"]
 
 
 def grids_of(arrangement: Arrangement) -> list[Grid]:
@@ -94,7 +34,7 @@ def grids_of(arrangement: Arrangement) -> list[Grid]:
         sources = ends[0], ends[1], None, None
         grids.append(Grid((curve.length, 1), closed, clamped, (curve.stops, False), sources, curve=True))
     for part in arrangement.parts:
-        first, last, left, right = (side and Source(side.curve, side.reversed) for side in part.sides)
+        first, last, left, right = (None if s is None else Source(s.curve, s.reversed) for s in part.sides)
         grids.append(Grid(part.shape, part.closed, part.clamped, part.stops, (first, last, left, right)))
     return grids
 
@@ -122,14 +62,29 @@ def _owners(arrangement: Arrangement) -> dict[tuple[int, int], tuple[int, int]]:
     return {end: find(end) for end in list(parent)}
 
 
-def covers(shape: tuple[int, int], closed: Closed, windows: Sequence[tuple[tuple[int, int], tuple[int, int]]]) -> bool:
-    """Whether windows of a block cover each of its cells once; ``closed`` says whether the last cells wrap."""
-    if any(closed):
-        return len(windows) == 1 and windows[0] == ((0, shape[0]), (0, shape[1]))
-    cells = [(r0, max(r1 - 1, r0 + 1), c0, max(c1 - 1, c0 + 1)) for (r0, r1), (c0, c1) in windows]
-    area = sum((b - a) * (d - c) for a, b, c, d in cells)
-    if area != max(shape[0] - 1, 1) * max(shape[1] - 1, 1):
-        return False
-    return not any(
-        a < f and e < b and c < h and g < d for k, (a, b, c, d) in enumerate(cells) for e, f, g, h in cells[:k]
+def covers(shape: tuple[int, int], closed: Closed, parts: Sequence[Part]) -> bool:
+    """Whether parts of a block cover each of its cells once; along a closed axis the last cells wrap."""
+    cells = [
+        (rows, columns)
+        for part in parts
+        for rows in _cells(shape[0], closed[0], part.closed[0], part.rows)
+        for columns in _cells(shape[1], closed[1], part.closed[1], part.columns)
+    ]
+    whole = [n if wraps else max(n - 1, 1) for n, wraps in zip(shape, closed, strict=True)]
+    area = sum((b - a) * (d - c) for (a, b), (c, d) in cells)
+    return area == whole[0] * whole[1] and not any(
+        a < f and e < b and c < h and g < d for k, ((a, b), (c, d)) in enumerate(cells) for (e, f), (g, h) in cells[:k]
     )
+
+
+def _cells(length: int, wraps: bool, closed: bool, window: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """First and past-the-last cell along an axis, in one piece or two."""
+    if closed:
+        yield 0, length
+        return
+    start, stop = window[0], max(window[1] - 1, window[0] + 1)
+    if not wraps or stop <= length:
+        yield start, stop
+    else:
+        yield start, length
+        yield 0, stop - length

@@ -25,5 +25,5 @@ def values_digest(blocks: Iterable[Block]) -> str:
     for block in blocks:
         for array in (block.points, *block.attributes.values()):
             little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-            digest.update(np.ascontiguousarray(little).reshape(-1).view(np.uint8))
+            digest.update(np.ascontiguousarray(little).data)
     return digest.hexdigest()

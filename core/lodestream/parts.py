@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrangement import Part
 from .layout import Grid, Layout
+from .sides import Part
 
-__all__ = ["assemble", "level_masks", "level_positions", "level_shapes", "take"]
+__all__ = ["Shape", "assemble", "level_masks", "level_positions", "level_shapes"]
 
+Shape = tuple[int, int]
 Positions = tuple[NDArray[np.int64], NDArray[np.int64]]
-
-
-def take(block: NDArray[Any], part: Part) -> NDArray[Any]:
-    """A part's window of a block's array (row, column, ...), turned as it is stored; a view."""
-    window = block[slice(*part.rows), slice(*part.columns)]
-    return window[:: -1 if part.flipped[0] else 1, :: -1 if part.flipped[1] else 1]
 
 
 def _node_positions(grid: Grid, axis: int, above: int) -> NDArray[np.int64]:
@@ -33,53 +28,61 @@ def _node_positions(grid: Grid, axis: int, above: int) -> NDArray[np.int64]:
     return positions
 
 
-def level_positions(parts: Sequence[Part], layout: Layout, level: int, block: int) -> Positions:
-    """Which rows and columns of a block stand at the nodes of a level."""
+def level_positions(parts: Sequence[Part], layout: Layout, level: int, block: int, shape: Shape) -> Positions:
+    """Which rows and columns of a block of this shape stand at the nodes of a level."""
     rows: set[int] = set()
     columns: set[int] = set()
     for number, part in enumerate(parts):
         if part.block == block:
-            down, right = _part_positions(part, layout, level, number, len(parts))
+            down, right = _part_positions(part, layout, level, number, len(parts), shape)
             rows.update(down.tolist())
             columns.update(right.tolist())
     return np.array(sorted(rows), np.int64), np.array(sorted(columns), np.int64)
 
 
-def _part_positions(part: Part, layout: Layout, level: int, number: int, count: int) -> Positions:
+def _part_positions(part: Part, layout: Layout, level: int, number: int, count: int, shape: Shape) -> Positions:
     grid = layout.grids[len(layout.grids) - count + number]
     found = []
     for axis, window in enumerate((part.rows, part.columns)):
         nodes = _node_positions(grid, axis, layout.levels - level)
-        found.append(window[0] + (grid.shape[axis] - 1 - nodes if part.flipped[axis] else nodes))
+        place = window[0] + (grid.shape[axis] - 1 - nodes if part.flipped[axis] else nodes)
+        found.append(place % shape[axis])  # along a closed axis windows go on from the last sample to the first
     return found[0], found[1]
 
 
-def level_shapes(parts: Sequence[Part], layout: Layout, level: int, blocks: int) -> list[tuple[int, int]]:
-    """Rows and columns of each block's grid at a level."""
-    if len(parts) == blocks:
+def _whole(part: Part, shape: Shape) -> bool:
+    """Whether a part is its block as it is, perhaps turned round."""
+    return part.rows == (0, shape[0]) and part.columns == (0, shape[1])
+
+
+def level_shapes(parts: Sequence[Part], layout: Layout, level: int, shapes: Sequence[Shape]) -> list[Shape]:
+    """Rows and columns of each block's grid at a level; ``shapes`` are the blocks'."""
+    if len(parts) == len(shapes) and all(_whole(part, shapes[part.block]) for part in parts):
         curves = len(layout.grids) - len(parts)
-        return [layout.shape(curves + number, level) for number in range(blocks)]
-    positions = (level_positions(parts, layout, level, block) for block in range(blocks))
+        return [layout.shape(curves + number, level) for number in range(len(shapes))]
+    positions = (level_positions(parts, layout, level, block, shape) for block, shape in enumerate(shapes))
     return [(rows.size, columns.size) for rows, columns in positions]
 
 
 def assemble(
-    parts: Sequence[Part], layout: Layout, level: int, block: int, grids: Sequence[NDArray[Any]]
+    parts: Sequence[Part], layout: Layout, level: int, block: int, shape: Shape, grids: Sequence[NDArray[Any]]
 ) -> NDArray[Any]:
     """A block's grid of a level out of the grids of its parts.
 
     Parameters
     ----------
+    shape : (int, int)
+        Of the block.
     grids : arrays (row, column, ...), one for each part, as stored
     """
     own = [(number, part) for number, part in enumerate(parts) if part.block == block]
-    if len(own) == 1:
+    if len(own) == 1 and _whole(own[0][1], shape):
         number, part = own[0]
         return grids[number][:: -1 if part.flipped[0] else 1, :: -1 if part.flipped[1] else 1]
-    rows, columns = level_positions(parts, layout, level, block)
+    rows, columns = level_positions(parts, layout, level, block, shape)
     whole = np.zeros((rows.size, columns.size, *grids[own[0][0]].shape[2:]), grids[own[0][0]].dtype)
     for number, part in own:
-        down, right = _part_positions(part, layout, level, number, len(parts))
+        down, right = _part_positions(part, layout, level, number, len(parts), shape)
         whole[np.ix_(np.searchsorted(rows, down), np.searchsorted(columns, right))] = grids[number]
     return whole
 
@@ -90,10 +93,9 @@ def level_masks(
     """Which nodes of a level stand for valid points: those at whose place the full grid has one."""
     found: list[NDArray[np.bool_] | None] = []
     for block, mask in enumerate(masks):
-        coarse = None
-        if mask is not None:
-            coarse = mask
-            if level < layout.levels:
-                coarse = mask[np.ix_(*level_positions(parts, layout, level, block))]
+        coarse = mask
+        if mask is not None and level < layout.levels:
+            shape = mask.shape[0], mask.shape[1]
+            coarse = mask[np.ix_(*level_positions(parts, layout, level, block, shape))]
         found.append(coarse)
     return found

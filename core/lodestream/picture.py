@@ -210,7 +210,7 @@ class Original:
     def count(self) -> int:
         """Points that errors are of."""
         if self.counted is None:
-            return self.points.shape[0] * self.points.shape[1]
+            return int(self.points.shape[0] * self.points.shape[1])
         return int(np.count_nonzero(self.counted))
 
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrangement import Arrangement, Curve, Part, Side, grids_of
+from .arrangement import grids_of
 from .container.model import AttributeKind
 from .heights import to_heights
 from .lattice import Lattice
 from .layout import Layout
 from .measure import extent_of
-from .parts import take
 from .picture import Original
 from .quantise import attribute_lattices, choose_lattices
+from .sides import Arrangement, Curve, LatticeBlock, Part, Side, arrange, stored, whole_part
 from .surface import Block, Surface
 from .target import Tolerance
 from .transform import allocate
@@ -75,7 +75,7 @@ class Preparation:
         self.arrangement = self._arranged()
         if self.arrangement is None:
             shape = first.shape
-            self.parts: tuple[Part, ...] = (Part(0, (0, shape[0]), (0, shape[1]), first.closed),)
+            self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
             self.tile = tile_exponents(shape)
             self.layout = Layout.single(shape, first.closed, self.tile)
         else:
@@ -112,7 +112,7 @@ class Preparation:
             return arrays
         known: set[int] = set()
         for number, part in enumerate(self.parts):
-            values = np.ascontiguousarray(take(self.channel(part.block, channel), part))
+            values = stored(part, self.channel(part.block, channel))
             arrays[curves + number][...] = lattice.coordinates(values)
             if channel >= self.geometric:
                 continue
@@ -144,10 +144,7 @@ class Preparation:
         if self.geometric == 1 or (len(blocks) == 1 and not _may_share(blocks[0], self.arrays[0][0])):
             if len(blocks) == 1:
                 return None
-            whole = [Part(k, (0, b.shape[0]), (0, b.shape[1]), b.closed) for k, b in enumerate(blocks)]
-            return Arrangement(tuple(whole))
-        from .sides import LatticeBlock, arrange
-
+            return Arrangement(tuple(whole_part(k, b.shape, b.closed) for k, b in enumerate(blocks)), ())
         lattices = choose_lattices(self._valid, self.geometric, self.precision, None)
         sources = []
         for block, arrays in zip(blocks, self.arrays, strict=True):
@@ -157,31 +154,18 @@ class Preparation:
                 points[~block.mask] = 0  # whatever stands under holes agrees
             sources.append(LatticeBlock(points, block.closed, block.mask))
         found = arrange(sources, self.geometric)
-        parts = [
-            Part(
-                p.block,
-                p.rows,
-                p.columns,
-                p.closed,
-                p.flipped,
-                tuple(s and Side(s.curve, s.reversed) for s in p.sides),  # type: ignore[arg-type]  # four of them
-                p.clamped,
-                p.stops,
-            )
-            for p in found.parts
-        ]
-        curves = [Curve(c.length, c.closed, c.stops) for c in found.curves]
+        parts, curves = list(found.parts), list(found.curves)
         for number, part in enumerate(parts):
-            window = take(sources[part.block].coordinates, part)
+            window = stored(part, sources[part.block].coordinates)
             sides = list(part.sides)
             mask = sources[part.block].mask
-            valid = _lines(np.ones(part.shape, np.bool_) if mask is None else take(mask, part))
+            valid = _lines(np.ones(part.shape, np.bool_) if mask is None else stored(part, mask))
             for place, line in enumerate(_lines(window)):
                 wraps = part.closed[place // 2]  # such an axis has no ends
                 pole = not wraps and len(line) > 1 and valid[place].all() and (line == line[0]).all()
                 if sides[place] is None and pole:
                     sides[place] = Side(len(curves), False)
-                    curves.append(Curve(1))
+                    curves.append(Curve(1, False, False))
             first, last, left, right = sides
             clamped = [a or s is not None for a, s in zip(part.clamped, sides, strict=True)]
             parts[number] = replace(
@@ -197,9 +181,9 @@ class Preparation:
         originals = []
         used: set[int] = set()
         for part in self.parts:
-            points = np.ascontiguousarray(take(self.arrays[part.block][0], part))
+            points = stored(part, self.arrays[part.block][0])
             mask = self.surface.blocks[part.block].mask
-            counted = np.ones(part.shape, np.bool_) if mask is None else take(mask, part).copy()
+            counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
             lines = _lines(counted)
             again = [side is not None and self._again(side, used) for side in part.sides]
             for place, (side, line) in enumerate(zip(part.sides, lines, strict=True)):
@@ -241,11 +225,8 @@ def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
     """Heights in place of x, y and z where a short rule makes x and y again, and that rule."""
     block = surface.blocks[0]
-    if (
-        len(surface.blocks) > 1
-        or "angles" in surface.metadata
-        or (block.mask is not None and surface.dtype.kind != "f")
-    ):
+    lost = block.mask is not None and surface.dtype.kind != "f"  # integers have no coordinates under holes
+    if len(surface.blocks) > 1 or "angles" in surface.metadata or lost:
         return surface, None
     heights = to_heights(surface)
     if heights is None:

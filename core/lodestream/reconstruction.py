@@ -279,6 +279,6 @@ def to_values(header: Header, pictures: Sequence[Picture], level: int) -> list[V
             channel += 1
         grids.append(arrays)
     return [
-        Values([np.ascontiguousarray(assemble(parts, layout, level, block, arrays)) for arrays in grids])
-        for block in range(len(header.blocks))
+        Values([np.ascontiguousarray(assemble(parts, layout, level, block, shape, arrays)) for arrays in grids])
+        for block, (shape, _) in enumerate(header.blocks)
     ]

@@ -155,7 +155,7 @@ def test_gains_are_the_squared_errors_of_what_is_known() -> None:
         pass_gains(rows, weights, count, gather(table, [values]), reader._tiles[0].early, errors)
         for remaining in range(count + 1):
             known = np.zeros(layout.grids[0].shape, np.int32)
-            reader._tiles[0].spread(tile, remaining, known)
+            reader._tiles[0].spread(tile, remaining, [known])
             squares = (values.astype(np.int64) - known) ** 2
             bands = layout.tiles[tile].bands
             expected = [

@@ -311,12 +311,13 @@ def test_an_index_that_lies_is_corrupt() -> None:
 def test_a_bomb_in_place_of_exactness_is_corrupt() -> None:
     container, index = contained("small")
     assert index.exactness is not None
-    bomb = sections.section(sections.EXACTNESS, zlib.compress(bytes(30_000_000), 9))
+    payload = sections.serialize_pieces((0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
+    bomb = sections.section(sections.EXACTNESS, payload)
     decoder = Decoder()
     views = decoder.feed(container[: index.exactness.offset] + bomb)
     with pytest.raises(CorruptStreamError, match="exactness") as caught:
         views[-1].points  # noqa: B018 - lazy: looking is the test
-    assert index.exactness.offset < caught.value.offset < index.exactness.offset + 9
+    assert index.exactness.offset < caught.value.offset < index.exactness.offset + 30
     assert views[-2].points.tobytes() == expected_views(container)[-2][1]
 
 

@@ -226,7 +226,7 @@ def test_metadata_come_back_as_they_were() -> None:
         np.array([["a", "b"]]),
         np.zeros((2, 2), bool),
         np.full((4, 4), np.nan),
-        np.array([[1.0, np.inf]]),
+        np.array([[np.nan, np.inf]]),
         np.array([[1.7e308, -1.7e308]]),
     ],
 )

@@ -119,7 +119,7 @@ def test_the_fit_makes_details_smaller_than_the_fixed_rules() -> None:
 
 def test_only_long_axes_have_predictors_of_their_own() -> None:
     layout = Layout.single((200, 9), (False, True), (7, 7))
-    own, others = set(fitted_steps(layout)), default_predictors(layout)
+    own, others = set(fitted_steps(layout)), effective(layout, default_predictors(layout))
     assert own == {(level, 0) for level in range(layout.levels) if shapes_of(layout)[level][0] >= 24}
     for level, axis in itertools.product(range(layout.levels), (0, 1)):
         assert tuple(others[level, axis]) == ((0, 0) if (level, axis) in own else (16, 0))
@@ -127,7 +127,7 @@ def test_only_long_axes_have_predictors_of_their_own() -> None:
 
 def test_synthesis_norms_are_what_a_coefficient_adds() -> None:
     layout = Layout.single((129, 129), (True, True), (7, 7))
-    predictors = np.zeros((layout.levels, 2, 2), np.int8)
+    predictors = default_predictors(layout)
     predictors[:] = 16, 0
     norms = synthesis_norms(layout, predictors)
     unit = 2**16

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrangement import Arrangement, Part, grids_of
+from ..arrangement import grids_of
 from ..lattice import Lattice
 from ..layout import Layout
 from ..parts import level_shapes
+from ..sides import Arrangement, Part, whole_part
 from ..surface import Closed
 
 __all__ = ["AttributeKind", "ByteRange", "Header", "Index", "LayerRecord", "LevelRecord", "Piece", "Segment"]
@@ -146,7 +147,7 @@ class Header:
         if self.arrangement is not None:
             return self.arrangement.parts
         (rows, columns), closed = self.blocks[0]
-        return (Part(0, (0, rows), (0, columns), closed),)
+        return (whole_part(0, (rows, columns), closed),)
 
     @cached_property
     def layout(self) -> Layout:
@@ -162,7 +163,7 @@ class Header:
 
     def level_shape(self, level: int) -> tuple[int, int] | None:
         """Rows and columns of a level of the only block; None where there are several."""
-        shapes = level_shapes(self.parts, self.layout, level, len(self.blocks))
+        shapes = level_shapes(self.parts, self.layout, level, [shape for shape, _ in self.blocks])
         return shapes[0] if len(shapes) == 1 else None
 
     @cached_property

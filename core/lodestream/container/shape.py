@@ -8,8 +8,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from ..arrangement import Arrangement, Curve, Part, Side, covers
+from ..arrangement import covers
 from ..errors import CorruptStreamError
+from ..sides import Arrangement, Curve, Part, Side
 from ..surface import Closed
 from .fields import FieldReader, FieldWriter
 from .model import AttributeKind
@@ -81,8 +82,7 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
     parts = [_parse_part(fields, blocks, curves) for _ in range(_count(fields))]
     for number, (shape, closed) in enumerate(blocks):
         own = [part for part in parts if part.block == number]
-        wraps = len(own) == 1 and own[0].closed == closed
-        if not covers(shape, own[0].closed if wraps else (False, False), [(p.rows, p.columns) for p in own]):
+        if not covers(shape, closed, own):
             raise CorruptStreamError(f"expected parts that cover block {number} once, got others", start)
     return tuple(blocks), Arrangement(tuple(parts), tuple(curves))
 
@@ -104,8 +104,9 @@ def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]
     spans = [(0, shape[0]), (0, shape[1])]
     if flags & 64:
         for axis in range(2):
-            first = fields.varint(shape[axis])
-            spans[axis] = first, first + fields.varint(shape[axis] - first)
+            first = fields.varint(shape[axis] - 1)
+            # Along an axis that wraps, a window may go on from the last sample to the first, and to that one again.
+            spans[axis] = first, first + fields.varint(shape[axis] + 1 if whole[axis] else shape[axis] - first)
     rows, columns = spans
     closed = bool(flags & 1), bool(flags & 2)
     lengths = columns[1] - columns[0], rows[1] - rows[0]
@@ -124,18 +125,17 @@ def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]
         if not (pole or same) or closed[1 - along] or not ends & 1 << number:
             raise CorruptStreamError(f"expected a curve of {length} points at a clamped side, got {curve}", start)
         sides.append(side)
-    cut = (rows, columns) != ((0, shape[0]), (0, shape[1]))
-    opens = (closed[0] and not whole[0]) or (closed[1] and not whole[1])
-    if flags > 127 or min(lengths) < 1 or (cut and any(closed)) or opens:
+    wraps = [w and n == count for w, n, count in zip(whole, lengths[::-1], shape, strict=True)]
+    if flags > 127 or min(lengths) < 1 or (closed[0] and not wraps[0]) or (closed[1] and not wraps[1]):
         raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
-    first, last, left, right = sides
+    top, bottom, left, right = sides
     return Part(
         block,
         rows,
         columns,
         closed,
         (bool(flags & 4), bool(flags & 8)),
-        (first, last, left, right),
+        (top, bottom, left, right),
         (bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)),
         stops,
     )

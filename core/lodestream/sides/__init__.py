@@ -13,6 +13,6 @@ curve must be the whole side of every part that uses it, and be coarsened the sa
 from __future__ import annotations
 
 from .arrangement import arrange
-from .parts import Arrangement, Curve, LatticeBlock, Part, Side, assemble, stored
+from .parts import Arrangement, Curve, LatticeBlock, Part, Side, assemble, stored, whole_part
 
-__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "arrange", "assemble", "stored"]
+__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "arrange", "assemble", "stored", "whole_part"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "assemble", "stored"]
+__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "assemble", "stored", "whole_part"]
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,13 @@ class Arrangement:
 
     parts: tuple[Part, ...]
     curves: tuple[Curve, ...]
+
+
+def whole_part(block: int, shape: tuple[int, int], closed: tuple[bool, bool]) -> Part:
+    """A block as its only part, which shares no side."""
+    none = (None, None, None, None)
+    free = (False, False, False, False)
+    return Part(block, (0, shape[0]), (0, shape[1]), closed, (False, False), none, free, (False, False))
 
 
 def stored(part: Part, values: NDArray[Any]) -> NDArray[Any]:
