@@ -76,7 +76,7 @@ _CLOSED: Mapping[str, Closed | None] = {
 
 _FORMATS = (
     Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
-    Format("npz", (".npz",), npz.sniff, npz.read, options={"array": "name of the array that is the surface"}),
+    Format("npz", (".npz",), npz.sniff, npz.read, options=npz.READ_OPTIONS),
     Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options=geotiff.READ_OPTIONS),
     Format("esri-ascii", (".asc",), ascii_grid.sniff, ascii_grid.read),
     Format("usgs-dem", (".dem",), usgs_dem.sniff, usgs_dem.read),
