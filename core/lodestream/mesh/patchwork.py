@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from .halfedges import Corners, find_pieces, find_twins, find_umbrellas
+from .model import Mesh, name_faces
 from .poles import find_fans, find_poles, unfold
-from .polygons import Mesh, Polygons, name_faces
+from .polygons import Polygons
 from .triangles import pair_in_order, pair_triangles
 
 __all__ = ["Quads", "make_quads"]
