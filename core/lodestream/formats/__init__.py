@@ -18,7 +18,22 @@ from typing import Any, BinaryIO
 from ..errors import FormatError, InputError, OptionError
 from ..seams import restore
 from ..surface import Closed, Surface
-from . import ascii_grid, bezier, geotiff, npy, npz, obj, pcd, plot3d, ply, srtm_hgt, usgs_dem
+from . import (
+    ascii_grid,
+    bezier,
+    cgns,
+    geotiff,
+    npy,
+    npz,
+    obj,
+    pcd,
+    plot3d,
+    ply,
+    srtm_hgt,
+    usgs_dem,
+    vtk_legacy,
+    vtk_xml,
+)
 from .source import DEFAULT_MAX_VERTICES, Source
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
@@ -84,6 +99,9 @@ _FORMATS = (
     Format("ply", (".ply",), ply.sniff, ply.read, ply.write),
     Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
     Format("pcd", (".pcd",), pcd.sniff, pcd.read),
+    Format("vtk", (".vtk",), vtk_legacy.sniff, vtk_legacy.read, options=vtk_legacy.OPTIONS),
+    Format("vts", vtk_xml.SUFFIXES, vtk_xml.sniff, vtk_xml.read, options=vtk_xml.OPTIONS, more=vtk_xml.MORE),
+    Format("cgns", (".cgns",), cgns.sniff, cgns.read, options=cgns.OPTIONS),
     Format("bpt", (bezier.SUFFIX,), bezier.sniff, bezier.read, options=bezier.OPTIONS),
     Format("plot3d", plot3d.SUFFIXES, plot3d.sniff, plot3d.read, options=plot3d.READ_OPTIONS, more=plot3d.MORE),
 )
