@@ -16,15 +16,16 @@ __all__ = ["find_curve"]
 _MIN_CLOSED = 3
 
 
-def find_curve(points: int, segments: NDArray[np.int64], lines: Sequence[int]) -> bool:
+def find_curve(points: int, segments: NDArray[np.int64], places: Sequence[int], what: str = "line") -> bool:
     """Check that `segments` join the points one after another; say whether the last is joined to the first.
 
     Parameters
     ----------
     points : int
     segments : int64 array of shape (S, 2)
-    lines : sequence of int
-        The line of the file that holds each segment.
+    places : sequence of int
+        Where in the file each segment is: the number of its `what`.
+    what : str
     """
     expected = np.stack((np.arange(points), (np.arange(points) + 1) % points), axis=-1)
     shared = min(len(segments), points)
@@ -32,7 +33,8 @@ def find_curve(points: int, segments: NDArray[np.int64], lines: Sequence[int]) -
     if wrong.size or len(segments) > points:
         misfit = int(wrong[0]) if wrong.size else points
         raise FormatError(
-            f"line {lines[misfit]}: expected lines that join points one after another, got {_shown(segments[misfit])}"
+            f"{what} {places[misfit]}: expected lines that join points one after another, got "
+            f"{_shown(segments[misfit])}"
         )
     if len(segments) < points - 1:
         raise FormatError(f"expected lines that join all {number(points)} points, got {number(len(segments))} segments")

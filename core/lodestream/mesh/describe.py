@@ -132,10 +132,11 @@ def _border(block: RecognisedBlock) -> NDArray[np.int64]:
     return np.concatenate([block.vertices[border], np.unique(poles).astype(np.int64)])
 
 
-def shape_words(blocks: Sequence[Block]) -> str:
-    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"."""
+def shape_words(blocks: Sequence[Block], poles: int) -> str:
+    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"; `poles` are sides of blocks that are one vertex."""
     if len(blocks) == 1:
-        kind = ("grid", "cylinder", "torus")[sum(blocks[0].closed)]
+        closed = sum(blocks[0].closed)
+        kind = ("grid", ("cylinder", "cap", "sphere")[poles if closed == 1 else 0], "torus")[closed]
         return f"{kind}, {_by(blocks[0].shape)}"
     sizes = sorted({block.shape for block in blocks}, key=lambda shape: (shape[0] * shape[1], shape))
     if len(sizes) == 1:

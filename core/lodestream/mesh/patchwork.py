@@ -219,8 +219,8 @@ def _unpaired(
     irregular = len(np.unique(rows[wrong]))
     return (
         f"expected six triangles round every inner vertex (the cells of a grid cut in two), or fans round poles, got "
-        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])} "
-        f"and {irregular:,} such vertices in all: make quads of the triangles first"
+        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])}, "
+        f"and another number than six round {irregular:,} vertices in all: make quads of the triangles first"
     )
 
 

@@ -57,7 +57,8 @@ class Recognised:
 
         `surface` is that of the blocks, or what it has become since.
         """
-        return "; ".join([shape_words(surface.blocks) + ", from triangles" * self.triangles, *self.notes])
+        poles = sum(pole["kind"] != "repeated" for block in self.blocks for pole in block.poles)
+        return "; ".join([shape_words(surface.blocks, poles) + ", from triangles" * self.triangles, *self.notes])
 
     def surface(self, metadata: Mapping[str, Any] | None = None) -> Surface:
         """Make a surface of the blocks, with ``recognised``, ``faces`` and ``poles`` beside the metadata given."""
@@ -315,7 +316,7 @@ class _Recognition:
         notes += [f"{name} left out: {why}" for name, why in self.left_out.items()]
         alone = len(used) - int(used.sum())
         notes += [f"{alone} vertices without a face left out"] * (alone > 0)
-        return notes
+        return [*notes, *self.mesh.notes]
 
 
 def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:
