@@ -4,7 +4,7 @@ A *rule* is a list of plain numbers, evaluated in float64 in the order shown and
 
     [origin, step]                          origin + step k           k: the column for x, the row for y
     [origin, step, scale]                   (origin + step k) / scale
-    [origin, last, true]                    origin + (last - origin) / (n - 1) k; at the end, last (numpy.linspace)
+    [origin, last, n, true]                 origin + (last - origin) / (n - 1) k; last for k = n - 1 (numpy.linspace)
     [origin, across, down, shift]           across (column + shift) + down (row + shift) + origin
     [v0, v1, v2, ..., "values"]             the numbers themselves, of each column for x, of each row for y
 """
@@ -38,10 +38,9 @@ def evaluate(
     if len(rule) == 2:
         return np.asarray(place * float(rule[1]) + float(rule[0]))
     if rule[-1] is True:
-        origin, last, _ = map(float, rule)
-        values = place * ((last - origin) / (place.size - 1)) + origin
-        values.reshape(-1)[-1] = last
-        return np.asarray(values)
+        origin, last, count, _ = map(float, rule)
+        values = place * ((last - origin) / (count - 1)) + origin
+        return np.where(place == count - 1, last, values)
     if len(rule) == 3:
         return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
     origin, across, by_row, shift = map(float, rule)
@@ -78,17 +77,14 @@ def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule
     if len(values) < 2 or not np.isfinite(values).all() or not _nearly_even(index, values):
         return None
     sample = np.unique(np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).round().astype(int))
-    for rule in _candidates(index, values):
-        if all(_makes(rule, len(line), index[part], values[part]) for part in (sample, slice(None))):
+    for rule in _candidates(index, values, len(line)):
+        if all(_makes(rule, index[part], values[part]) for part in (sample, slice(None))):
             return [plain(number) for number in rule]
     return None
 
 
-def _makes(rule: Rule, length: int, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
-    if rule[-1] is True:  # depends on the last index, and is cheap to make whole
-        made = evaluate(rule, np.zeros((1, 1)), np.arange(length, dtype=np.float64)[None, :], False)[0, index]
-    else:
-        made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
+def _makes(rule: Rule, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
+    made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
     return np.array_equal(bits(rounded(made, values.dtype)), bits(values))
 
 
@@ -108,14 +104,16 @@ def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
     return bool(step) and bool(away <= min(allowed, abs(step) / 4)) and float(np.abs(exact).max()) < 2**53
 
 
-def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule]:
+def _candidates(index: NDArray[np.int64], values: NDArray[Any], length: int) -> Iterator[Rule]:
     """Rules that may have made these values, the likely ones first."""
     ends = [float(values[0]), float(values[-1])]
     steps = _steps(index, values)
     firsts = [ends[0], float(str(values[0]))] if values.dtype.kind == "f" else ends[:1]
     if index[0] == 0:
         yield from ([first, step] for first in dict.fromkeys(firsts) for step in steps)
-        yield from ([first, last, True] for first, last in (ends, [float(str(values[0])), float(str(values[-1]))]))
+        yield from (
+            [first, last, length, True] for first, last in (ends, [float(str(values[0])), float(str(values[-1]))])
+        )
     if values.dtype == np.float32:
         yield from _stabbed(index, values, steps[0])
     for step in steps:

@@ -1,8 +1,9 @@
 """Height fields: surfaces whose x and y are a rule, so that heights alone need to be stored.
 
 Surfaces that come as xyz and have such an x and y are taken for heights and given back as xyz, bit for bit.
-In the metadata of a surface, ``grid`` holds the two rules of x and y where the surface came as xyz, and ``axes`` those
-of heights that came with coordinates. Without either, a ``geotransform`` says where the heights lie.
+In the metadata of a surface, ``grid`` holds the two rules of x and y where the surface came as xyz. For heights that
+came with coordinates of their own, ``axes`` is a map of the rules "x" and "y", of the "dtype" of the coordinates unless
+that is float64, and of "rows": "x" where x runs along the rows. Without either, ``geotransform`` says where they lie.
 """
 
 from __future__ import annotations
@@ -88,10 +89,11 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
         for n, at in zip(shape, nodes, strict=True)
     )
     dtype: np.dtype[Any] = np.dtype(np.float64)
+    swapped = False
     if "grid" in metadata:
         rules, dtype = metadata["grid"], surface.dtype
     elif "axes" in metadata:
-        rules = metadata["axes"]
+        rules, dtype, swapped = _axes(metadata["axes"])
     elif metadata.get("geotransform") is not None:
         rules = _geotransform_rules(metadata["geotransform"])
     else:
@@ -100,7 +102,7 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     planes = []
     for channel, rule in enumerate(rules):
         try:
-            values = evaluate(rule, row[:, None], column[None, :], down=channel == 1)
+            values = evaluate(rule, row[:, None], column[None, :], down=(channel == 1) != swapped)
         except (TypeError, ValueError, IndexError):
             raise InputError(f"expected two rules of coordinates in the metadata, got {str(rules)[:80]}") from None
         for angle in metadata.get("angles", ()):
@@ -108,6 +110,14 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
                 values = wrapped(values, angle["period"], angle["low"])
         planes.append(np.broadcast_to(rounded(values, dtype), shape))
     return planes[0], planes[1]
+
+
+def _axes(axes: Any) -> tuple[list[Rule], np.dtype[Any], bool]:
+    """The two rules, the type of coordinates, and whether x runs along the rows."""
+    try:
+        return [axes["x"], axes["y"]], np.dtype(axes.get("dtype", "float64")), axes.get("rows") == "x"
+    except (TypeError, KeyError, AttributeError):
+        raise InputError(f"expected axes of x and y in the metadata, got {str(axes)[:80]}") from None
 
 
 def _geotransform_rules(transform: Any) -> list[Rule]:
@@ -131,7 +141,7 @@ def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rul
             return rule
         if len(rule) == 2:
             rule = [rule[0], rule[1], 0, 0] if axis == 1 else [rule[0], 0, rule[1], 0]
-        elif len(rule) == 4:
+        elif len(rule) == 4 and rule[-1] is not True:
             rule = [rule[0], rule[2], rule[1], rule[3]]
         else:
             continue
@@ -229,11 +239,15 @@ def level_metadata(
         full / nodes if wraps else (full - 1) / max(nodes - 1, 1)
         for full, nodes, wraps in zip(shape, coarse, closed, strict=True)
     ]
-    for key in ("grid", "axes"):
-        if key in metadata:
-            result[key] = [
-                _coarser(rule, shape, coarse, across, down=channel == 1) for channel, rule in enumerate(metadata[key])
-            ]
+    if "grid" in metadata:
+        result["grid"] = [
+            _coarser(rule, shape, coarse, across, down=channel == 1) for channel, rule in enumerate(metadata["grid"])
+        ]
+    if "axes" in metadata:
+        rules, _, swapped = _axes(metadata["axes"])
+        for name, channel in (("x", 0), ("y", 1)):
+            rule = _coarser(rules[channel], shape, coarse, across, down=(channel == 1) != swapped)
+            result["axes"] = {**result["axes"], name: rule}
     nodes = [
         (level_coordinates(n, wraps, halvings) / ratio).tolist() if has_gap(n, wraps, halvings) else None
         for n, wraps, ratio in zip(shape, closed, across, strict=True)

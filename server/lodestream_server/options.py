@@ -7,11 +7,15 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lodestream import Tolerance
 from lodestream.errors import FormatError, OptionError
 
 from .worker import CLOSED, UNNAMED
+
+if TYPE_CHECKING:
+    from lodestream.formats import Format
 
 __all__ = ["SurfaceOptions", "check", "identify", "plain_name"]
 
@@ -63,8 +67,8 @@ class SurfaceOptions:
         return cls(name, filename, values)
 
 
-def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -> str:
-    """Refuse what a look at the first bytes shows to be wrong; the name of the first file's format.
+def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -> Format:
+    """Refuse what a look at the first bytes shows to be wrong; the first file's format.
 
     Raises
     ------
@@ -84,13 +88,17 @@ def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -
         if key not in ("precision", "closed", *found[0].options):
             known = ", ".join(("precision", "closed", "name", "filename", *found[0].options))
             raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
-    return found[0].name
+    return found[0]
 
 
-def identify(digest: hashlib._Hash, format_name: str, options: SurfaceOptions) -> str:
-    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, its format and its options."""
+def identify(digest: hashlib._Hash, format_: Format, filename: str | None, options: SurfaceOptions) -> str:
+    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, its format and its options.
+
+    What the name of the first file tells, like the place of an .hgt, counts as an option; the name itself does not.
+    """
+    told = dict(format_.named(filename)) if format_.named and filename else {}
     whole = digest.copy()
-    whole.update(json.dumps([format_name, sorted(options.chosen.items())], ensure_ascii=True).encode())
+    whole.update(json.dumps([format_.name, sorted({**told, **options.chosen}.items())], ensure_ascii=True).encode())
     return whole.hexdigest()[:20]
 
 

@@ -143,6 +143,10 @@ class Storage:
             raise NotFoundError(f"expected the id of a surface on this server, got {surface[:80]!a}")
         return record
 
+    def find(self, surface: str | None) -> Record | None:
+        """The record of a surface, if there is one."""
+        return self._records.get(surface or "")
+
     def records(self) -> list[Record]:
         """All records, oldest first."""
         return sorted(self._records.values(), key=lambda record: (record.created, record.id))
@@ -176,7 +180,7 @@ class Storage:
             When no surface has it.
         """
         path = self._at.container(sha256)
-        if len(sha256) != 64 or not sha256.isalnum() or not path.is_file():
+        if len(sha256) != 64 or not (sha256.isascii() and sha256.isalnum()) or not path.is_file():
             raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
         return path
 

@@ -102,9 +102,9 @@ async def delete(parts: Parts, surface: str) -> Response:
 
 def _record(received: uploads.Upload, chosen: options.SurfaceOptions, parts: State) -> Record:
     names = [options.plain_name(name or "") for name in received.names]
-    format_name = options.check(received.paths, names, chosen)
+    format_ = options.check(received.paths, names, chosen)
     return Record(
-        id=options.identify(received.digest, format_name, chosen),
+        id=options.identify(received.digest, format_, names[0], chosen),
         name=chosen.name,
         created=time.time(),
         filenames=tuple(name or "" for name in names),

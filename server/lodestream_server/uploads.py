@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,9 +25,10 @@ from .settings import Settings
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Upload", "receive"]
+__all__ = ["Upload", "digest_of", "receive"]
 
-_BUFFER = 1 << 20
+# Larger blocks than the network's, so that a thread is asked less often; small enough for many uploads at once.
+_BUFFER = 64 * 1024
 _FIELD = "file"
 _MOST_PART_HEADERS = 16 * 1024
 
@@ -84,6 +85,19 @@ class Upload:
     def abort(self) -> None:
         """Close what is open, after an error."""
         self._stack.close()
+
+
+def digest_of(files: Iterable[Path]) -> str:
+    """What `Upload.digest` was when these files were taken, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for path in files:
+        size = 0
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+                size += len(block)
+        digest.update(size.to_bytes(8, "big"))
+    return digest.hexdigest()
 
 
 class _Raw:
@@ -218,9 +232,8 @@ def _check_promised(request: Request, most: int) -> None:
 
 
 async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
-    # Larger blocks than the network's, so that a thread is asked less often.
-    pending: list[bytes] = []
-    waiting = size = 0
+    pending = bytearray()
+    size = 0
     chunks = aiter(request.stream())
     while True:
         try:
@@ -233,10 +246,9 @@ async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
         size += len(chunk)
         if size > settings.upload_bytes:
             raise TooLargeError(f"expected an upload of at most {settings.upload_bytes} bytes, got more")
-        pending.append(chunk)
-        waiting += len(chunk)
-        if waiting >= _BUFFER:
-            yield b"".join(pending)
-            pending, waiting = [], 0
+        pending += chunk
+        if len(pending) >= _BUFFER:
+            yield bytes(pending)
+            pending.clear()
     if pending:
-        yield b"".join(pending)
+        yield bytes(pending)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lodestream.errors import LodestreamError
 
 from .durable import NewFile
+from .records import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,14 +25,8 @@ __all__ = ["CLOSED", "UNNAMED", "Built", "Job", "Refused", "build", "limit_memor
 
 _log = logging.getLogger(__name__)
 
-#: The values of ``closed``, as (rows, columns); `auto` leaves what the file says.
-CLOSED: dict[str, tuple[bool, bool] | None] = {
-    "auto": None,
-    "none": (False, False),
-    "rows": (True, False),
-    "cols": (False, True),
-    "both": (True, True),
-}
+#: The values of ``closed``; `auto` leaves what the file says.
+CLOSED = ("auto", "none", "rows", "cols", "both")
 
 #: What a file without a name is called in messages, which must not tell where it lies on the server.
 UNNAMED = "upload"
@@ -55,7 +50,7 @@ class Job:
     precision : str or None
         As on the command line: a number, or a number and ``d``.
     closed : str
-        A key of `CLOSED`.
+        One of `CLOSED`.
     options : mapping of str to str
         Options of the format.
     max_vertices : int
@@ -140,23 +135,25 @@ def _build(job: Job) -> Built:
     with NewFile(path) as file:
         file.write(container)
     index = read_index(lambda offset, length: container[offset : offset + length], len(container))
-    return Built(path, hashlib.sha256(container).hexdigest(), describe(index))
+    return Built(path, hashlib.sha256(container).hexdigest(), plain(describe(index)))
 
 
 def _read(job: Job) -> Surface:
-    from lodestream import Surface
     from lodestream.formats import read
 
-    filename = job.filename or UNNAMED
-    surface = read(*job.files, max_vertices=job.max_vertices, filename=filename, **job.options)
-    metadata = dict(surface.metadata)
+    surface = read(
+        *job.files,
+        closed=job.closed,
+        max_vertices=job.max_vertices,
+        filename=job.filename or UNNAMED,
+        **job.options,
+    )
     if job.name is not None:
-        metadata["name"] = job.name
+        surface.metadata["name"] = job.name
     elif job.filename is None:
         # Nobody gave it one: the reader took it from the name that stands in for the file's.
-        metadata.pop("name", None)
-    closed = CLOSED[job.closed]
-    return Surface(surface.points, surface.closed if closed is None else closed, metadata=metadata)
+        surface.metadata.pop("name", None)
+    return surface
 
 
 def _reporter(folder: Path) -> Callable[[float], None]:

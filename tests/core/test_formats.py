@@ -88,6 +88,49 @@ def test_npz_gives_its_only_surface_and_keeps_numbers_beside_it(tmp_path: Path, 
     assert surface.metadata == {"name": "a", "format": "npz", "scalars": {"dx": 0.5, "zone": 17}}
 
 
+def test_npz_gives_heights_their_coordinates(tmp_path: Path) -> None:
+    heights = np.arange(12.0).reshape(3, 4)
+    x, y = np.array([1.5, 2.0, 2.5, 3.0]), np.array([8.0, 6.0, 4.0])
+    np.savez(tmp_path / "even.npz", depth=heights, lon=x, lat=y)
+    surface = formats.read(tmp_path / "even.npz")
+    np.testing.assert_array_equal(surface.points, heights)
+    assert surface.metadata["geotransform"] == [1.25, 0.5, 0.0, 9.0, 0.0, -2.0]
+    np.savez(tmp_path / "uneven.npz", depth=heights, lon=x**2, lat=y, u=y, v=np.ones((3, 4)))
+    surface = formats.read(tmp_path / "uneven.npz", array="depth")
+    np.testing.assert_array_equal(surface.points, np.dstack((*np.meshgrid(x**2, y), heights)))
+    np.savez(tmp_path / "arrays.npz", z=heights, x=heights + 1, y=heights * 2)
+    surface = formats.read(tmp_path / "arrays.npz")
+    np.testing.assert_array_equal(surface.points, np.dstack((heights + 1, heights * 2, heights)))
+    surface = formats.read(tmp_path / "uneven.npz", array="depth", x="v", y="u")
+    np.testing.assert_array_equal(surface.points[1], np.column_stack((np.ones(4), np.full(4, 6.0), heights[1])))
+    refusals: list[tuple[dict[str, Any], type[InputError], str]] = [
+        ({"x": "nothing"}, OptionError, r"x= one of depth \(3 x 4 float64\), .*, got 'nothing'"),
+        ({"y": "lon"}, FormatError, r"lon of the shape of depth, \(3, 4\), or a vector along it, got 4 float64"),
+    ]
+    for options, error, message in refusals:
+        with pytest.raises(error, match=message):
+            formats.read(tmp_path / "uneven.npz", array="depth", **options)
+
+
+@pytest.mark.parametrize(
+    ("extent", "expected"),
+    [
+        ((18.0, 17.0), [10.0, 2.0, 0.0, 20.0, 0.0, -1.0]),  # of cells
+        ((16.0, 22.0), [9.0, 2.0, 0.0, 19.5, 0.0, 1.0]),  # of points
+        ((18.0, 9.0), None),
+    ],
+)
+def test_npz_with_an_extent_says_where_its_cells_or_points_lie(
+    tmp_path: Path, extent: tuple[float, float], expected: list[float] | None
+) -> None:
+    scalars = {"dx": 2.0, "xmin": 10.0, "xmax": extent[0], "dy": 1.0, "ymin": 20.0, "ymax": extent[1]}
+    arrays: dict[str, Any] = {"z": np.zeros((3, 4)), **{name: np.array(value) for name, value in scalars.items()}}
+    np.savez(tmp_path / "a.npz", **arrays)
+    metadata = formats.read(tmp_path / "a.npz").metadata
+    assert metadata["scalars"] == scalars
+    assert metadata.get("geotransform") == expected
+
+
 def test_npz_of_two_surfaces_asks_which(tmp_path: Path) -> None:
     path = tmp_path / "two.npz"
     np.savez(path, bed=np.zeros((3, 4)), ice=np.ones((3, 4), np.float32, order="F"))
@@ -236,7 +279,7 @@ def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", np.eye(3))
     with pytest.raises(OptionError, match=r"an option of format npy \(none\), got 'band'"):
         formats.read(tmp_path / "a.npy", band=1)
-    with pytest.raises(OptionError, match=r"an option of format npz \(array\), got 'band'"):
+    with pytest.raises(OptionError, match=r"an option of format npz \(array, x, y\), got 'band'"):
         formats.read(tmp_path / "a.npz", band=1)
     with pytest.raises(OptionError, match="expected max_vertices as a whole number, got '9'"):
         formats.read(tmp_path / "a.npy", max_vertices="9")  # type: ignore[arg-type]

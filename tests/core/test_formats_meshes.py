@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lodestream import formats
 from lodestream.errors import FormatError, InputError
+from lodestream.seams import restore
 from lodestream.surface import Surface
 
 CLOSED = [(False, False), (True, False), (False, True), (True, True)]
@@ -44,14 +45,14 @@ def torus(rows: int, columns: int) -> NDArray[np.float64]:
 @given(
     points=npst.arrays(
         st.sampled_from((np.float32, np.float64)),
-        st.tuples(st.integers(2, 8), st.integers(2, 8), st.sampled_from((3, 6))),
+        st.tuples(st.integers(2, 8), st.integers(2, 8), st.just(3)),
         elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
     ),
     closed=st.sampled_from(CLOSED),
 )
 def test_obj_round_trip(points: NDArray[Any], closed: tuple[bool, bool]) -> None:
     assume(all(length > 2 for length, wraps in zip(points.shape[:2], closed, strict=True) if wraps))
-    surface = parse(text(Surface(points, closed)))
+    surface = restore(parse(text(Surface(points, closed))))  # of points drawn at random, some repeat at the end
     assert (surface.points.shape, surface.closed) == (points.shape, closed)
     np.testing.assert_array_equal(surface.points.astype(points.dtype), points)
 
@@ -137,7 +138,8 @@ def test_heights_are_drawn_over_columns_and_rows_or_where_they_lie() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "line 4: expected a face of 4 corners, got 3: 'f 1 2 3'"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4: expected a face of 3 or 4 corners, got 2: 'f 1 2'"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", r"have no partner: face 1 \(line 4\)"),
         ("v 0 0\nv 1 0 0\n", "line 1: expected a point of 3 numbers .*, got 'v 0 0'"),
         ("v 0 0 zero\n", "line 1: expected a point of 3 numbers"),
         ("v 0 0 0 0.5\n", "line 1: expected a point of 3 numbers"),
@@ -165,14 +167,12 @@ def test_faces_that_are_no_grid_are_named() -> None:
     lines = text(Surface(np.zeros((4, 5)))).splitlines()
     crossed = [*lines[:-1], "f 14 20 15 19"]
     with pytest.raises(
-        FormatError, match=r"line 32: expected each quad of a 4 x 5 grid .* got face 12 \(14 20 15 19\)"
+        FormatError, match=r"the first of them vertex 14 of face 7 \(line 27\), face 8 .* and face 12 \(line 32\)"
     ):
         parse("\n".join(crossed))
     twice = [*lines[:-1], lines[-2]]
-    with pytest.raises(FormatError, match=r"line 32: expected each quad of a 4 x 5 grid .* once, got face 12"):
+    with pytest.raises(FormatError, match=r"got 3 at the edge .*: face 7 \(line 27\), face 11 \(line 31\) and face 12"):
         parse("\n".join(twice))
-    with pytest.raises(FormatError, match=r"got 11 faces over 20 points: no such grid"):
-        parse("\n".join(lines[:-1]))
     # Six quads on the sides of a cube: closed, and no grid.
     cube = "".join(f"v {i & 1} {i >> 1 & 1} {i >> 2}\n" for i in range(8))
     cube += "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n"

@@ -85,7 +85,7 @@ def test_turned_lattices_are_found(dtype: str) -> None:
 def test_columns_may_run_along_y(x: str) -> None:
     points = xyz(AXES[x](31), AXES["downwards"](20)).transpose(1, 0, 2)
     found = to_heights(Surface(points))
-    if x == "decimals":  # such a rule has no room for the other axis
+    if x == "decimals":  # such a rule runs along its own axis only
         assert found is None
         return
     assert found is not None
@@ -179,10 +179,13 @@ def test_heights_lie_at_the_centres_of_their_cells_or_at_their_indices() -> None
     assert (x[2].tolist(), y[:, 1].tolist()) == ([0, 1, 2, 3], [0, 1, 2])
     x, y = coordinates(Surface(values, metadata={"geotransform": [100, 10, 0, 500, 0, -20]}))
     assert (x[0].tolist(), y[:, 0].tolist()) == ([105, 115, 125, 135], [490, 470, 450])
-    axes = [[0.1, 0.1], [7.0, 8.5, 11.0, "values"]]
+    axes: dict[str, Any] = {"x": [0.1, 0.1], "y": [7.0, 8.5, 11.0, "values"]}
     x, y = coordinates(Surface(values, metadata={"geotransform": [100, 10, 0, 500, 0, -20], "axes": axes}))
     assert x[0].tolist() == (np.arange(4) * 0.1 + 0.1).tolist()
     assert y[:, 3].tolist() == [7.0, 8.5, 11.0]
+    turned = {"x": [1, 0.25], "y": [0.5, 8.5, 8.0, 7.5, "values"], "rows": "x", "dtype": "float32"}
+    x, y = coordinates(Surface(values, metadata={"axes": turned}))
+    assert (x.dtype.name, x[:, 2].tolist(), y[1].tolist()) == ("float32", [1, 1.25, 1.5], [0.5, 8.5, 8, 7.5])
     points = to_xyz(Surface(values, metadata={"axes": axes, "crs": "here"}))
     assert (points.dtype.name, points.metadata) == ("float64", {"crs": "here"})
     for metadata in (
@@ -258,11 +261,11 @@ def test_metadata_of_levels_keep_the_rest_and_drop_the_seam() -> None:
         "name": "a",
         "seam": "cols",
         "crs": "here",
-        "axes": [[0.0, 1.0, 4.0, 9.0, 16.0, "values"], [0, 1, 0, 0.5]],
+        "axes": {"x": [0.0, 1.0, 4.0, 9.0, 16.0, "values"], "y": [0, 1, 0, 0.5]},
     }
     level = level_metadata(metadata, (7, 5), (4, 3), (False, False), 1)
-    assert level["axes"][0] == [0.0, 4.0, 16.0, "values"]
-    assert level["axes"][1] == [0.5, 2.0, 0.0, 0.0]
+    assert level["axes"]["x"] == [0.0, 4.0, 16.0, "values"]
+    assert level["axes"]["y"] == [0.5, 2.0, 0.0, 0.0]
     assert "nodes" not in level
     assert (level["name"], level["crs"]) == ("a", "here")
     assert "seam" not in level

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -93,8 +93,8 @@ class _Node:
 class LosingDisk(Disk):
     """A disk that remembers what was synchronised, and can show what remains when the power fails.
 
-    It takes the hardest view that POSIX allows: bytes that were not synchronised are gone, and so are names of a
-    folder that was not. Every step is done on the real disk too.
+    What was not synchronised may be lost or kept, bytes apart from names: `remains` shows each. Every step is done on
+    the real disk too.
 
     Parameters
     ----------
@@ -110,9 +110,12 @@ class LosingDisk(Disk):
         self._after = after
         self._open: dict[int, _Node] = {}
 
-    def remains(self, target: Path) -> None:
-        """Write what a power failure would leave into a new folder."""
-        self._show(self._top, target)
+    def remains(self, *, names: bool, data: bool) -> dict[str, bytes | None]:
+        """What a power failure would leave: the bytes of each file, None for a folder.
+
+        Names, or bytes, that were not synchronised are kept if so said.
+        """
+        return dict(self._show(self._top, "", names, data))
 
     def make_folder(self, path: Path) -> None:
         super().make_folder(path)
@@ -170,10 +173,10 @@ class LosingDisk(Disk):
             node.data = node.safe_data = path.read_bytes()
         return node
 
-    def _show(self, node: _Node, target: Path) -> None:
+    def _show(self, node: _Node, path: str, names: bool, data: bool) -> Iterator[tuple[str, bytes | None]]:
         if not node.folder:
-            target.write_bytes(node.safe_data)
+            yield path, node.data if data else node.safe_data
             return
-        target.mkdir()
-        for name, child in node.safe_names.items():
-            self._show(child, target / name)
+        yield path, None
+        for name, child in (node.names if names else node.safe_names).items():
+            yield from self._show(child, f"{path}/{name}", names, data)

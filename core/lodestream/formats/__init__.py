@@ -18,7 +18,23 @@ from typing import Any, BinaryIO
 from ..errors import FormatError, InputError, OptionError
 from ..seams import restore
 from ..surface import Closed, Surface
-from . import ascii_grid, bezier, geotiff, npy, npz, obj, pcd, plot3d, ply, srtm_hgt, usgs_dem
+from . import (
+    ascii_grid,
+    bezier,
+    cgns,
+    geotiff,
+    npy,
+    npz,
+    obj,
+    off,
+    pcd,
+    plot3d,
+    ply,
+    srtm_hgt,
+    usgs_dem,
+    vtk_legacy,
+    vtk_xml,
+)
 from .source import DEFAULT_MAX_VERTICES, Source
 
 __all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
@@ -76,14 +92,18 @@ _CLOSED: Mapping[str, Closed | None] = {
 
 _FORMATS = (
     Format("npy", (".npy",), npy.sniff, npy.read, npy.write),
-    Format("npz", (".npz",), npz.sniff, npz.read, options={"array": "name of the array that is the surface"}),
+    Format("npz", (".npz",), npz.sniff, npz.read, options=npz.READ_OPTIONS),
     Format("geotiff", (".tif", ".tiff"), geotiff.sniff, geotiff.read, options=geotiff.READ_OPTIONS),
     Format("esri-ascii", (".asc",), ascii_grid.sniff, ascii_grid.read),
     Format("usgs-dem", (".dem",), usgs_dem.sniff, usgs_dem.read),
     Format("srtm-hgt", (".hgt",), srtm_hgt.sniff, srtm_hgt.read, options=srtm_hgt.READ_OPTIONS, named=srtm_hgt.named),
     Format("ply", (".ply",), ply.sniff, ply.read, ply.write),
+    Format("off", (".off",), off.sniff, off.read),
     Format("obj", (".obj",), obj.sniff, obj.read, obj.write),
     Format("pcd", (".pcd",), pcd.sniff, pcd.read),
+    Format("vtk", (".vtk",), vtk_legacy.sniff, vtk_legacy.read, options=vtk_legacy.OPTIONS),
+    Format("vts", vtk_xml.SUFFIXES, vtk_xml.sniff, vtk_xml.read, options=vtk_xml.OPTIONS, more=vtk_xml.MORE),
+    Format("cgns", (".cgns",), cgns.sniff, cgns.read, options=cgns.OPTIONS),
     Format("bpt", (bezier.SUFFIX,), bezier.sniff, bezier.read, options=bezier.OPTIONS),
     Format("plot3d", plot3d.SUFFIXES, plot3d.sniff, plot3d.read, options=plot3d.READ_OPTIONS, more=plot3d.MORE),
 )

@@ -1,21 +1,37 @@
-"""NPZ: an archive of arrays, of which one is the surface."""
+"""NPZ: an archive of arrays, of which one is the surface and others say where it lies."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .npy import Header, read_header, read_values
+from .placed import Coordinate, place
 from .source import Source, number, refuse_array
 
-__all__ = ["read", "sniff"]
+__all__ = ["READ_OPTIONS", "read", "sniff"]
+
+READ_OPTIONS = {
+    "array": "name of the array that is the surface",
+    "x": "name of the array of x, a vector or of the shape of the surface (default: x, lon, longitude or easting)",
+    "y": "name of the array of y (default: y, lat, latitude or northing)",
+}
+
+_NAMES = {"x": ("x", "lon", "longitude", "easting"), "y": ("y", "lat", "latitude", "northing")}
+_DEGREES = ("lon", "longitude")
+_BOUNDS = (("dx", "xmin", "xmax"), ("dy", "ymin", "ymax"))
+
+#: How far spacing times count may be from the extent, relative to it.
+_CLOSE = 1e-6
 
 _MAX_MEMBERS = 1000
 _ENCRYPTED = 1
@@ -27,27 +43,89 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the only array that can be a surface, or the one that the option ``array`` names.
+    """Read the array that is a surface, with the coordinates beside it.
 
-    Single numbers beside it (spacings, extents) are kept in the metadata as ``scalars``.
+    Those are vectors or arrays under the usual names, or under those that options give; or the numbers dx, dy, xmin,
+    xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``.
     """
     with _refusals(), ZipFile(source.path) as archive:
         members = _members(archive)
-        headers = {name: _header(archive, member) for name, member in members.items()}
-        name = _choose(source, headers)
-        header = headers[name]
+        contents = _Contents(source, archive, members, {name: _header(archive, it) for name, it in members.items()})
+        name = _choose(contents)
+        header = contents.headers[name]
         source.check_array(header.shape, header.dtype)
-        source.check_expansion(header.nbytes)
-        with archive.open(members[name]) as file:
+        axes = [contents.coordinate(letter, header.shape[:2], name) for letter in "xy"]
+        values = contents.values(name)
+        metadata = source.metadata("npz")
+        if contents.scalars():
+            metadata["scalars"] = contents.scalars()
+    if axes[0] is not None and axes[1] is not None:
+        if values.ndim != 2:
+            raise FormatError(f"expected heights of shape (H, W) for coordinates beside them, got shape {values.shape}")
+        return place(values, axes[0], axes[1], closed=source.closed, metadata=metadata)
+    transform = _bounds(metadata.get("scalars", {}), header.shape)
+    if transform is not None:
+        metadata["geotransform"] = transform
+    return Surface(values, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """The archive's members by the names of their arrays."""
+
+    source: Source
+    archive: ZipFile
+    members: Mapping[str, ZipInfo]
+    headers: Mapping[str, Header]
+
+    @property
+    def listing(self) -> str:
+        """All arrays, in words."""
+        words = [f"{name} ({header.words})" for name, header in self.headers.items()]
+        return ", ".join(words[:10] + ["..."] * (len(words) > 10)) or "nothing"
+
+    def values(self, name: str) -> NDArray[Any]:
+        """One array, whose header was found to be allowed."""
+        header = self.headers[name]
+        self.source.check_expansion(header.nbytes)
+        with self.archive.open(self.members[name]) as file:
             read_header(file)
             values = read_values(file, header)
             if file.read(1):  # reading to the end is also what makes zipfile compare the CRC
                 raise FormatError(f"expected {number(header.nbytes)} bytes of values in {name}, got more")
-        metadata = source.metadata("npz")
-        scalars = {other: _scalar(archive, members[other]) for other, it in headers.items() if _is_scalar(it)}
-        if scalars:
-            metadata["scalars"] = scalars
-    return Surface(values, metadata=metadata)
+        return values
+
+    def coordinate(self, letter: str, shape: tuple[int, ...], heights: str) -> Coordinate | None:
+        """The array of x or y: the one that the option names, or one of a usual name and a fitting shape."""
+        shapes = {shape: None, (shape[1 - "xy".index(letter)],): 1 - "xy".index(letter)}
+        if letter in self.source.options:
+            name = str(self.source.options[letter])
+            if name not in self.headers:
+                raise OptionError(f"expected {letter}= one of {self.listing}, got {name!r}")
+            header = self.headers[name]
+            if header.shape not in shapes or header.dtype.kind not in "iuf":
+                raise FormatError(
+                    f"expected {name} of the shape of {heights}, {shape}, or a vector along it, got {header.words}"
+                )
+        else:
+            fitting = (
+                name
+                for name, header in self.headers.items()
+                if name.lower() in _NAMES[letter] and header.shape in shapes and header.dtype.kind in "iuf"
+            )
+            name = next(fitting, heights)
+            if name == heights:
+                return None
+        degrees = letter == "x" and name.lower() in _DEGREES
+        return Coordinate(self.values(name), shapes[self.headers[name].shape], degrees)
+
+    def scalars(self) -> dict[str, Any]:
+        """The single numbers."""
+        return {
+            name: np.asarray(self.values(name)).reshape(-1)[0].item()
+            for name, header in self.headers.items()
+            if header.dtype.kind in "iuf" and header.dtype.itemsize <= 8 and set(header.shape) <= {1}
+        }
 
 
 @contextmanager
@@ -86,27 +164,42 @@ def _header(archive: ZipFile, member: ZipInfo) -> Header:
     return header
 
 
-def _choose(source: Source, headers: dict[str, Header]) -> str:
-    listing = ", ".join(f"{name} ({header.words})" for name, header in headers.items()) or "nothing"
-    if "array" in source.options:
-        name = str(source.options["array"])
-        if name not in headers:
-            raise OptionError(f"expected array= one of {listing}, got {name!r}")
+def _choose(contents: _Contents) -> str:
+    if "array" in contents.source.options:
+        name = str(contents.source.options["array"])
+        if name not in contents.headers:
+            raise OptionError(f"expected array= one of {contents.listing}, got {name!r}")
         return name
-    surfaces = [name for name, header in headers.items() if refuse_array(header.shape, header.dtype) is None]
-    if len(surfaces) == 1:
-        return surfaces[0]
+    beside = {*_NAMES["x"], *_NAMES["y"]}
+    beside |= {str(contents.source.options[letter]) for letter in "xy" if letter in contents.source.options}
+    surfaces = [name for name, header in contents.headers.items() if refuse_array(header.shape, header.dtype) is None]
+    others = [name for name in surfaces if name.lower() not in beside and name not in beside]
+    if len(others) == 1 or len(surfaces) == 1:
+        return (others or surfaces)[0]
     if surfaces:
         raise FormatError(
             f"expected one array that is a surface, got {len(surfaces)}: choose one with array= {' or '.join(surfaces)}"
         )
-    raise FormatError(f"expected an array of shape (H, W), (H, W, 2) or (H, W, C >= 3) of numbers, got {listing}")
+    raise FormatError(
+        f"expected an array of shape (H, W), (H, W, 2) or (H, W, C >= 3) of numbers, got {contents.listing}"
+    )
 
 
-def _is_scalar(header: Header) -> bool:
-    return header.dtype.kind in "iuf" and header.dtype.itemsize <= 8 and set(header.shape) <= {1}
-
-
-def _scalar(archive: ZipFile, member: ZipInfo) -> Any:
-    with archive.open(member) as file:
-        return np.asarray(read_values(file, read_header(file))).reshape(-1)[0].item()
+def _bounds(scalars: Mapping[str, Any], shape: tuple[int, ...]) -> list[float] | None:
+    """The geotransform that spacings and an extent agree on, of cells or of points; None where they do not."""
+    if len(shape) != 2:
+        return None
+    transform: list[float] = []
+    for axis, names in enumerate(_BOUNDS):
+        count = shape[1 - axis]
+        try:
+            spacing, first, last = (float(scalars[name]) for name in names)
+        except KeyError:
+            return None
+        fitting = [n for n in (count, count - 1) if n and abs(abs(last - first) - n * spacing) <= _CLOSE * n * spacing]
+        if not fitting:
+            return None
+        step = spacing if last > first else -spacing
+        origin = first if fitting[0] == count else first - step / 2
+        transform += [origin, step, 0.0] if axis == 0 else [origin, 0.0, step]
+    return transform

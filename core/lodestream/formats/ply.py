@@ -1,4 +1,4 @@
-"""PLY: range grids read; any surface written, binary and little-endian."""
+"""PLY: range grids, meshes and curves read; any surface written, binary and little-endian."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError, TooLargeError
 from ..surface import Surface
-from . import range_grid
+from . import ply_mesh, range_grid
 from .ply_elements import read_header
 from .quads import columns, edges, quads
 from .source import Source, number
@@ -30,12 +30,19 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read a range grid."""
+    """Read a range grid, or a mesh or curve that is a structured surface."""
     header = read_header(source.path)
     names = [element.name for element in header.elements]
     if range_grid.ELEMENT in names:
         return range_grid.read(source, header)
-    raise FormatError(f"expected a PLY file with {range_grid.ELEMENT}, got elements {', '.join(names) or 'none'}")
+    if ply_mesh.ELEMENT in names:
+        return ply_mesh.read(source, header)
+    if ply_mesh.CURVE in names:
+        return ply_mesh.read_curve(source, header)
+    raise FormatError(
+        f"expected a PLY file with {range_grid.ELEMENT} or {ply_mesh.ELEMENT}, got elements "
+        f"{', '.join(names) or 'none'}"
+    )
 
 
 def write(surface: Surface, file: BinaryIO) -> None:

@@ -45,6 +45,7 @@ A cell with a corner that is a hole has no face.
 
 from __future__ import annotations
 
+from .model import CornerAttribute, Mesh
 from .weld import Faces, Weld, faces_of, weld
 
-__all__ = ["Faces", "Weld", "faces_of", "weld"]
+__all__ = ["CornerAttribute", "Faces", "Mesh", "Weld", "faces_of", "weld"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface import Closed
+from ..surface import Block, Closed
 from .cells import pack_cells
 from .grid import Grid
 from .patchwork import Quads
@@ -132,14 +132,17 @@ def _border(block: RecognisedBlock) -> NDArray[np.int64]:
     return np.concatenate([block.vertices[border], np.unique(poles).astype(np.int64)])
 
 
-def shape_words(blocks: Sequence[RecognisedBlock]) -> str:
-    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"."""
-    shapes = [block.vertices.shape for block in blocks]
+def shape_words(blocks: Sequence[Block], poles: int) -> str:
+    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"; `poles` are sides of blocks that are one vertex."""
     if len(blocks) == 1:
-        kind = ("grid", "cylinder", "torus")[sum(blocks[0].closed)]
-        return f"{kind}, {shapes[0][0]} x {shapes[0][1]}"
-    sizes = sorted(set(shapes), key=lambda shape: (shape[0] * shape[1], shape))
+        closed = sum(blocks[0].closed)
+        kind = ("grid", ("cylinder", "cap", "sphere")[poles if closed == 1 else 0], "torus")[closed]
+        return f"{kind}, {_by(blocks[0].shape)}"
+    sizes = sorted({block.shape for block in blocks}, key=lambda shape: (shape[0] * shape[1], shape))
     if len(sizes) == 1:
-        return f"{len(blocks)} blocks, {sizes[0][0]} x {sizes[0][1]} each"
-    least, most = sizes[0], sizes[-1]
-    return f"{len(blocks)} blocks, {least[0]} x {least[1]} to {most[0]} x {most[1]}"
+        return f"{len(blocks)} blocks, {_by(sizes[0])} each"
+    return f"{len(blocks)} blocks, {_by(sizes[0])} to {_by(sizes[-1])}"
+
+
+def _by(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} x {shape[1]}"

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from .halfedges import Corners, find_pieces, find_twins, find_umbrellas
+from .model import Mesh, name_faces
 from .poles import find_fans, find_poles, unfold
-from .polygons import Mesh, Polygons, name_faces
+from .polygons import Polygons
 from .triangles import pair_in_order, pair_triangles
 
 __all__ = ["Quads", "make_quads"]
@@ -218,8 +219,8 @@ def _unpaired(
     irregular = len(np.unique(rows[wrong]))
     return (
         f"expected six triangles round every inner vertex (the cells of a grid cut in two), or fans round poles, got "
-        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])} "
-        f"and {irregular:,} such vertices in all: make quads of the triangles first"
+        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])}, "
+        f"and another number than six round {irregular:,} vertices in all: make quads of the triangles first"
     )
 
 

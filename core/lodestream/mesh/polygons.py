@@ -1,92 +1,17 @@
-"""Meshes of triangles and quads as files hold them, made ready for recognition."""
+"""Faces wound alike, of which grids can be made."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError
+from ..errors import FormatError
 from .halfedges import Corners, find_pieces, find_twins, orient, turn
+from .model import Mesh, name_faces
 
-__all__ = ["CornerAttribute", "Mesh", "Polygons", "name_faces", "prepare"]
-
-#: How many of the faces that are wrong a message names.
-_NAMED = 3
-
-
-@dataclass(frozen=True, slots=True)
-class CornerAttribute:
-    """Values that belong to the corners of faces, not to vertices: two faces may see different ones at one vertex.
-
-    Attributes
-    ----------
-    values : array of shape (N, K)
-    corners : int32 array of shape (F, 4)
-        For each corner the row of `values`, or -1 where it has none.
-    """
-
-    values: NDArray[Any]
-    corners: NDArray[np.int32]
-
-
-def _number(face: int) -> str:
-    return f"face {face + 1}"
-
-
-@dataclass(frozen=True, slots=True)
-class Mesh:
-    """A mesh of triangles and quads.
-
-    Attributes
-    ----------
-    vertices : array of shape (V, 2) or (V, 3)
-    corners : int32 array of shape (F, 4)
-        0-based vertices of each face, going round it; -1 in the last place of a triangle.
-    attributes : mapping of str to arrays of shape (V,) or (V, K)
-        What belongs to the vertices.
-    corner_attributes : mapping of str to CornerAttribute
-        What belongs to the corners of faces.
-    face_name : callable
-        How to name a face in messages, from its 0-based number: "face 12 (line 31)".
-    """
-
-    vertices: NDArray[Any]
-    corners: NDArray[np.int32]
-    attributes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    corner_attributes: Mapping[str, CornerAttribute] = field(default_factory=dict)
-    face_name: Callable[[int], str] = _number
-
-    @staticmethod
-    def of(
-        vertices: ArrayLike,
-        faces: ArrayLike | Sequence[Sequence[int]],
-        attributes: Mapping[str, ArrayLike] | None = None,
-    ) -> Mesh:
-        """Make a mesh of an array of quads, an array of triangles, or a list of either.
-
-        Raises
-        ------
-        InputError
-            When the arrays have other shapes, or faces name vertices that do not exist.
-        """
-        points = np.asarray(vertices)
-        rows = [list(face) for face in faces] if isinstance(faces, list | tuple) else np.asarray(faces)
-        if isinstance(rows, list):
-            rows = np.array([row + [-1] * (4 - len(row)) for row in rows], np.int64).reshape(-1, 4)
-        if rows.ndim != 2 or rows.shape[1] not in (3, 4) or points.ndim != 2 or points.shape[1] not in (2, 3):
-            raise InputError(
-                f"expected vertices of shape (V, 2) or (V, 3) and faces of 3 or 4 corners, got {points.shape} and "
-                f"{rows.shape}"
-            )
-        corners = np.full((len(rows), 4), -1, np.int32)
-        corners[:, : rows.shape[1]] = rows
-        if corners.size and (corners[:, :3].min() < 0 or corners.min() < -1 or corners.max() >= len(points)):
-            raise InputError(f"expected faces over {len(points)} vertices, got numbers outside 0 to {len(points) - 1}")
-        return Mesh(points, corners, {name: np.asarray(values) for name, values in (attributes or {}).items()})
+__all__ = ["Polygons", "prepare"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,15 +43,6 @@ class Polygons:
     names: tuple[str, ...]
     attributes: NDArray[np.int32]
     turned: int
-
-
-def name_faces(mesh: Mesh, faces: ArrayLike) -> str:
-    """Name the first few of some faces."""
-    numbers = np.unique(np.asarray(faces)).tolist()
-    words = [mesh.face_name(number) for number in numbers[:_NAMED]]
-    if len(numbers) > _NAMED:
-        return f"{', '.join(words)} and {len(numbers) - _NAMED:,} more"
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def prepare(mesh: Mesh, names: tuple[str, ...], attributes: NDArray[np.int32]) -> Polygons:

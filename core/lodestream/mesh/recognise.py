@@ -16,8 +16,9 @@ from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, sh
 from .develop import develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
+from .model import Mesh, name_faces
 from .patchwork import Quads, make_quads
-from .polygons import Mesh, Polygons, name_faces, prepare
+from .polygons import Polygons, prepare
 from .tearing import equal_rows, sort_attributes, tear
 from .weld import SIDES
 
@@ -40,25 +41,37 @@ class Recognised:
     mesh : Mesh
     blocks : tuple of RecognisedBlock
         In the order of their first faces.
-    words : str
-        What was recognised, such as "torus, 96 x 24, from triangles; 2,304 vertices".
+    triangles : bool
+        Whether quads were made of triangles.
+    notes : tuple of str
+        What else there is to say about it.
     """
 
     mesh: Mesh
     blocks: tuple[RecognisedBlock, ...]
-    words: str
+    triangles: bool
+    notes: tuple[str, ...]
+
+    def words(self, surface: Surface) -> str:
+        """Say what was recognised, such as "torus, 96 x 24, from triangles; 2304 vertices".
+
+        `surface` is that of the blocks, or what it has become since.
+        """
+        poles = sum(pole["kind"] != "repeated" for block in self.blocks for pole in block.poles)
+        return "; ".join([shape_words(surface.blocks, poles) + ", from triangles" * self.triangles, *self.notes])
 
     def surface(self, metadata: Mapping[str, Any] | None = None) -> Surface:
         """Make a surface of the blocks, with ``recognised``, ``faces`` and ``poles`` beside the metadata given."""
         known = dict(metadata or {})
-        known["recognised"] = self.words
         faces = [dict(block.faces) for block in self.blocks]
         if any(faces):
             known["faces"] = faces if len(faces) > 1 else faces[0]
         poles = [{"block": number, **pole} for number, block in enumerate(self.blocks) for pole in block.poles]
         if poles:
             known["poles"] = poles
-        return Surface(blocks=[self._block(block) for block in self.blocks], metadata=known)
+        surface = Surface(blocks=[self._block(block) for block in self.blocks], metadata=known)
+        surface.metadata["recognised"] = self.words(surface)
+        return surface
 
     def _block(self, block: RecognisedBlock) -> Block:
         valid = block.vertices >= 0
@@ -158,7 +171,7 @@ class _Recognition:
         part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
         blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
         blocks, merged = join_blocks(blocks, self.mesh.vertices)
-        return Recognised(self.mesh, tuple(blocks), self._words(blocks, merged))
+        return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), tuple(self._notes(blocks, merged)))
 
     def _grids(self) -> list[Grid]:
         laid = develop_quads(self.quads.corners, self.twins)
@@ -246,18 +259,19 @@ class _Recognition:
 
     def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
         at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
-        _, first = np.unique(self.umbrella[at], return_index=True)
-        at = at[np.sort(first)]
-        where = (
-            f"first at vertex {int(self.vertex[at[0]]) + 1} of {name_faces(self.mesh, self.quads.origin[at[:1] >> 2])}"
-            if at.size
-            else "and winds or lies on itself"
-        )
+        irregular_ones = len(np.unique(self.umbrella[at]))
+        where = "and winds or lies on itself"
+        if at.size:
+            around = at[self.umbrella[at] == self.umbrella[at[0]]] >> 2
+            where = (
+                f"the first of them vertex {int(self.vertex[at[0]]) + 1} of "
+                f"{name_faces(self.mesh, self.quads.origin[around])}"
+            )
         return (
             f"expected a grid, or a mesh that grid lines cut into at most {MOST_BLOCKS:,} blocks of {LEAST_QUADS} "
             f"quads or more on average, got {int(chosen.sum()):,} quads in {count:,} blocks{self._seam_words()}: the "
-            f"mesh has {len(at):,} irregular vertices (inner ones without four quads, outer ones with three or more), "
-            f"{where}; make it again with fewer of them, or with finer quads"
+            f"mesh has {irregular_ones:,} irregular vertices (inner ones without four quads, outer ones with three or "
+            f"more), {where}; make it again with fewer of them, or with finer quads"
         )
 
     def _block(self, grid: Grid, part: int) -> RecognisedBlock:
@@ -283,10 +297,9 @@ class _Recognition:
         poles = poles_of(vertices, grid.closed, self.mesh.vertices, kinds)
         return RecognisedBlock(vertices, grid.closed, kept, faces, poles)
 
-    def _words(self, blocks: list[RecognisedBlock], merged: int) -> str:
+    def _notes(self, blocks: list[RecognisedBlock], merged: int) -> list[str]:
         used = np.zeros(len(self.mesh.vertices), np.bool_)
         used[self.vertex] = True
-        text = shape_words(blocks) + (", from triangles" if self.quads.cut.any() else "")
         notes = [f"{int(used.sum())} vertices"]
         holes = sum(int((block.vertices < 0).sum()) for block in blocks)
         notes += [f"{holes} holes"] * (holes > 0)
@@ -303,7 +316,7 @@ class _Recognition:
         notes += [f"{name} left out: {why}" for name, why in self.left_out.items()]
         alone = len(used) - int(used.sum())
         notes += [f"{alone} vertices without a face left out"] * (alone > 0)
-        return "; ".join([text, *notes])
+        return [*notes, *self.mesh.notes]
 
 
 def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:

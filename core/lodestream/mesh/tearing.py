@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..kernels import kernel
 from .halfedges import Corners
+from .model import Mesh
 from .patchwork import Quads
-from .polygons import Mesh
 
 __all__ = ["equal_rows", "sort_attributes", "tear"]
 

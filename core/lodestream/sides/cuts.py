@@ -193,11 +193,11 @@ class _Splitting:
         return fits
 
     def _images(self, link: Link, place: int) -> list[_Place]:
-        """Where the link has a cut of its source on its target."""
-        source = self._sides[link.source]
-        seam = source in self.cuts.closed and place == 0
-        places = (0, self.cuts.lengths[source]) if seam else (place,)
-        return [(self._sides[link.target], link.at(at)) for at in places if link.first <= at <= link.last]
+        """Where the link has a cut of its source on its target.
+
+        A link that reaches a seam at its end either goes on in one that begins there, or is cut there anyway.
+        """
+        return [(self._sides[link.target], link.at(place))] if link.first <= place <= link.last else []
 
     def _split(self, pending: list[_Place], made: list[_Place]) -> bool:
         """Cut axes, and all that is linked with them there; False as soon as there are too many parts."""

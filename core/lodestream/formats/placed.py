@@ -1,0 +1,169 @@
+"""Heights that come with coordinates, as vectors or as arrays of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..coordinate_rules import VALUES, fit_axis
+from ..errors import FormatError
+from ..heights import coordinates
+from ..seams import merge, unwrap, wrapped
+from ..surface import Closed, Surface
+from .longitudes import TURN, close_around, encircles
+
+__all__ = ["Coordinate", "place"]
+
+#: How far a coordinate may be from even spacing, in steps, for the heights to count as a regular lattice.
+_EVEN = 0.01
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One coordinate of a grid.
+
+    Attributes
+    ----------
+    values : array of shape (H,), (W,) or (H, W)
+    axis : {0, 1, None}
+        The axis that a vector runs along; None for an array over both.
+    degrees : bool
+        It is a longitude in degrees.
+    """
+
+    values: NDArray[Any]
+    axis: int | None
+    degrees: bool = False
+
+
+def place(
+    heights: NDArray[Any],
+    x: Coordinate,
+    y: Coordinate,
+    *,
+    closed: Closed | None,
+    mask: NDArray[np.bool_] | None = None,
+    attributes: Mapping[str, NDArray[Any]] | None = None,
+    metadata: Mapping[str, Any] | None = None,
+) -> Surface:
+    """Put heights over their coordinates.
+
+    Where both coordinates are vectors and evenly spaced, the result is heights with a ``geotransform``, and with
+    ``axes`` where that alone does not say every coordinate bit for bit; otherwise x, y, z. Longitudes that jump are
+    unwrapped; an axis that goes once around the Earth is closed.
+
+    Parameters
+    ----------
+    heights : array of shape (H, W)
+    x, y : Coordinate
+    closed : (bool, bool) or None
+        What was said of the surface; None leaves it to what the coordinates show.
+    mask, attributes, metadata
+        See `Surface`.
+    """
+    extras: dict[str, Any] = {"mask": mask, "attributes": attributes or {}}
+    values = dict(metadata or {})
+    if x.axis is not None and y.axis == 1 - x.axis:
+        even = [_even(coordinate) for coordinate in (x, y)]
+        if even[0] is not None and even[1] is not None:
+            surface = Surface(heights, **extras, metadata=values | _georeference(x, y, even[0], even[1]))
+            for coordinate, found in zip((x, y), even, strict=True):
+                if coordinate.degrees and coordinate.axis is not None and found is not None:
+                    surface = close_around(surface, (coordinate.axis, found.step), closed)
+            return surface
+    planes = [_plane(coordinate, heights.shape) for coordinate in (x, y)]
+    dtype = np.result_type(*planes, heights)
+    points = np.stack([plane.astype(dtype) for plane in (*planes, heights)], axis=-1)
+    degrees = [channel for channel, coordinate in enumerate((x, y)) if coordinate.degrees]
+    surface = merge(Surface(points, **extras, metadata=values), closed, angle=(degrees[0], TURN) if degrees else None)
+    if len(degrees) != 1:
+        return surface
+    if closed is None:
+        surface = _closed(surface, degrees[0])
+    return unwrap(surface, degrees[0], TURN)
+
+
+@dataclass(frozen=True)
+class _Even:
+    """An evenly spaced coordinate: its unwrapped values, what they are nearly, and where they wrap."""
+
+    values: NDArray[Any]
+    origin: float
+    step: float
+    low: float | None
+
+
+def _even(coordinate: Coordinate) -> _Even | None:
+    given = coordinate.values
+    if len(given) < 2 or not np.isfinite(given).all():
+        return None
+    values, low = given, None
+    if coordinate.degrees and given.dtype.kind == "f":
+        turns = np.rint((np.unwrap(given.astype(np.float64), period=TURN) - given) / TURN)
+        if turns.any():
+            low = float((given.min() + (given.max() - TURN)) / 2)
+            values = given.astype(np.float64) + TURN * turns
+            if wrapped(values, TURN, low).astype(given.dtype).tobytes() != given.tobytes():
+                values, low = given, None
+    exact = values.astype(np.float64)
+    step = float((exact[-1] - exact[0]) / (len(exact) - 1))
+    away = np.abs(exact - (exact[0] + step * np.arange(len(exact)))).max()
+    return _Even(values, float(exact[0]), step, low) if step and away <= _EVEN * abs(step) else None
+
+
+def _georeference(x: Coordinate, y: Coordinate, across: _Even, down: _Even) -> dict[str, Any]:
+    dtype = np.result_type(across.values, down.values)
+    transform: list[float] = []
+    rules: dict[str, Any] = {}
+    for name, even, axis in (("x", across, x.axis), ("y", down, y.axis)):
+        values = even.values.astype(dtype)
+        rule = fit_axis(values)
+        rules[name] = rule or [*values.tolist(), VALUES]
+        origin, step = map(float, rule) if rule and len(rule) == 2 else (even.origin, even.step)
+        transform += [origin - step / 2, step, 0.0] if axis == 1 else [origin - step / 2, 0.0, step]
+    found: dict[str, Any] = {"geotransform": transform}
+    if dtype != np.float64:
+        rules["dtype"] = dtype.name
+    if x.axis == 0:
+        rules["rows"] = "x"
+    shape = (len(down.values), len(across.values)) if x.axis == 1 else (len(across.values), len(down.values))
+    centres = coordinates(Surface(np.zeros(shape, np.uint8), metadata=found))
+    for plane, even, axis in zip(centres, (across, down), (x.axis, y.axis), strict=True):
+        line = plane[0] if axis == 1 else plane[:, 0]
+        if line.tobytes() != even.values.astype(np.float64).tobytes():
+            found["axes"] = rules
+    lows = [(channel, even.low) for channel, even in enumerate((across, down)) if even.low is not None]
+    if lows:
+        found["angles"] = [{"channel": channel, "period": TURN, "low": low} for channel, low in lows]
+    return found
+
+
+def _plane(coordinate: Coordinate, shape: tuple[int, ...]) -> NDArray[Any]:
+    values = coordinate.values
+    if coordinate.axis is not None:
+        values = values[:, None] if coordinate.axis == 0 else values[None, :]
+    if values.ndim != 2 or any(n not in (1, whole) for n, whole in zip(values.shape, shape, strict=True)):
+        raise FormatError(f"expected coordinates of the shape of the heights, {shape}, got {coordinate.values.shape}")
+    return np.broadcast_to(values, shape)
+
+
+def _closed(surface: Surface, longitude: int) -> Surface:
+    """Close the axes along which the grid goes around the Earth without repeating its first line."""
+    degrees = surface.points.astype(np.float64)
+    if surface.mask is not None:
+        degrees[~surface.mask] = np.nan
+    east, north = degrees[..., longitude], degrees[..., 1 - longitude]
+    closed = tuple(surface.closed[axis] or encircles(east, north, axis) for axis in (0, 1))
+    if closed == surface.closed:
+        return surface
+    return Surface(
+        surface.points,
+        (closed[0], closed[1]),
+        mask=surface.mask,
+        attributes=surface.attributes,
+        metadata=surface.metadata,
+    )

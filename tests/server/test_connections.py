@@ -1,0 +1,236 @@
+"""Connections that dawdle, and requests that do not end where they say."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from lodestream_server import running_server
+from tests.server.helpers import PATIENCE, eventually, hills, npy, push, raw_stream
+
+
+@pytest.fixture(scope="module")
+def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A server that waits for nobody, and a surface on it that no buffer takes whole."""
+    with running_server(tmp_path_factory.mktemp("data"), workers=1, head_seconds=0.5, idle_seconds=0.5) as url:
+        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+            made = push(http, npy(hills(1400, 1300)))
+        yield url, made
+
+
+def connected(url: str, buffer: int | None = None) -> socket.socket:
+    address = urlsplit(url)
+    assert address.hostname is not None
+    connection = socket.socket()
+    if buffer is not None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+    connection.settimeout(PATIENCE)
+    connection.connect((address.hostname, address.port))
+    return connection
+
+
+def all_of(connection: socket.socket) -> bytes:
+    """What comes until the other side closes, or breaks the connection."""
+    data = b""
+    try:
+        while piece := connection.recv(1 << 20):
+            data += piece
+    except ConnectionResetError:
+        pass
+    return data
+
+
+def status_of(answer: bytes) -> int:
+    return int(answer.split(b" ", 2)[1])
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /hea", b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"])
+def test_a_head_that_does_not_come_is_not_waited_for(impatient: tuple[str, Any], sent: bytes) -> None:
+    with connected(impatient[0]) as connection:
+        connection.sendall(sent)
+        answer = all_of(connection)
+    assert status_of(answer) == 408
+    assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "idle"
+
+
+def test_a_head_that_comes_byte_by_byte_is_late_too(impatient: tuple[str, Any]) -> None:
+    with connected(impatient[0]) as connection:
+        connection.settimeout(0.02)
+        answer = b""
+        for _ in range(10_000):
+            try:
+                connection.sendall(b"X")
+                answer = connection.recv(4096)
+            except TimeoutError:
+                continue
+            except (ConnectionResetError, BrokenPipeError):
+                pass
+            break
+        else:
+            pytest.fail("the server waits and waits")
+    assert not answer or status_of(answer) == 408
+
+
+def test_the_next_head_is_not_waited_for_either(impatient: tuple[str, Any]) -> None:
+    with connected(impatient[0]) as connection:
+        for _ in range(2):
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert status_of(connection.recv(65536)) == 200
+        connection.sendall(b"GET /hea")
+        assert status_of(all_of(connection)) == 408
+
+
+def test_a_body_that_nobody_wants_any_more_is_not_waited_for(impatient: tuple[str, Any]) -> None:
+    with connected(impatient[0]) as connection:
+        connection.sendall(
+            b"POST /v1/surfaces HTTP/1.1\r\nHost: example.org\r\nContent-Length: 1000000\r\n\r\nbeginning"
+        )
+        assert status_of(all_of(connection)) == 401
+
+
+def test_an_answer_that_nobody_takes_is_given_up(impatient: tuple[str, dict[str, Any]]) -> None:
+    url, made = impatient
+    address = f"/v1/containers/{made['container']}.lode"
+    with connected(url, buffer=4096) as connection:
+        # Several times over, so that no system's buffers hold it all.
+        connection.sendall(f"GET {address} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 8)
+
+        def given_up() -> bool:
+            try:
+                connection.send(b"GET / HTTP/1.1\r\n")
+            except OSError:
+                return True
+            return False
+
+        eventually(given_up, "the connection to be closed")
+    eventually(lambda: not opened(made["container"]), "the file to be closed")
+
+
+def opened(name: str) -> bool:
+    folder = Path("/proc/self/fd")
+    if not folder.exists():
+        pytest.skip("this system does not list open files in /proc")
+    for link in folder.iterdir():
+        try:
+            if name in str(link.readlink()):
+                return True
+        except OSError:
+            continue
+    return False
+
+
+def test_an_answer_that_is_taken_slowly_comes_whole(impatient: tuple[str, dict[str, Any]]) -> None:
+    url, made = impatient
+    address = f"/v1/containers/{made['container']}.lode"
+    with connected(url, buffer=16384) as connection:
+        connection.sendall(f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
+        data = bytearray()
+        while piece := connection.recv(4096):
+            data += piece
+    assert len(data.partition(b"\r\n\r\n")[2]) == made["bytes"]
+
+
+def test_streams_outlive_the_clock_of_heads(impatient: tuple[str, dict[str, Any]]) -> None:
+    from lodestream.messages import Credit, Header, Open, Segments
+
+    url, made = impatient
+    with raw_stream(url + made["url"]) as stream:
+        stream.send(Open(credit=1))
+        assert isinstance(stream.receive(), Header)
+        for _ in range(40):
+            # Twenty times a grant, a twentieth of the patience apart: longer in all than a head or a silence may take.
+            assert isinstance(stream.receive(), Segments)
+            with pytest.raises(TimeoutError):
+                stream.socket.recv(timeout=0.03)
+            stream.send(Credit(1))
+
+
+def test_a_body_longer_than_it_says_is_cut_there(http: httpx.Client, server: str) -> None:
+    body = npy(hills(9, 8, seed=31))
+    with connected(server) as connection:
+        head = f"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+        connection.sendall(head + body + b"and more of it, which is no request\r\n\r\n")
+        answer = all_of(connection)
+    assert status_of(answer) in (200, 202)
+    document = json.loads(answer.partition(b"\r\n\r\n")[2].partition(b"HTTP/1.1")[0])
+    assert document["upload_bytes"] == len(body)
+    # What followed was taken for a request, and was none.
+    assert b"HTTP/1.1 400" in answer
+
+
+def test_a_body_shorter_than_it_says_is_nothing(http: httpx.Client, server: str, data: Path) -> None:
+    before = http.get("/v1/surfaces").json()
+    with connected(server) as connection:
+        connection.sendall(b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nshort")
+        connection.shutdown(socket.SHUT_WR)
+        all_of(connection)
+    eventually(lambda: not list((data / "incoming").iterdir()), "the upload's folder to be removed")
+    assert http.get("/v1/surfaces").json() == before
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nhello",
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: -5\r\n\r\nhello",
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: five\r\n\r\nhello",
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nZZ\r\nhello\r\n",
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: gzip\r\n\r\nhello",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: example.org\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nX: a\0b\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n\r\n",
+    ],
+)
+def test_what_is_no_request_is_refused(impatient: tuple[str, Any], head: bytes) -> None:
+    with connected(impatient[0]) as connection:
+        connection.sendall(head)
+        answer = all_of(connection)
+    assert not answer or 400 <= status_of(answer) < 500
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "bytes=" + ",".join(f"{number}-{number}" for number in range(10_000)),
+        "bytes=" + "0-," * 10_000 + "0-",
+        "bytes=" + ",".join(["-1"] * 10_000),
+    ],
+)
+def test_ten_thousand_ranges_cost_no_more_than_the_file(impatient: tuple[str, dict[str, Any]], header: str) -> None:
+    url, made = impatient
+    address = f"/v1/containers/{made['container']}.lode"
+    with connected(url) as connection:
+        connection.sendall(
+            f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nRange: {header}\r\n\r\n".encode()
+        )
+        answer = all_of(connection)
+    # Whether the server's buffer for heads holds it depends on how the network cuts it.
+    assert status_of(answer) in (200, 400)
+    assert len(answer) <= made["bytes"] + 2000
+
+
+def test_a_connection_too_many_is_told_to_come_back(tmp_path: Path) -> None:
+    with running_server(tmp_path, workers=1, max_connections=3) as url:
+        held = [connected(url) for _ in range(3)]
+        try:
+            for connection in held:
+                connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                assert status_of(connection.recv(65536)) == 200
+            with connected(url) as connection:
+                answer = all_of(connection)
+            assert status_of(answer) == 503
+            assert b"retry-after: " in answer.lower()
+            assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "busy"
+        finally:
+            for connection in held:
+                connection.close()
+        eventually(lambda: httpx.get(f"{url}/healthz", trust_env=False).status_code == 200, "room again")

@@ -1,0 +1,38 @@
+"""Clients that do not behave, beside honest ones: these get the right bytes, and of the others nothing remains."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from pathlib import Path
+
+from lodestream.container import read_index
+from lodestream.plan import plan
+from tests.server.helpers import hills, npy, push
+from tests.server.programs import server
+from tests.torture import crowd
+
+COUNT = 20
+
+
+def sent(container: bytes) -> str:
+    """Hash of what a stream of the whole surface carries."""
+    chosen = plan(read_index(lambda offset, length: container[offset : offset + length], len(container)))
+    places = (*chosen.before, *chosen.ranges, *chosen.after)
+    return hashlib.sha256(b"".join(container[place.offset : place.end] for place in places)).hexdigest()
+
+
+def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with server(data, **crowd.settings(COUNT)) as running, running.client() as http:
+        surface = push(http, npy(hills(420, 400)))
+        container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
+        http.close()
+        outcome = asyncio.run(crowd.visit(running, running.url + surface["url"], sent(container), COUNT))
+        assert outcome.wrong == ()
+        assert outcome.remains == ()
+        assert outcome.hostile == 6 * COUNT
+        assert outcome.grown < 128 * 1024
+        assert list((data / "incoming").iterdir()) == []
+    log = running.log.read_text()
+    assert "Traceback" not in log, log[-3000:]

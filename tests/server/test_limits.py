@@ -1,0 +1,304 @@
+"""How much is taken at the same time, and what whoever comes after that is told."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+from fastapi import Request
+from websockets.exceptions import ConnectionClosed
+
+from lodestream.messages import Error, Header, Open
+from lodestream_server import Settings, running_server
+from lodestream_server.limits import Limits, Turnstile
+from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
+from lodestream_server.tokens import TokenFile
+from tests.server.helpers import PATIENCE, Raw, eventually, hills, npy, push, raw_stream
+
+
+class Disk(NamedTuple):
+    total: int
+    used: int
+    free: int
+
+
+def limits(folder: Path, surfaces: int = 0, builds: int = 0, **settings: Any) -> Limits:
+    return Limits(Settings(data=folder, **settings), folder, lambda: surfaces, lambda: builds)
+
+
+def request(*chunks: bytes, length: int | str | None = None) -> Request:
+    headers = [] if length is None else [(b"content-length", str(length).encode())]
+    messages = [
+        {"type": "http.request", "body": chunk, "more_body": number + 1 < len(chunks)}
+        for number, chunk in enumerate(chunks)
+    ]
+
+    async def receive() -> Any:
+        return messages.pop(0)
+
+    return Request({"type": "http", "method": "POST", "headers": headers}, receive)
+
+
+async def read(made: Limits, asked: Request) -> bytes:
+    async with made.upload(asked) as watched:
+        return b"".join([chunk async for chunk in watched.stream()])
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    size = {"free": 1000, "total": 100_000}
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(size["total"], 0, size["free"]))
+    return size
+
+
+def test_the_body_that_is_watched_is_the_body(tmp_path: Path, disk: dict[str, int]) -> None:
+    made = limits(tmp_path, keep_free=0)
+    assert asyncio.run(read(made, request(b"one", b"two", b"", length=6))) == b"onetwo"
+
+
+@pytest.mark.parametrize(("length", "fits"), [(400, True), (500, True), (501, False), (10**17, False)])
+def test_what_is_to_stay_free_stays_free(tmp_path: Path, disk: dict[str, int], length: int, fits: bool) -> None:
+    made = limits(tmp_path, keep_free=500, upload_bytes=10**18)
+    if fits:
+        asyncio.run(read(made, request(b"x", length=length)))
+    else:
+        with pytest.raises(FullError, match="500 bytes"):
+            asyncio.run(read(made, request(b"x", length=length)))
+
+
+def test_a_twentieth_of_a_small_disk_stays_free_if_nothing_is_said(tmp_path: Path, disk: dict[str, int]) -> None:
+    disk["total"] = 20_000
+    asyncio.run(read(limits(tmp_path), request(b"", length=0)))
+    disk["free"] = 999
+    with pytest.raises(FullError):
+        asyncio.run(read(limits(tmp_path), request(b"", length=0)))
+
+
+def test_uploads_under_way_are_counted_until_they_are_on_the_disk(tmp_path: Path, disk: dict[str, int]) -> None:
+    made = limits(tmp_path, keep_free=0)
+
+    async def together() -> None:
+        async with made.upload(request(b"x" * 300, b"", length=600)) as first:
+            with pytest.raises(FullError):
+                await read(made, request(b"", length=401))
+            await anext(aiter(first.stream()))
+            disk["free"] -= 300
+            assert await read(made, request(b"y", length=400)) == b"y"
+        assert await read(made, request(b"z", length=700)) == b"z"
+
+    asyncio.run(together())
+
+
+def test_an_upload_that_does_not_say_its_size_stops_at_the_mark(tmp_path: Path, disk: dict[str, int]) -> None:
+    made = limits(tmp_path, keep_free=500)
+
+    async def fill() -> None:
+        async with made.upload(request(*[bytes(1 << 24)] * 3)) as watched:
+            chunks = aiter(watched.stream())
+            await anext(chunks)
+            disk["free"] = 400
+            with pytest.raises(FullError):
+                await anext(chunks)
+
+    asyncio.run(fill())
+
+
+@pytest.mark.parametrize("length", ["x", "-1", "1_0", "", "9" * 30, "١٢"])
+def test_a_size_that_is_none_promises_nothing(tmp_path: Path, disk: dict[str, int], length: str) -> None:
+    assert asyncio.run(read(limits(tmp_path, keep_free=0), request(b"x", length=length))) == b"x"
+
+
+def test_numbers_are_limits_too(tmp_path: Path) -> None:
+    with pytest.raises(BusyError, match="at most 3 builds"):
+        asyncio.run(read(limits(tmp_path, builds=3, max_builds=3), request(b"x")))
+    with pytest.raises(FullError, match="at most 5 surfaces"):
+        asyncio.run(read(limits(tmp_path, surfaces=5, max_surfaces=5), request(b"x")))
+
+    async def together() -> None:
+        made = limits(tmp_path, max_uploads=1)
+        async with made.upload(request(b"x")):
+            with pytest.raises(BusyError, match="at most 1 uploads"):
+                await read(made, request(b"x"))
+        await read(made, request(b"x"))
+
+    asyncio.run(together())
+
+
+def test_an_upload_that_is_too_slow_ends(tmp_path: Path) -> None:
+    made = limits(tmp_path, idle_seconds=1e-6, upload_rate=10**9)
+    with pytest.raises(SlowUploadError, match="1000000000 bytes a second"):
+        asyncio.run(read(made, request(b"x", b"y", b"")))
+    assert asyncio.run(read(limits(tmp_path, idle_seconds=1e-6, upload_rate=0), request(b"x", b"y", b""))) == b"xy"
+
+
+def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:
+    made = limits(tmp_path, max_streams=3, max_client_streams=2)
+    with ExitStack() as held:
+        held.enter_context(made.stream("a"))
+        with made.stream("a"), pytest.raises(TooManyError, match="at most 2"), made.stream("a"):
+            pass
+        held.enter_context(made.stream("b"))
+        held.enter_context(made.stream("c"))
+        for client in ("a", "d"):
+            with pytest.raises(BusyError, match="at most 3"), made.stream(client):
+                pass
+    for _ in range(5):
+        with made.stream("a"), made.stream("a"):
+            pass
+
+
+def test_one_at_a_time_and_some_waiting() -> None:
+    async def crowd() -> None:
+        door, order = Turnstile(3), list[int]()
+
+        async def pass_through(number: int) -> None:
+            async with door:
+                order.append(number)
+                await asyncio.sleep(0)
+                order.append(number)
+
+        tasks = [asyncio.create_task(pass_through(number)) for number in range(4)]
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert [type(result) for result in results] == [type(None)] * 3 + [BusyError]
+        assert order == [0, 0, 1, 1, 2, 2]
+        # Whoever gives up waiting makes room.
+        async with door:
+            waiting = [asyncio.create_task(pass_through(number)) for number in range(2)]
+            await asyncio.sleep(0)
+            waiting[0].cancel()
+            await asyncio.sleep(0)
+            waiting.append(asyncio.create_task(pass_through(9)))
+        await asyncio.gather(*waiting, return_exceptions=True)
+        assert order[-2:] == [9, 9]
+
+    asyncio.run(crowd())
+
+
+# Over real sockets.
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, dict[str, str]]]:
+    """A server with little room: its address, a surface, and tokens."""
+    folder = tmp_path_factory.mktemp("small")
+    file = TokenFile(folder / "tokens.json")
+    tokens = {name: file.create(name, ("write",))[0] for name in ("one", "two", "three")}
+    with running_server(
+        folder, workers=1, max_streams=4, max_client_streams=2, max_surfaces=2, max_uploads=1, upload_bytes=1 << 20
+    ) as url:
+        with client(url, tokens["one"]) as http:
+            made = push(http, npy(hills(30, 20)))
+        yield url, url + made["url"], tokens
+
+
+@contextmanager
+def client(url: str, token: str) -> Iterator[httpx.Client]:
+    headers = {"authorization": f"Bearer {token}"}
+    with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+        yield http
+
+
+def code_of(stream: Raw) -> tuple[str, int]:
+    said = stream.receive()
+    assert isinstance(said, Error)
+    with pytest.raises(ConnectionClosed) as over:
+        stream.receive()
+    assert over.value.rcvd is not None
+    return said.code, over.value.rcvd.code
+
+
+def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str, str]]) -> None:
+    _, surface, tokens = small
+
+    def opened(held: ExitStack, name: str) -> Raw:
+        headers = {"Authorization": f"Bearer {tokens[name]}"}
+        return held.enter_context(raw_stream(surface, additional_headers=headers))
+
+    with ExitStack() as held:
+        for name in ("one", "one", "two"):
+            stream = opened(held, name)
+            stream.send(Open(credit=0))
+            assert isinstance(stream.receive(), Header)
+        assert code_of(opened(held, "one")) == ("too-many", 4429)
+        stream = opened(held, "two")
+        stream.send(Open(credit=0))
+        assert isinstance(stream.receive(), Header)
+        assert code_of(opened(held, "three")) == ("busy", 4503)
+
+    def free() -> bool:
+        with ExitStack() as held:
+            stream = opened(held, "one")
+            stream.send(Open(credit=0))
+            return isinstance(stream.receive(), Header)
+
+    assert eventually(free, "room after they are gone")
+
+
+def test_uploads_too_many_are_told_to_come_back(small: tuple[str, str, dict[str, str]]) -> None:
+    url, _, tokens = small
+    address = urlsplit(url)
+    with client(url, tokens["one"]) as http, socket.create_connection((address.hostname, address.port)) as slow:
+        slow.sendall(
+            f"POST /v1/surfaces HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: Bearer {tokens['two']}\r\n"
+            "Content-Length: 100000\r\n\r\nxxx".encode()
+        )
+
+        def refused() -> httpx.Response | None:
+            answer = http.post("/v1/surfaces", content=b"x" * 2_000_000)
+            return answer if answer.status_code == 503 else None
+
+        answer = eventually(refused, "the slow upload to be counted")
+        assert answer.headers["retry-after"].isdecimal()
+        assert answer.json()["code"] == "busy"
+    with client(url, tokens["one"]) as http:
+
+        def taken() -> httpx.Response | None:
+            answer = http.post("/v1/surfaces", content=npy(hills(6, 5)))
+            return None if answer.status_code == 503 else answer
+
+        assert eventually(taken, "room after the slow upload").status_code in (200, 202)
+        full = http.post("/v1/surfaces", content=npy(hills(7, 5)))
+        assert (full.status_code, full.json()["code"]) == (507, "full")
+        assert "2 surfaces" in full.json()["detail"]
+        large = http.post("/v1/surfaces", content=bytes((1 << 20) + 1))
+        assert large.status_code in (413, 507)
+
+
+def test_a_server_without_room_says_so(tmp_path: Path) -> None:
+    with (
+        running_server(tmp_path, workers=1, keep_free=1 << 60) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        answer = http.post("/v1/surfaces", content=npy(hills()))
+        assert (answer.status_code, answer.json()["code"]) == (507, "full")
+        assert list((tmp_path / "incoming").iterdir()) == []
+
+
+def test_levels_are_asked_for_by_so_many_at_a_time(tmp_path: Path) -> None:
+    with (
+        running_server(tmp_path, workers=1, max_level_requests=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        made = push(http, npy(hills(300, 300)))
+        statuses: list[int] = []
+
+        def ask() -> None:
+            answer = httpx.get(f"{url}{made['url']}/levels/{len(made['levels']) - 1}", trust_env=False, timeout=60)
+            statuses.append(answer.status_code)
+
+        threads = [threading.Thread(target=ask) for _ in range(6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(PATIENCE)
+        assert set(statuses) <= {200, 503}
+        assert 200 in statuses

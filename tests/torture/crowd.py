@@ -1,0 +1,254 @@
+"""Clients that do not behave, many of each at once beside honest ones, and what they leave in the server."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import socket
+import struct
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from lodestream.messages import MAX_CREDIT, Open
+from lodestream.wire import serialize
+from tests.server.programs import Server, Within, resident
+from tests.server.sockets import Place, Reader, frame, handshake, read_stream
+
+__all__ = ["BEHAVIOURS", "Outcome", "settings", "visit"]
+
+#: How long the server waits for anybody: a crowd is gone soon after.
+IDLE_SECONDS = 3.0
+
+_PATIENCE = 120.0
+_SAMPLE_SECONDS = 0.05
+
+
+def settings(count: int) -> dict[str, Any]:
+    """Settings of a server that is to stand a crowd with so many of each kind."""
+    return {
+        "idle_seconds": IDLE_SECONDS,
+        "head_seconds": IDLE_SECONDS,
+        "bye_seconds": IDLE_SECONDS,
+        "max_uploads": 2 * count + 64,
+        "max_connections": 20 * count + 500,
+    }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a crowd did.
+
+    Attributes
+    ----------
+    honest, hostile : int
+        Connections.
+    wrong : tuple of str
+        What honest clients complain of.
+    grown : int
+        Bytes by which the server's memory grew at the most, for each connection.
+    before, after : Within
+        What the server held before the crowd came, and when it was gone.
+    seconds : float
+        Until the last honest client had finished.
+    """
+
+    honest: int
+    hostile: int
+    wrong: tuple[str, ...]
+    grown: int
+    before: Within
+    after: Within
+    seconds: float
+
+    @property
+    def remains(self) -> tuple[str, ...]:
+        """What the crowd left in the server."""
+        left = [f"open file {name}" for name in self.after.files if name not in self.before.files]
+        for name in ("tasks", "sockets"):
+            was, now = getattr(self.before, name), getattr(self.after, name)
+            if now > was:
+                left.append(f"{now - was} {name}")
+        return tuple(left)
+
+
+class _Client:
+    """A connection that is closed when the ``with`` block ends, whatever happens in it."""
+
+    def __init__(self, place: Place, random_: random.Random) -> None:
+        self.place = place
+        self.random = random_
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self.socket.setblocking(False)
+
+    async def connect(self, *, small: bool = False) -> None:
+        if small:
+            # Before connecting, so that the window that is offered is small too.
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        await asyncio.get_running_loop().sock_connect(self.socket, (self.place.host, self.place.port))
+
+    async def send(self, data: bytes) -> None:
+        await asyncio.get_running_loop().sock_sendall(self.socket, data)
+
+    async def receive(self, most: int) -> bytes:
+        return await asyncio.get_running_loop().sock_recv(self.socket, most)
+
+    async def open(self, *, small: bool = False) -> None:
+        """Open a stream, of which nothing but the answer to the handshake is read."""
+        await self.connect(small=small)
+        await self.send(handshake(self.place))
+        head = b""
+        while not head.endswith(b"\r\n\r\n"):
+            head += await self.receive(1)
+        await self.send(frame(serialize(Open(credit=MAX_CREDIT))))
+
+    async def __aenter__(self) -> _Client:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.socket.close()
+
+
+async def never_reads(client: _Client) -> None:
+    """Open a stream, and take nothing of it."""
+    await client.open(small=client.random.random() < 0.5)
+    await asyncio.sleep(_PATIENCE)
+
+
+async def one_byte_a_second(client: _Client) -> None:
+    """Open a stream, and read a byte each second."""
+    await client.open(small=True)
+    while await client.receive(1):
+        await asyncio.sleep(1)
+
+
+async def vanishes(client: _Client) -> None:
+    """Open a stream, read some of it, and be gone without a word."""
+    await client.open()
+    await client.receive(client.random.randrange(1, 65536))
+    client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, not closed
+
+
+async def garbage(client: _Client) -> None:
+    """Send what is no HTTP, no frame, no message, or no message of this protocol."""
+    await client.connect()
+    kind, noise = client.random.randrange(4), client.random.randbytes(client.random.randrange(1, 5000))
+    if kind:
+        await client.send(handshake(client.place))
+        await client.receive(4096)
+    opened = frame(serialize(Open(credit=MAX_CREDIT)))
+    await client.send((noise, noise, frame(noise), opened + frame(noise))[kind])
+    while await client.receive(65536):
+        pass
+    await asyncio.sleep(_PATIENCE)
+
+
+async def never_speaks(client: _Client) -> None:
+    """Connect, or connect and agree on a WebSocket, and say nothing."""
+    await client.connect()
+    if client.random.random() < 0.5:
+        await client.send(handshake(client.place))
+    await asyncio.sleep(_PATIENCE)
+
+
+async def slow_upload(client: _Client) -> None:
+    """Promise a file, and send a byte of it each second."""
+    await client.connect()
+    host = f"{client.place.host}:{client.place.port}"
+    await client.send(f"POST /v1/surfaces HTTP/1.1\r\nHost: {host}\r\nContent-Length: 1000000\r\n\r\n".encode())
+    while True:
+        await client.send(client.random.randbytes(1))
+        await asyncio.sleep(1)
+
+
+BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
+    never_reads,
+    one_byte_a_second,
+    vanishes,
+    garbage,
+    never_speaks,
+    slow_upload,
+)
+
+
+async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1) -> Outcome:
+    """Send ``count`` clients of each kind to a server, and as many honest ones that read a surface to its end.
+
+    Parameters
+    ----------
+    server : Server
+        Made with `settings`.
+    url : str
+        A surface on it.
+    sha256 : str
+        What the honest ones are to read: the hash of the container's parts in the order in which they are sent.
+    """
+    place, random_ = Place.of(url), random.Random(seed)
+    await _honest(place, sha256, count)  # what the server needs once for all
+    before = await _settled(server)
+    most = [before.resident]
+    watching = asyncio.create_task(_sample(server.pid, most))
+    hostile = [
+        asyncio.create_task(_behave(behave, place, random.Random(random_.random())))
+        for _ in range(count)
+        for behave in BEHAVIOURS
+    ]
+    started = asyncio.get_running_loop().time()
+    wrong = await _honest(place, sha256, count)
+    seconds = asyncio.get_running_loop().time() - started
+    # The server has had enough of each of them by itself, before they are gone.
+    await asyncio.sleep(IDLE_SECONDS)
+    after = await _settled(server, before)
+    watching.cancel()
+    for task in hostile:
+        task.cancel()
+    await asyncio.gather(*hostile, return_exceptions=True)
+    connections = count * (1 + len(BEHAVIOURS))
+    grown = (most[0] - before.resident) // connections
+    return Outcome(count, len(hostile), wrong, grown, before, after, seconds)
+
+
+async def _behave(behave: Callable[[_Client], Awaitable[None]], place: Place, random_: random.Random) -> None:
+    async with _Client(place, random_) as client:
+        # What the server does with it is seen in the server.
+        with contextlib.suppress(OSError):
+            await behave(client)
+
+
+async def _honest(place: Place, sha256: str, count: int) -> tuple[str, ...]:
+    async def read(window: int) -> str | None:
+        try:
+            async with asyncio.timeout(_PATIENCE):
+                reader = await read_stream(place, Reader(window=window))
+        except (OSError, TimeoutError) as error:
+            return f"{type(error).__name__}: {error}"
+        if (reader.ended, reader.closed, reader.sha256) != ("complete", 1000, sha256):
+            return f"expected the whole surface, got {reader.size} bytes, end {reader.ended}, close {reader.closed}"
+        return None
+
+    windows = [(4096, 30_000, MAX_CREDIT)[number % 3] for number in range(count)]
+    return tuple(wrong for wrong in await asyncio.gather(*map(read, windows)) if wrong)
+
+
+async def _sample(process: int, most: list[int]) -> None:
+    while True:
+        most[0] = max(most[0], resident(process))
+        await asyncio.sleep(_SAMPLE_SECONDS)
+
+
+async def _settled(server: Server, like: Within | None = None) -> Within:
+    """What the server holds when that does not change any more, or is no more than it was."""
+    loop = asyncio.get_running_loop()
+    until, last = loop.time() + _PATIENCE, None
+    while True:
+        now = await asyncio.to_thread(server.look)
+        held = (now.tasks, now.sockets, now.files)
+        if like is None and held == last:
+            return now
+        if like is not None and now.tasks <= like.tasks and now.sockets <= like.sockets and now.files == like.files:
+            return now
+        if loop.time() > until:
+            return now
+        last = held
+        await asyncio.sleep(0.2)
