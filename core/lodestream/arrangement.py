@@ -10,11 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import product
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .layout import Grid, Source
 from .sides import Arrangement, Part, Side
 from .surface import Closed
 
-__all__ = ["covers", "grids_of"]
+__all__ = ["VertexCounter", "covers", "grids_of"]
 
 
 def grids_of(arrangement: Arrangement) -> list[Grid]:
@@ -60,6 +63,51 @@ def _owners(arrangement: Arrangement) -> dict[tuple[int, int], tuple[int, int]]:
             a, b = sorted((find(end_of(along, column)), find(end_of(across, row))))
             parent[b] = a
     return {end: find(end) for end in list(parent)}
+
+
+class VertexCounter:
+    """Leaves each vertex of a surface to one of its parts, so that errors count it once."""
+
+    def __init__(self, arrangement: Arrangement) -> None:
+        self._curves = arrangement.curves
+        self._owners = _owners(arrangement)
+        self._used: set[int] = set()
+        self._known: set[tuple[int, int]] = set()
+
+    def count(self, part: Part, counted: NDArray[np.bool_]) -> None:
+        """Set to False what earlier parts counted, or an earlier place of this part; shape (row, column), as stored."""
+        last_row, last_column = (n - 1 for n in counted.shape)
+        lines = counted[0], counted[-1], counted[:, 0], counted[:, -1]
+        ends = (
+            ((0, 0), (0, last_column)),
+            ((last_row, 0), (last_row, last_column)),
+            ((0, 0), (last_row, 0)),
+            ((0, last_column), (last_row, last_column)),
+        )
+        valid = {place: bool(counted[place]) for pair in ends for place in pair}
+        held: dict[tuple[int, int], tuple[int, int]] = {}
+        for side, line, places in zip(part.sides, lines, ends, strict=True):
+            if side is None:
+                continue
+            curve = self._curves[side.curve]
+            if curve.length == 1:
+                line[1:] = False
+                held.setdefault(self._owners.get((side.curve, 0), (side.curve, 0)), places[0])
+                continue
+            if side.curve in self._used:
+                line[slice(None) if curve.closed else slice(1, -1)] = False
+            self._used.add(side.curve)
+            if not curve.closed:
+                for end, place in enumerate(places):
+                    key = side.curve, end ^ side.reversed
+                    owner = self._owners.get(key, key)
+                    if held.setdefault(owner, place) != place:
+                        valid[place] = False
+        for owner, place in held.items():
+            counted[place] = valid[place] and owner not in self._known
+        for place, still in valid.items():
+            counted[place] &= still
+        self._known.update(held)
 
 
 def covers(shape: tuple[int, int], closed: Closed, parts: Sequence[Part]) -> bool:

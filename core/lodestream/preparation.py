@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrangement import grids_of
+from .arrangement import VertexCounter, grids_of
 from .container.model import AttributeKind
 from .heights import to_heights
 from .lattice import Lattice
@@ -179,31 +179,13 @@ class Preparation:
         if self.arrangement is None:
             return [Original(self.arrays[0][0], self.surface.blocks[0].mask)]
         originals = []
-        used: set[int] = set()
+        counter = VertexCounter(self.arrangement)
         for part in self.parts:
-            points = stored(part, self.arrays[part.block][0])
             mask = self.surface.blocks[part.block].mask
             counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
-            lines = _lines(counted)
-            again = [side is not None and self._again(side, used) for side in part.sides]
-            for place, (side, line) in enumerate(zip(part.sides, lines, strict=True)):
-                if again[place]:
-                    line[:] = False
-                elif side is not None and self.layout.grids[side.curve].shape[0] == 1:
-                    beside = (2, 3) if place < 2 else (0, 1)
-                    line[1:] = False
-                    if again[beside[0]] or again[beside[1]]:
-                        line[:] = False
-            originals.append(Original(points, counted))
+            counter.count(part, counted)
+            originals.append(Original(stored(part, self.arrays[part.block][0]), counted))
         return originals
-
-    @staticmethod
-    def _again(side: Side, used: set[int]) -> bool:
-        """Whether a curve's points were counted already."""
-        if side.curve in used:
-            return True
-        used.add(side.curve)
-        return False
 
 
 TILE_BITS = 14

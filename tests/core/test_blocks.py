@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.container import read_index
 from lodestream.container.model import Index
+from lodestream.preparation import Preparation
 
 Floats = NDArray[np.float64]
 
@@ -159,6 +160,21 @@ def test_every_vertex_counts_once() -> None:
         assert view.rms == pytest.approx(float(np.sqrt(squares.mean())), rel=1e-9)
         assert view.max_error == pytest.approx(float(np.sqrt(squares.max())), rel=1e-9)
     assert index.levels[-1].rms == decoder.layers[-1].rms
+
+
+@pytest.mark.parametrize(
+    ("blocks", "vertices"),
+    [
+        ([ls.Block(sphere(18, 24), (False, True))], 16 * 24 + 2),
+        ([ls.Block(np.concatenate([sphere(18, 24), sphere(18, 24)[:, :1]], axis=1))], 16 * 24 + 2),
+        ([ls.Block(block) for block in cut(terrain(21, 31), [0, 10, 20], [0, 5, 19, 30])], 21 * 31),
+        ([ls.Block(block, (False, False)) for block in cut(sphere(9, 12), [0, 4, 8], [0, 11])], 7 * 12 + 2),
+        ([ls.Block(np.ones((3, 4, 3)))], 3),
+    ],
+)
+def test_every_vertex_is_one_wherever_it_appears(blocks: list[ls.Block], vertices: int) -> None:
+    prepared = Preparation(ls.Surface(blocks=blocks), (None, {}))
+    assert sum(original.count for original in prepared.originals) == vertices
 
 
 def test_levels_of_blocks_are_put_together() -> None:

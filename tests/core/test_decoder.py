@@ -207,6 +207,7 @@ def test_grids_have_the_dtype_and_axes_of_the_original(name: str) -> None:
         for record in index.levels:
             grid = view.points_at(record.level)
             assert grid.dtype == original.dtype
+            assert record.shape is not None
             assert grid.shape == (*record.shape, *original.shape[2:])
     surface = ls.decode(container)
     assert surface.closed == SAMPLES[name][1]
