@@ -233,7 +233,7 @@ def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None
         waiting = running.enter_context(raw_stream(url + made["url"], additional_headers={"x-request-id": "waits"}))
         waiting.send(Open(credit=100))
         assert isinstance(waiting.receive(), Header)
-        silent = running.enter_context(raw_stream(url + made["url"]))
+        silent = running.enter_context(raw_stream(url + made["url"], close_timeout=0.1))
         silent.send(Open())
         address = urlsplit(url)
         upload = running.enter_context(socket.create_connection((address.hostname, address.port), timeout=PATIENCE))
