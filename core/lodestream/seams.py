@@ -128,10 +128,13 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
     """
     angles = surface.points[..., channel]
     valid = np.isfinite(angles) if surface.mask is None else surface.mask
-    turns = _turns(np.where(valid, angles, np.nan).astype(np.float64), period)
+    least, greatest = angles[valid].min(), angles[valid].max()
+    # The angle of a hole is often known, and then tells how its neighbours hang together.
+    known = valid | ((angles >= least) & (angles <= greatest))
+    turns = _turns(np.where(known, angles, np.nan).astype(np.float64), period)
     if not turns.any():
         return surface
-    low = float((angles[valid].min() + (angles[valid].max() - period)) / 2)
+    low = float((least + (greatest - period)) / 2)
     for dtype in dict.fromkeys((surface.dtype, np.dtype(np.float64))):
         points = surface.points.astype(dtype)
         points[..., channel] += (turns * period).astype(dtype)

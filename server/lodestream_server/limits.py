@@ -16,7 +16,7 @@ from pathlib import Path
 from fastapi import Request
 from starlette.types import Message, Receive
 
-from .problems import BusyError, FullError, SlowUploadError, TooManyError
+from .problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
 from .settings import Settings
 
 __all__ = ["Limits", "Turnstile"]
@@ -26,6 +26,9 @@ _STRIDE = 16 << 20
 
 # What stays free where the settings say nothing, unless the disk is small.
 _KEPT = 1 << 30
+
+# What an upload may still take when the server is told to end.
+_LAST_SECONDS = 2.0
 
 
 class Limits:
@@ -48,7 +51,7 @@ class Limits:
         self._surfaces = surfaces
         self._builds = builds
         self._streams: Counter[str] = Counter()
-        self._uploads = 0
+        self._uploads = set[asyncio.Timeout]()
         self._promised = 0
 
     @contextmanager
@@ -90,20 +93,33 @@ class Limits:
             When there are as many uploads or builds as there may be.
         FullError
             When there are as many surfaces as there may be, or the disk has no room for what the upload says it is.
+        RestartingError
+            When the server ends meanwhile.
         """
         self._check_numbers()
         size = request.headers.get("content-length", "")
         promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
         # One that is too large anyway is refused for that.
         room = _Room(self, promised if promised <= self._settings.upload_bytes else 0)
-        self._uploads += 1
+        clock = asyncio.timeout(None)
+        self._uploads.add(clock)
         self._promised += room.promised
         try:
-            await self.check_disk()
-            yield Request(request.scope, _watched(request, room, self._settings))
+            async with clock:
+                await self.check_disk()
+                yield Request(request.scope, _watched(request, room, self._settings))
+        except TimeoutError:
+            if clock.expired():
+                raise RestartingError("expected the whole upload before the server ended; send it again") from None
+            raise
         finally:
-            self._uploads -= 1
+            self._uploads.discard(clock)
             self._promised -= room.promised
+
+    def end(self) -> None:
+        """The server ends: uploads that are not whole soon do, too."""
+        for clock in self._uploads:
+            clock.reschedule(asyncio.get_running_loop().time() + _LAST_SECONDS)
 
     async def check_disk(self) -> None:
         """Look whether everything that is promised has room; FullError when it does not."""
@@ -125,7 +141,7 @@ class Limits:
 
     def _check_numbers(self) -> None:
         settings = self._settings
-        if self._uploads >= settings.max_uploads:
+        if len(self._uploads) >= settings.max_uploads:
             raise BusyError(f"expected at most {settings.max_uploads} uploads at the same time; come back soon")
         if self._builds() >= settings.max_builds:
             raise BusyError(f"expected at most {settings.max_builds} builds to do; come back when some are done")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import re
@@ -54,6 +55,9 @@ def request_id() -> str | None:
 
 
 def _is_worth_a_line(record: logging.LogRecord) -> bool:
+    # A request that the end of the server has cut short is no failure.
+    if record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError):
+        return False
     # uvicorn says so of every handshake that is refused with an answer, which is in order.
     return record.msg != "ASGI callable returned without completing handshake."
 

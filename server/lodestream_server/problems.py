@@ -36,6 +36,7 @@ __all__ = [
     "FullError",
     "NoTokenError",
     "NotReadyError",
+    "RestartingError",
     "SlowUploadError",
     "SmallScopeError",
     "TooManyError",
@@ -97,6 +98,12 @@ class BusyError(LodestreamError):
     headers: ClassVar = {"retry-after": "10"}
 
 
+class RestartingError(LodestreamError):
+    """The server ends, and will be back."""
+
+    headers: ClassVar = {"retry-after": "5"}
+
+
 class FullError(LodestreamError):
     """There is no room for more surfaces."""
 
@@ -123,6 +130,7 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
     (TooManyError, _Answer(429, "too-many", "More at the same time than one client may have")),
     (BusyError, _Answer(503, "busy", "As much to do as the server can; come back")),
+    (RestartingError, _Answer(503, "restarting", "The server is restarting; come back")),
     (FullError, _Answer(507, "full", "There is no room for more")),
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),

@@ -41,6 +41,7 @@ class Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, listening: Callable[[str], None]) -> None:
         super().__init__(config)
         self._listening = listening
+        self._state = getattr(config.app, "state", None)
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
         """Start, then tell the address."""
@@ -48,6 +49,13 @@ class Server(uvicorn.Server):
         if self.started:
             host, port = self.servers[0].sockets[0].getsockname()[:2]
             self._listening(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
+
+    async def shutdown(self, sockets: list[Any] | None = None) -> None:
+        """Tell whoever is connected, wait a little for them, and end."""
+        parts = getattr(self._state, "parts", None)
+        if parts is not None:
+            parts.limits.end()
+        await super().shutdown(sockets)
 
 
 def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:

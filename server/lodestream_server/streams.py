@@ -18,6 +18,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.messages import CODES, SUBPROTOCOL, MessageError, Open
+from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
 from lodestream.wire import parse
@@ -149,8 +150,10 @@ class _Session:
 
     @property
     def saved(self) -> int:
-        """Bytes of the container that were not sent, since the target was met or the client had seen enough."""
-        return 0 if self._sender.why in (None, "complete") else self._container.index.size - self._sender.sent
+        """Bytes of the surface that were not sent, since the target was met or the client had seen enough."""
+        if self._sender.why in (None, "complete"):
+            return 0
+        return max(plan(self._container.index).bytes - self._sender.sent, 0)
 
     def close(self) -> None:
         """Close the container."""

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
 from ..surface import Surface
 from . import raster
+from .flat import even_heights, geotransform, warn
 from .source import Source
 
-__all__ = ["READ_OPTIONS", "read", "sniff"]
+__all__ = ["READ_OPTIONS", "read", "sniff", "write"]
 
 READ_OPTIONS = {"band": "number of the band of heights, from 1 (default: 1); the others become attributes"}
 
 _MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # both byte orders, classic and BigTIFF
+_TITLE = "GeoTIFF"
+
+#: Sides of the tiles of an image that is at least so large.
+_TILE = 256
 
 
 def sniff(head: bytes, suffix: str) -> bool:
@@ -20,4 +34,106 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 def read(source: Source) -> Surface:
     """Read the first band, or the one that the option ``band`` names, as heights and the others as attributes."""
-    return raster.read(source, "GTiff", "geotiff", "GeoTIFF", "data.tif")
+    return raster.read(source, "GTiff", "geotiff", _TITLE, "data.tif")
+
+
+def write(surface: Surface, file: BinaryIO) -> None:
+    """Write heights as band 1 and attributes as further bands, with holes, place, CRS, unit and scale.
+
+    Holes get the value of ``nodata`` in the metadata where their type can hold it and no height has it, else NaN; in
+    integers without such a value a mask inside the file says where they are.
+    """
+    rasterio = raster.require_rasterio(_TITLE)
+    surface = even_heights(surface, _TITLE)
+    if any(surface.closed):
+        warn("GeoTIFF cannot say that a surface is closed")
+    names, bands = _bands(surface)
+    nodata = _nodata(surface, bands[0])
+    if surface.mask is not None:
+        bands[0] = np.where(surface.mask, bands[0], bands[0].dtype.type(0 if nodata is None else nodata))
+    rows, columns = surface.shape
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "height": rows,
+        "width": columns,
+        "count": len(bands),
+        "dtype": bands[0].dtype,
+        "nodata": nodata,
+        "compress": "deflate",
+        "predictor": 3 if bands[0].dtype.kind == "f" else 2,
+        "bigtiff": "if_safer",
+    }
+    if min(rows, columns) >= _TILE:
+        profile |= {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE}
+    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        path = Path(folder) / "data.tif"
+        with (
+            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED="NO"),
+            rasterio.open(path, "w", **profile) as dataset,
+        ):
+            _describe(dataset, surface, names)
+            for number, band in enumerate(bands, 1):
+                dataset.write(band, number)
+            if surface.mask is not None and nodata is None:
+                dataset.write_mask(surface.mask)
+        with path.open("rb") as written:
+            shutil.copyfileobj(written, file)
+
+
+def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
+    """Names and values of all bands, which have one type in a TIFF."""
+    names, bands = [""], [surface.points]
+    for name, values in surface.attributes.items():
+        parts = values.reshape(*surface.shape, -1)
+        count = parts.shape[2]
+        names += [name if count == 1 else f"{name}_{part}" for part in range(count)]
+        bands += [parts[..., part] for part in range(count)]
+    common = np.result_type(*bands)
+    for name, band in zip(names, bands, strict=True):
+        if (
+            band.dtype.kind in "iu"
+            and common.kind == "f"
+            and not np.array_equal(band.astype(common).astype(band.dtype), band)
+        ):
+            warn(f"GeoTIFF has one type for all bands: {name or 'heights'} are rounded to {common}")
+    return names, [band.astype(common, copy=False) for band in bands]
+
+
+def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
+    """The value that stands for holes; None where there is none."""
+    given = surface.metadata.get("nodata")
+    valid = heights if surface.mask is None else heights[surface.mask]
+    if given is not None:
+        value = float(given)
+        if heights.dtype.kind == "f" and np.isnan(value):
+            return value
+        limits: Any = np.finfo(heights.dtype) if heights.dtype.kind == "f" else np.iinfo(heights.dtype)
+        held = float(limits.min) <= value <= float(limits.max) and (heights.dtype.kind == "f" or value == int(value))
+        if held and not (valid == heights.dtype.type(value)).any():
+            return value
+    return float("nan") if surface.mask is not None and heights.dtype.kind == "f" else None
+
+
+def _describe(dataset: Any, surface: Surface, names: list[str]) -> None:
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+    from rasterio.transform import Affine
+
+    metadata = surface.metadata
+    transform = geotransform(surface)
+    if transform is not None:
+        dataset.transform = Affine.from_gdal(*transform)
+    if metadata.get("crs"):
+        try:
+            dataset.crs = CRS.from_wkt(str(metadata["crs"]))
+        except CRSError as error:
+            warn(f"the CRS is left out, which GDAL does not know: {error}")
+    for number, name in enumerate(names, 1):
+        if name:
+            dataset.set_band_description(number, name)
+    if metadata.get("unit"):
+        dataset.units = (str(metadata["unit"]), *dataset.units[1:])
+    if "scale" in metadata:
+        dataset.scales = (float(metadata["scale"]), *dataset.scales[1:])
+        dataset.offsets = (float(metadata.get("offset", 0.0)), *dataset.offsets[1:])
