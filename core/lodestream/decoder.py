@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .container import sections
 from .container.frames import Frame, FrameReader, section_extent
-from .container.model import ByteRange, Header, Index
+from .container.model import ByteRange, Header, Index, Piece
 from .container.pieces import windows
 from .container.reader import index_from, read_metadata, with_level_bytes
 from .container.slices import Slices
@@ -21,7 +21,9 @@ from .errors import CorruptStreamError, InputError, OptionError, TruncatedStream
 from .heights import level_metadata, to_xyz
 from .parts import level_masks
 from .reconstruction import Coded, Progress, Reconstruction
+from .selection import Wish, select
 from .surface import Block, Surface
+from .windows import window_of
 
 __all__ = ["Decoder", "View", "decode"]
 
@@ -58,6 +60,7 @@ class View:
     _corrected: bool = field(repr=False, compare=False)
     _metadata: dict[str, Any] = field(repr=False, compare=False)
     _digest: dict[str, Any] = field(repr=False, compare=False)
+    _wish: Wish = field(repr=False, compare=False)
 
     @property
     def points(self) -> NDArray[Any]:
@@ -117,7 +120,10 @@ class View:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
         digest = self._digest.get(DIGEST)
-        grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest)
+        if not finest and self._wish.region is not None:
+            raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")
+        chosen = self._wish.channels(header)
+        grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
         masks = level_masks(header.parts, header.layout, level, header.masks)
         blocks = []
         for grid, mask, (_, closed) in zip(grids, masks, header.blocks, strict=True):
@@ -125,6 +131,7 @@ class View:
             named = {
                 kind.name: array if kind.components else array[..., 0]
                 for kind, array in zip(header.attributes, attributes, strict=True)
+                if self._wish.attributes is None or kind.name in self._wish.attributes
             }
             if mask is not None and not mask.any():
                 mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
@@ -143,7 +150,9 @@ class View:
                 surface = to_xyz(surface)
             except InputError as error:
                 raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
-        if self.complete and finest and header.exact and digest is not None:
+        if self._wish.region is not None:
+            surface, values = window_of(surface, values, self._wish.region)
+        elif self.complete and finest and header.exact and digest is not None and chosen.all():
             found = values_digest(surface.blocks)
             if digest != found:
                 raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
@@ -161,9 +170,16 @@ class Decoder:
 
     `feed` takes them in file order, `feed_at` takes the slices that `plan` names. Damage raises `CorruptStreamError`
     with its offset, and what came before stays usable.
+
+    Parameters
+    ----------
+    wish : Wish, optional
+        A window of the surface, or some of its attributes, which alone the views then show. Errors of a window are not
+        known (NaN) before it is complete.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wish: Wish | None = None) -> None:
+        self._wish = wish or Wish()
         self.header: Header | None = None
         self.index: Index | None = None
         self.metadata: dict[str, Any] | None = None
@@ -312,6 +328,8 @@ class Decoder:
             self._begin(self.header)
 
     def _begin(self, header: Header) -> None:
+        self._wish.check(header)
+        self._wanted = self._wish.tiles(header)
         self._progress = Progress(header)
         self._reconstruction = Reconstruction(header)
         self._level = 0
@@ -365,6 +383,9 @@ class Decoder:
             complete or (number == self.header.layer_count - 1 and level == self.header.levels)
         )
         length, state = self._reconstruction.length, self._progress.snapshot(whole)
+        if self.header is not None and self._wish.region is not None:
+            # What lies outside has no part in the window.
+            state[~self._wanted] = 0
         self.layers.append(
             View(
                 number,
@@ -379,6 +400,7 @@ class Decoder:
                 corrected,
                 self._values,
                 self._digest,
+                self._wish,
             )
         )
 
@@ -402,32 +424,33 @@ class Decoder:
             self._take_metadata(read_metadata(bytes(run), place))
         elif self.header is not None:
             self.index = index_from(bytes(run), place, self.header)
-            self._slices = Slices(self.index)
+            chosen = select(self.index, self._wish)
+            partial = self._wish.region is not None
+            self._slices = Slices(self.index, chosen.segments, chosen.pieces, partial, chosen.whole)
             if (state := self._slices.state()) is not None:
                 self._show(*state)
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None
-        assert self.header is not None
         self._slices.add(offset, data)
-        for segment, payload in self._slices.segments():
-            if zlib.crc32(payload) != segment.crc:
-                raise CorruptStreamError("expected a segment to match its CRC, got other bytes", segment.range.offset)
-            known = bool(self._progress.top[segment.tile, segment.channel])
-            top = 0 if known else segment.top
-            first = self._progress.advance(segment.tile, segment.channel, top, segment.passes, segment.range.offset)
-            self._reconstruction.add(
-                Coded(segment.tile, segment.channel, first, segment.passes, payload, segment.range.offset)
-            )
-            if (state := self._slices.hold(segment)) is not None:
-                self._show(*state)
-        for frame in self._slices.sections():
-            if frame.kind == sections.METADATA:
-                self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+        for item, payload in self._slices.items():
+            place = item.range.offset
+            if zlib.crc32(payload) != item.crc:
+                raise CorruptStreamError("expected a segment or piece to match its CRC, got other bytes", place)
+            if isinstance(item, Piece):
+                self._reconstruction.correct(self._slices.number(item), payload, place)
+                state = self._slices.hold_piece(item)
             else:
-                self._correct(frame, self.header)
-                if (state := self._slices.hold_exactness()) is not None:
-                    self._show(*state)
+                known = bool(self._progress.top[item.tile, item.channel])
+                top = 0 if known else item.top
+                first = self._progress.advance(item.tile, item.channel, top, item.passes, place)
+                self._reconstruction.add(Coded(item.tile, item.channel, first, item.passes, payload, place))
+                state = self._slices.hold(item)
+            if state is not None:
+                self._show(*state)
+        frame = self._slices.metadata()
+        if frame is not None:
+            self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
 
 
 def decode(container: bytes | bytearray | memoryview) -> Surface:

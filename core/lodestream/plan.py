@@ -12,6 +12,7 @@ from typing import Literal
 
 from .container.model import ByteRange, Index
 from .errors import OptionError
+from .selection import select, wish_of
 from .target import Target
 
 __all__ = ["Ended", "Mark", "Plan", "plan"]
@@ -88,6 +89,8 @@ def plan(index: Index, target: Target = Target()) -> Plan:  # noqa: B008 - an im
     OptionError
         When there is no such level, or not even the first layer fits into the bytes allowed.
     """
+    if target.region is not None or target.attributes is not None:
+        return _selected(index, target)
     if target.level is not None:
         finest = index.header.levels
         if target.level > finest:
@@ -173,6 +176,55 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
         return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
     marks, ended = _until(marks, target, index.header.extent)
     return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+
+
+def _selected(index: Index, target: Target) -> Plan:
+    """A window, or some attributes only: segments in file order or level by level, then pieces of exactness."""
+    chosen = select(index, wish_of(target))
+    tiles, partial = index.header.layout.tiles, target.region is not None
+    finest = index.header.levels if target.level is None else target.level
+    if finest > index.header.levels:
+        raise OptionError(f"expected a level of 0 to {index.header.levels}, got {finest}")
+    segments = [s for s in chosen.segments if tiles[s.tile].level <= finest]
+    if target.order == "level":
+        segments.sort(key=lambda segment: tiles[segment.tile].level)
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    level = 0
+    ended: Ended
+    for number, segment in enumerate(segments):
+        _append(ranges, segment.range)
+        held += segment.range.length
+        own = tiles[segment.tile].level
+        level = max(level, own)
+        after = segments[number + 1] if number + 1 < len(segments) else None
+        if target.order == "level":
+            if after is None or tiles[after.tile].level > own:
+                state = index.levels[own]
+                marks.append(_mark(held, own, own, state.rms, state.max_error, partial))
+        elif after is None or after.layer > segment.layer:
+            # Layers of which nothing is wanted are there as well.
+            record = index.layers[-1 if after is None else after.layer - 1]
+            if target.level is None or level <= target.level:
+                marks.append(_mark(held, record.number, level, record.rms, record.max_error, partial))
+    if finest < index.header.levels:
+        state = index.levels[finest]
+        last, ended = _mark(held, finest, finest, state.rms, state.max_error, partial), "level"
+    else:
+        for piece in chosen.pieces.values():
+            _append(ranges, piece.range)
+            held += piece.range.length
+        state, number = index.levels[-1], len(index.layers) if chosen.pieces else len(index.layers) - 1
+        last, ended = Mark(held, number, finest, held, state.rms, state.max_error), "complete"
+    marks = [mark for mark in marks if mark.sent < held] + [last]
+    if target.level is None:
+        marks, ended = _until(marks, target, index.header.extent)
+    return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+
+
+def _mark(held: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
+    unknown = float("nan")
+    return Mark(held, number, level, held, *((unknown, unknown) if partial else (rms, max_error)))
 
 
 def _level_end(index: Index, level: int) -> Ended:

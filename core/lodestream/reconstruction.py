@@ -82,8 +82,17 @@ class Reconstruction:
         if data:
             self._pieces[number] = data, offset
 
-    def blocks(self, length: int, state: NDArray[np.int8], level: int, corrected: bool = False) -> list[Values]:
+    def blocks(
+        self,
+        length: int,
+        state: NDArray[np.int8],
+        level: int,
+        corrected: bool = False,
+        chosen: NDArray[np.bool_] | None = None,
+    ) -> list[Values]:
         """The grids of ``level`` when the first ``length`` segments are known, one for each block.
+
+        Channels that are not ``chosen`` mean nothing.
 
         Raises
         ------
@@ -93,10 +102,12 @@ class Reconstruction:
         header = self.header
         with self._lock:
             self._decode(length)
-            pictures = [
-                channel_picture(header, channel, tiles, state[:, channel], level)
-                for channel, tiles in enumerate(self._tiles)
-            ]
+            pictures: list[Picture] = []
+            for channel, tiles in enumerate(self._tiles):
+                if chosen is None or chosen[channel]:
+                    pictures.append(channel_picture(header, channel, tiles, state[:, channel], level))
+                else:
+                    pictures.append(pictures[0])  # of the right shapes
         blocks = to_values(header, pictures, level)
         if corrected:
             self._correct(blocks)

@@ -8,9 +8,11 @@ from typing import Literal
 
 from .errors import OptionError
 
-__all__ = ["Order", "Target", "Tolerance"]
+__all__ = ["Order", "Region", "Target", "Tolerance"]
 
 Order = Literal["quality", "level"]
+#: Rows and columns, half-open, in full-resolution indices.
+Region = tuple[tuple[int, int], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,10 @@ class Target:
     order : "quality" or "level"
         Quality order sends bits in order of what they do to the error; level order sends level by level, and limits
         then stop at a level's end.
+    region : ((int, int), (int, int)) or None
+        Only this window: rows and columns, half-open, in full-resolution indices.
+    attributes : tuple of str or None
+        Only the attributes of these names beside the points; None: all.
     """
 
     level: int | None = None
@@ -72,6 +78,8 @@ class Target:
     max_bytes: int | None = None
     seconds: float | None = None
     order: Order = "quality"
+    region: Region | None = None
+    attributes: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         limits = (self.until_rms, self.until_max, self.max_bytes, self.seconds)
@@ -85,3 +93,9 @@ class Target:
             raise OptionError(f"expected a positive number of seconds, got {self.seconds}")
         if self.order not in ("quality", "level"):
             raise OptionError(f"expected order quality or level, got {self.order!r}")
+        if self.region is not None:
+            if self.level is not None:
+                raise OptionError("expected either a level or a region, got both")
+            for start, stop in self.region:
+                if not 0 <= start < stop:
+                    raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")

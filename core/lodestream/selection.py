@@ -1,0 +1,109 @@
+"""Which segments and pieces of a container a receiver takes that wants a window, or some attributes only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .container.model import Header, Index, Piece, Segment
+from .container.pieces import windows
+from .errors import OptionError
+from .reach import check_region, needed_tiles
+from .target import Region, Target
+
+__all__ = ["Selection", "Wish", "select", "wish_of"]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What of a surface is wanted: a window of its points (None: all), and attributes by name (None: all)."""
+
+    region: Region | None = None
+    attributes: tuple[str, ...] | None = None
+
+    def check(self, header: Header) -> None:
+        """Refuse what the surface does not have.
+
+        Raises
+        ------
+        OptionError
+            When the region is not inside it, or there is no such attribute.
+        """
+        if self.region is not None:
+            if len(header.blocks) > 1:
+                raise OptionError(f"expected no region of a surface of {len(header.blocks)} blocks")
+            check_region(self.region, header.shape)
+        names = [kind.name for kind in header.attributes]
+        for name in self.attributes or ():
+            if name not in names:
+                raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
+
+    def channels(self, header: Header) -> NDArray[np.bool_]:
+        """Which channels are wanted."""
+        chosen = [True] * header.point_channels
+        for kind in header.attributes:
+            chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
+        return np.array(chosen)
+
+    def tiles(self, header: Header) -> NDArray[np.bool_]:
+        """Which tiles are wanted."""
+        if self.region is None:
+            return np.ones(len(header.layout.tiles), np.bool_)
+        region = self.region
+        if header.corrected:
+            # A piece of exactness restores a window as a whole.
+            sizes = [2 << exponent for exponent in header.tile]
+            (top, bottom), (left, right) = (
+                (start // size * size, min(-(-stop // size) * size, length))
+                for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
+            )
+            region = (top, bottom), (left, right)
+        if header.arrangement is not None:
+            # A block that meets itself: what is shared may lie on the other side.
+            return np.ones(len(header.layout.tiles), np.bool_)
+        return needed_tiles(header.layout, region)
+
+
+def wish_of(target: Target) -> Wish:
+    """The wish in a target."""
+    return Wish(target.region, target.attributes)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Segments in file order, and pieces of exactness by number, that a wish takes.
+
+    ``whole`` says that these are all of the container.
+    """
+
+    segments: tuple[Segment, ...]
+    pieces: dict[int, Piece]
+    whole: bool
+
+
+def select(index: Index, wish: Wish) -> Selection:
+    """What of a container a wish takes.
+
+    Raises
+    ------
+    OptionError
+        When the surface does not have it.
+    """
+    header = index.header
+    wish.check(header)
+    if wish.region is None and wish.attributes is None:
+        return Selection(index.segments, {k: p for k, p in enumerate(index.pieces) if p.range.length}, True)
+    tiles, channels = wish.tiles(header), wish.channels(header)
+    segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
+    pieces = {}
+    if index.pieces:
+        for number, (window, piece) in enumerate(zip(windows(header), index.pieces, strict=True)):
+            touches = wish.region is None or all(
+                start < b and a < stop
+                for (start, stop), (a, b) in zip(wish.region, (window.rows, window.columns), strict=True)
+            )
+            if piece.range.length and touches and channels[window.channel]:
+                pieces[number] = piece
+    return Selection(segments, pieces, False)
