@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..errors import FormatWarning
 from ..heights import coordinates
 from ..mesh.cells import unpack_cells
-from ..mesh.weld import face_map
 from ..surface import Block, Surface
 from .attributes import COLOR, NORMAL, TEXTURE
 from .mesh_output import exact_float, notes
@@ -107,7 +106,9 @@ def _grid(surface: Surface, number: int) -> _Grid:
     wraps = [closed and length >= _MIN_CLOSED for closed, length in zip(block.closed, block.shape, strict=True)]
     ends = [(0, int(wrap)) for wrap in wraps]
     rows, columns = (length - 1 + int(wrap) for length, wrap in zip(block.shape, wraps, strict=True))
-    left_out = unpack_cells(face_map(surface.metadata, number, len(surface.blocks)).get("left_out"), (rows, columns))
+    faces = surface.metadata.get("faces", {})  # one map for all blocks, or a list of one for each
+    of_block = faces[number] if isinstance(faces, list) and number < len(faces) else faces
+    left_out = unpack_cells(of_block.get("left_out") if isinstance(of_block, dict) else None, (rows, columns))
     return _Grid(
         _padded(points, ends, "wrap"),
         {name: _padded(values, ends, "wrap") for name, values in attributes.items()},
