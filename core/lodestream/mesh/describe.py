@@ -73,9 +73,9 @@ def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
 def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -> NDArray[np.int32]:
     """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column."""
     corners = corners.copy()
-    line, tips = corners[SIDES[side]], 4 * faces[SIDES[side]]
-    line[: len(tips)] = tips
-    line[len(tips) :] = tips[-1]
+    line, beside = corners[SIDES[side]], faces[SIDES[side]]
+    beside = np.concatenate([beside, beside[-1:]])[: len(line)]
+    line[beside >= 0] = 4 * beside[beside >= 0]
     return corners
 
 

@@ -204,9 +204,10 @@ class _Recognition:
 
     def _check_count(self, count: int) -> None:
         quads = len(self.quads.corners)
-        if count > MOST_BLOCKS or (count > MOST_SMALL_BLOCKS and quads < LEAST_QUADS * count):
+        most_small = 1 if self.seams else MOST_SMALL_BLOCKS
+        if count > MOST_BLOCKS or (count > most_small and quads < LEAST_QUADS * count):
             raise FormatError(
-                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {MOST_SMALL_BLOCKS} pieces "
+                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {most_small} pieces "
                 f"{LEAST_QUADS} quads in each on average, got {count:,} pieces of {quads:,} quads in all"
                 f"{self._seam_words()}: weld vertices at the same place first"
             )
