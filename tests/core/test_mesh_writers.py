@@ -153,13 +153,14 @@ def test_blocks_are_stacked_in_one_vts_with_a_warning(tmp_path: Path) -> None:
 def test_triangles_and_poles_go_out_as_they_came(tmp_path: Path, suffix: str) -> None:
     points = tube(5, 6)
     points[0] = points[0, 0]
-    metadata = {"faces": {"diagonal": "anti"}, "poles": [{"block": 0, "side": "first_row", "kind": "fan"}]}
-    surface = Surface(points, metadata=metadata)
-    formats.write(surface, tmp_path / f"a.{suffix}")
-    places, faces = polygons(tmp_path / f"a.{suffix}")
-    assert len(places) == 1 + 4 * 6
-    assert len(faces) == 5 + 2 * 15
-    assert triangles_in_space(places, faces) == expected_faces(surface, split=True)
+    poles = [{"block": 0, "side": "first_row", "kind": "fan"}]
+    for metadata in ({"faces": {"diagonal": "anti"}, "poles": poles}, {"poles": poles}):
+        surface = Surface(points, metadata=metadata)
+        formats.write(surface, tmp_path / f"a.{suffix}")
+        places, faces = polygons(tmp_path / f"a.{suffix}")
+        assert len(places) == 1 + 4 * 6
+        assert len(faces) == 5 + 2 * 15
+        assert triangles_in_space(places, faces) == expected_faces(surface, split=True)
 
 
 def colored(dtype: Any = np.float32) -> Surface:

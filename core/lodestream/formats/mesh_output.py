@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,12 @@ from ..mesh import weld
 from ..surface import Block, Surface
 from .source import number
 
-__all__ = ["Output", "check_count", "exact_float", "notes", "output_of", "warn_left_out"]
+__all__ = ["Output", "check_count", "exact_float", "notes", "output_of", "warn_left_out", "write_lines"]
 
 #: Largest magnitude of integers that each type holds without rounding, in order of preference.
 _EXACT = {"f4": 2**24, "f8": 2**53}
+
+_LINES = 1 << 16
 
 #: With fewer points, the edge that closes a curve would lie on one that is there already.
 _MIN_CLOSED = 3
@@ -128,3 +130,21 @@ def check_count(count: int, most: int, kind: str) -> None:
     """Refuse more vertices than a format can number."""
     if count > most:
         raise FormatError(f"expected at most {number(most)} vertices for {kind}, got {number(count)}")
+
+
+def write_lines(file: BinaryIO, keyword: str, columns: Sequence[NDArray[Any]]) -> None:
+    """Write a line of text for each index of arrays of one length: the keyword, if any, and numbers that read back."""
+    template = " ".join([*[keyword] * bool(keyword), *(_spell(column.dtype) for column in columns)]) + "\n"
+    for start in range(0, len(columns[0]), _LINES):
+        block = [column[start : start + _LINES].tolist() for column in columns]
+        flat: list[float] = [0] * (len(block) * len(block[0]))
+        for index, column in enumerate(block):
+            flat[index :: len(block)] = column
+        file.write((template * len(block[0]) % tuple(flat)).encode("ascii"))
+
+
+def _spell(dtype: np.dtype[Any]) -> str:
+    """Choose the shortest of the usual spellings that reads back as the same number."""
+    if dtype.kind in "iu":
+        return "%d"
+    return "%.9g" if dtype.itemsize == 4 else "%r"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..surface import Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .mesh_output import Output, notes, output_of, warn_left_out
+from .mesh_output import Output, notes, output_of, warn_left_out, write_lines
 
 __all__ = ["write"]
 
@@ -32,10 +31,10 @@ def write(surface: Surface, file: BinaryIO) -> None:
     for key, text in notes(surface.metadata).items():
         file.write(f"# {key} {text}\n".encode())
     places = np.unique(mesh.joined)
-    _write_lines(file, "v", [column[places] for column in (*mesh.coordinates, *colors)])
+    write_lines(file, "v", [column[places] for column in (*mesh.coordinates, *colors)])
     for keyword, key in (("vt", TEXTURE), ("vn", NORMAL)):
         if key in others:
-            _write_lines(file, keyword, list(others[key].T))
+            write_lines(file, keyword, list(others[key].T))
     numbers = np.searchsorted(places, mesh.joined)
     middle = {0: "", 1: "/%d" if TEXTURE in others else "//%d", 2: "/%d/%d"}[len(others)]
     for faces in (mesh.quads, mesh.triangles):
@@ -72,21 +71,3 @@ def _write_corners(
         block = faces[start : start + _ROWS]
         numbers = np.stack([places[block], *[block] * others], axis=-1) + 1
         file.write((line * len(block) % tuple(numbers.reshape(-1).tolist())).encode("ascii"))
-
-
-def _write_lines(file: BinaryIO, keyword: str, values: Sequence[NDArray[Any]]) -> None:
-    """Write a line for each index of the arrays `values`, all of one length."""
-    template = " ".join([keyword, *(_spell(column.dtype) for column in values)]) + "\n"
-    for start in range(0, len(values[0]), _ROWS):
-        block = [column[start : start + _ROWS].tolist() for column in values]
-        flat: list[float] = [0] * (len(block) * len(block[0]))
-        for index, column in enumerate(block):
-            flat[index :: len(block)] = column
-        file.write((template * len(block[0]) % tuple(flat)).encode("ascii"))
-
-
-def _spell(dtype: np.dtype[Any]) -> str:
-    """Choose the shortest of the usual spellings that reads back as the same number."""
-    if dtype.kind in "iu":
-        return "%d"
-    return "%.9g" if dtype.itemsize == 4 else "%r"

@@ -1,4 +1,4 @@
-"""PLY, binary and little-endian, of any surface."""
+"""PLY of any surface, binary and little-endian where its faces have the same number of corners."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..surface import Surface
 from .attributes import split
-from .mesh_output import check_count, exact_float, notes, output_of, warn_left_out
+from .mesh_output import check_count, exact_float, notes, output_of, warn_left_out, write_lines
 
 __all__ = ["write"]
 
@@ -34,7 +34,8 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
     Coordinates are float where that holds every integer, else double: readers are used to no other types there. Colours
     become red, green and blue, normals nx, ny, nz, places in a texture s and t; other attributes keep their name, with
-    the number of the component. Name, unit and CRS are comments.
+    the number of the component. Name, unit and CRS are comments. A mesh of quads and triangles is written as text,
+    since some libraries (trimesh) read lists of several lengths from text only.
     """
     mesh = output_of(surface)
     vertices = {
@@ -43,7 +44,8 @@ def write(surface: Surface, file: BinaryIO) -> None:
     count = len(mesh.coordinates[0])
     check_count(count, _MAX_INDEX, "PLY")
     faces = len(mesh.quads) + len(mesh.triangles)
-    lines = ["ply", "format binary_little_endian 1.0"]
+    text = bool(len(mesh.quads) and len(mesh.triangles))
+    lines = ["ply", f"format {'ascii' if text else 'binary_little_endian'} 1.0"]
     lines += [f"comment {key} {_ascii(text, ' -~')}" for key, text in notes(surface.metadata).items()]
     lines += [f"element vertex {count}"]
     lines += [f"property {_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()]
@@ -52,9 +54,15 @@ def write(surface: Surface, file: BinaryIO) -> None:
     if len(mesh.edges):
         lines += [f"element edge {len(mesh.edges)}", "property int vertex1", "property int vertex2"]
     file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+    if text:
+        write_lines(file, "", list(vertices.values()))
+        for corners in (mesh.quads, mesh.triangles):
+            write_lines(file, str(corners.shape[1]), list(corners.T))
+        if len(mesh.edges):
+            write_lines(file, "", list(mesh.edges.T))
+        return
     _write_rows(file, vertices)
-    for corners in (mesh.quads, mesh.triangles):
-        _write_faces(file, corners)
+    _write_faces(file, mesh.quads if len(mesh.quads) else mesh.triangles)
     file.write(mesh.edges.astype("<i4").tobytes())
 
 
