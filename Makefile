@@ -11,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-lowest lint format bench bench-peers wheel clean
+.PHONY: help demo test test-lowest lint format bench bench-peers bench-server wheel clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -40,6 +40,9 @@ bench: $(STAMP) ## measure speed, memory and bytes on this machine; ARGS="transf
 
 bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other coders; ARGS="--only ours" or "--tables"
 	@$(PEERS)/bin/python -m benchmarks.peers $(ARGS)
+
+bench-server: $(STAMP) ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
+	@$(BIN)/python -m benchmarks.server $(ARGS)
 
 wheel: $(STAMP) ## build dist/*.whl
 	@$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .

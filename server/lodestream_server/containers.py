@@ -8,6 +8,8 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
 
+from lodestream.errors import NotFoundError
+
 from .storage import Storage
 
 if TYPE_CHECKING:
@@ -17,6 +19,9 @@ __all__ = ["Containers", "OpenContainer"]
 
 # An index holds a record per segment, a few megabytes for the largest surfaces: streams of one surface share it.
 _INDEXES_KEPT = 16
+
+# Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
+_NOWAIT = getattr(os, "RWF_NOWAIT", 0)
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,18 @@ class OpenContainer:
     def read(self, place: ByteRange) -> bytes:
         """The bytes of a slice, fewer where the file ends; from any thread."""
         return os.pread(self.file.fileno(), place.length, place.offset)
+
+    def read_at_once(self, place: ByteRange) -> bytes | None:
+        """The same without waiting for a disk: None where the system would have to, or cannot tell."""
+        if not _NOWAIT:
+            return None
+        buffer = bytearray(place.length)
+        try:
+            count = os.preadv(self.file.fileno(), [buffer], place.offset, _NOWAIT)
+        except OSError:
+            return None
+        # Fewer bytes: the rest is not in memory, or the file has been cut.
+        return bytes(buffer) if count == place.length else None
 
     def close(self) -> None:
         """Close the file."""
@@ -54,7 +71,10 @@ class Containers:
         StreamError
             When it is damaged.
         """
-        file = self._storage.container(sha256).open("rb")
+        try:
+            file = self._storage.container(sha256).open("rb")
+        except FileNotFoundError:  # deleted since it was looked for
+            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}") from None
         try:
             return OpenContainer(sha256, self._index(sha256, file), file)
         except BaseException:

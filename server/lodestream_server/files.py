@@ -10,7 +10,7 @@ from typing import Annotated, BinaryIO
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
 
-from lodestream.errors import OptionError
+from lodestream.errors import NotFoundError, OptionError
 
 from . import examples
 from .levels import MEDIA_TYPES, write_level
@@ -31,6 +31,7 @@ _CHUNK = 64 * 1024
     "/surfaces/{surface}/container",
     status_code=307,
     summary="Find a surface's container",
+    response_class=Response,
     responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 424)},
 )
 async def find(request: Request, parts: Parts, surface: str) -> Response:
@@ -63,7 +64,10 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     if unchanged is not None:
         unchanged.headers.update(headers)
         return unchanged
-    status = path.stat()
+    try:
+        status = path.stat()
+    except FileNotFoundError:  # deleted since it was looked for
+        raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}") from None
     sort_out(request, status.st_size, etag)
     return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
 

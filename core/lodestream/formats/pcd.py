@@ -97,7 +97,7 @@ def _read_header(head: bytes) -> _Header:
 
 def _integer(entries: dict[str, list[str]], key: str) -> int:
     words = entries[key]
-    if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 18:
+    if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 20:
         raise FormatError(f"expected {key} and a whole number in the PCD header, got {' '.join(words)[:40]!r}")
     return int(words[0])
 

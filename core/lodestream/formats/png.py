@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import struct
 import warnings
+import zlib
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any, BinaryIO
@@ -19,7 +20,7 @@ from ..errors import FormatError, OptionError
 from ..lattice import Lattice, find_lattice, to_dtype
 from ..surface import Surface
 from .flat import even_heights, warn
-from .source import Source
+from .source import Source, number
 
 __all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
 
@@ -40,6 +41,10 @@ _KINDS = {
 }
 _ENCODINGS = ("grey", "terrain-rgb", "terrarium")
 _WHITE = 65535
+
+#: Left, top, and steps to the right and down of the passes of an interlaced image.
+_INTERLACED = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_PIECE = 1 << 20
 
 #: Key of a text in the file: JSON with first, origin, step and scale, where heights are
 #: (origin + step (first + shade)) / scale, in dtype; or with encoding, what its colours stand for.
@@ -73,6 +78,7 @@ def read(source: Source) -> Surface:
     """Read heights: the shades themselves, or what the colours stand for; transparent pixels are holes."""
     depth, kind = _header(source)
     pillow = require_pillow()
+    _check_pixels(source)
     try:
         # The plugin itself: Image.open would try others, and has a limit of its own.
         with warnings.catch_warnings(), source.path.open("rb") as file:
@@ -110,6 +116,35 @@ def _header(source: Source) -> tuple[int, int]:
         raise FormatError(f"expected grey of 8 or 16 bits, or grey with alpha or colours of 8, got {found}")
     source.check_expansion(height * width * depth // 8 * _CHANNELS[kind])
     return depth, kind
+
+
+def _check_pixels(source: Source) -> None:
+    """Count what the pixels expand to, because Pillow takes those that are missing for black."""
+    with source.path.open("rb") as file:
+        file.seek(16)
+        width, height, depth, kind, _, _, interlaced = struct.unpack(">IIBBBBB", file.read(13))
+        bits = depth * _CHANNELS[kind]
+        passes = _INTERLACED if interlaced else ((0, 0, 1, 1),)
+        sizes = ((-(-(width - left) // right), -(-(height - top) // down)) for left, top, right, down in passes)
+        wanted = sum(rows * (1 + (columns * bits + 7) // 8) for columns, rows in sizes if columns > 0 and rows > 0)
+        file.seek(8)
+        found, expander = 0, zlib.decompressobj()
+        while found < wanted and len(head := file.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            if name != b"IDAT":
+                file.seek(length + 4, 1)
+                continue
+            while length > 0 and (data := file.read(min(length, _PIECE))):
+                length -= len(data)
+                try:
+                    while data and found < wanted:
+                        found += len(expander.decompress(data, _PIECE))
+                        data = expander.unconsumed_tail
+                except zlib.error as error:
+                    raise FormatError(f"expected a whole PNG, got one with damaged pixels: {error}") from None
+            file.seek(length + 4, 1)
+    if found < wanted:
+        raise FormatError(f"expected a whole PNG of {number(wanted)} bytes of pixels, got {number(found)}")
 
 
 def _encoding(source: Source, kind: int, text: Mapping[str, Any]) -> str:

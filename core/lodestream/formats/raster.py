@@ -93,7 +93,7 @@ def _opened(source: Source, driver: str, title: str, file_name: str, options: di
             raise
         except (errors.RasterioError, OSError, ValueError) as error:
             # The cause says what failed, and the path may be a server's own.
-            reason = str(error.__cause__ or error).replace(str(path), "the file").replace(folder, "")
+            reason = str(error.__cause__ or error).replace(str(path), "the file").replace(f"{file_name}: ", "")
             raise FormatError(f"expected a whole {title}, got one that GDAL cannot read: {reason}") from None
 
 

@@ -23,16 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError, FormatWarning
+from ..mesh.cells import pack_cells
 from ..seams import merge
 from ..surface import Block, Surface
 from .attributes import COLOR, NORMAL, TEXTURE
 from .planes import Cut, Dims, cuts
 from .source import Source, number
+from .vtk_ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["HIDDEN_CELL", "HIDDEN_POINT", "Reading", "read_grids"]
-
-#: Bits of vtkGhostType, from VTK's vtkDataSetAttributes.h.
-HIDDEN_POINT, HIDDEN_CELL = 2, 32
+__all__ = ["Reading", "read_grids"]
 
 #: What VTK may take for a small file, beside what it takes for itself.
 _MEMORY = 128 << 20
@@ -159,7 +158,7 @@ def _block(grid: Any, cut: Cut, output: IO[bytes]) -> tuple[Block, dict[str, Any
         raise FormatError("expected a grid with points, got none")
     face: dict[str, Any] = {}
     if hidden is not None:
-        mask, face = _without_hidden(hidden, mask, points.shape[:2])
+        mask, face = _without_hidden(hidden, mask)
     return Block(points, mask=mask, attributes=attributes), face
 
 
@@ -202,14 +201,11 @@ def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
 
 
 def _without_hidden(
-    hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None, shape: tuple[int, ...]
+    hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.bool_], dict[str, Any]]:
     """Make holes of the points all of whose cells are hidden; name the other hidden cells."""
     around = np.pad(hidden, 1, constant_values=True)
     all_hidden = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
     valid = ~all_hidden if mask is None else mask & ~all_hidden
     whole = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
-    row, column = np.nonzero(hidden & whole)
-    if not row.size:
-        return valid, {}
-    return valid, {"left_out": {"shape": list(shape), "cells": (row * shape[1] + column).tolist()}}
+    return valid, {"left_out": pack_cells(hidden & whole)} if (hidden & whole).any() else {}

@@ -84,12 +84,18 @@ def _limit(budget: int) -> None:
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
         with open("/proc/self/status") as status:
             used = next(int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
-        resource.setrlimit(resource.RLIMIT_DATA, (used + budget, used + budget))
-    resource.setrlimit(resource.RLIMIT_CPU, (_MAX_SECONDS, _MAX_SECONDS))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        _lower(resource.RLIMIT_DATA, used + budget)
+    _lower(resource.RLIMIT_CPU, _MAX_SECONDS)
+    _lower(resource.RLIMIT_CORE, 0)
     free = os.open(os.devnull, os.O_RDONLY)
     os.close(free)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (free + 1, free + 1))
+    _lower(resource.RLIMIT_NOFILE, free + 1)
+
+
+def _lower(kind: int, limit: int) -> None:
+    before = resource.getrlimit(kind)[1]
+    limit = limit if before == resource.RLIM_INFINITY else min(limit, before)
+    resource.setrlimit(kind, (limit, limit))
 
 
 def _leaves(data: Any) -> Iterator[Any]:

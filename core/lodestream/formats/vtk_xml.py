@@ -25,7 +25,7 @@ from .vtk_grids import Reading, read_grids
 
 __all__ = ["MORE", "OPTIONS", "SUFFIXES", "read", "sniff"]
 
-SUFFIXES = (".vts", ".vtm")
+SUFFIXES = (".vts",)
 OPTIONS: Mapping[str, str] = {"plane": planes.HELP}
 MORE = "one more block each"
 

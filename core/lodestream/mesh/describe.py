@@ -13,7 +13,7 @@ from ..surface import Block, Closed
 from .cells import pack_cells
 from .grid import Grid
 from .patchwork import Quads
-from .weld import SIDES
+from .weld import SIDES, on_border
 
 __all__ = ["RecognisedBlock", "describe_cells", "join_blocks", "poles_of", "shape_words", "with_tips"]
 
@@ -73,9 +73,9 @@ def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
 def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -> NDArray[np.int32]:
     """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column."""
     corners = corners.copy()
-    line, tips = corners[SIDES[side]], 4 * faces[SIDES[side]]
-    line[: len(tips)] = tips
-    line[len(tips) :] = tips[-1]
+    line, beside = corners[SIDES[side]], faces[SIDES[side]]
+    beside = np.concatenate([beside, beside[-1:]])[: len(line)]
+    line[beside >= 0] = 4 * beside[beside >= 0]
     return corners
 
 
@@ -95,12 +95,14 @@ def poles_of(
     return tuple(poles)
 
 
-def join_blocks(blocks: Sequence[RecognisedBlock], points: NDArray[Any]) -> tuple[list[RecognisedBlock], int]:
-    """Say of each block whether its sides are joined to others, or to each other.
+def join_blocks(
+    blocks: Sequence[RecognisedBlock], grids: Sequence[Grid], points: NDArray[Any]
+) -> tuple[list[RecognisedBlock], int]:
+    """Say of each block whether its border is joined to others, or to itself.
 
     The second result is the number of vertices that will be joined although they only lie at the same place.
     """
-    borders = [_border(block) for block in blocks]
+    borders = [_border(block, grid) for block, grid in zip(blocks, grids, strict=True)]
     found, count = np.unique(np.concatenate(borders), return_counts=True)
     shared = found[count > 1]
     result, among = [], []
@@ -117,12 +119,9 @@ def join_blocks(blocks: Sequence[RecognisedBlock], points: NDArray[Any]) -> tupl
     return result, len(together) - len(np.unique(points[together] + 0, axis=0))
 
 
-def _border(block: RecognisedBlock) -> NDArray[np.int64]:
-    """Vertices on the open sides of a block, each node once and each pole once."""
-    border = np.zeros(block.vertices.shape, np.bool_)
-    for side, place in SIDES.items():
-        if not block.closed["column" in side]:
-            border[place] = True
+def _border(block: RecognisedBlock, grid: Grid) -> NDArray[np.int64]:
+    """Vertices on the border of a block, each node once and each pole once."""
+    border = on_border(grid.faces >= 0, block.vertices.shape)
     poles = []
     for pole in block.poles:
         if pole["kind"] != "repeated":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from .triangles import pair_in_order, pair_triangles
 __all__ = ["Quads", "make_quads"]
 
 _REGULAR = 6
+
+#: Vertices that are tried first as poles, where several may be; fewer of them in larger meshes.
+_TRIES, _TRIES_OF_MANY, _FEW_FACES = 32, 2, 50_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +138,20 @@ def _poles_and_pairs(
     uneven[piece[polygons.folded]] = True
     edges, left, choices = _pair(corners, twins, points, np.flatnonzero(open_faces & ~uneven[piece]))
     left = np.concatenate([left, np.flatnonzero(halves & uneven[piece])])
-    if left.size:
-        chosen = np.zeros(len(corners), np.bool_)
-        chosen[left] = True
-        _add_poles(polygons, umbrella, valence, chosen, pole)
+    missing = np.empty(len(valence), np.int32)
+    for order in _pole_orders(polygons, umbrella, valence, piece, left):
+        _forget_poles(umbrella, piece, left, pole)
+        leaving = _leaving(polygons, umbrella, valence)
+        find_poles(corners, twins, umbrella, valence, leaving, order, True, pole, missing)
         fan = ((umbrella >= 0) & pole[umbrella]).reshape(-1, 4).any(axis=1)
-        more, left, why = _pair(corners, twins, points, np.flatnonzero(chosen & ~fan))
+        stuck = np.isin(piece, piece[left]) & triangle
+        edges = edges[~stuck[edges >> 2]]
+        more, left, why = _pair(corners, twins, points, np.flatnonzero(stuck & ~fan))
         edges, choices = np.concatenate([edges, more]), choices + why
+        short = stuck & ((umbrella >= 0) & (missing != 0)[umbrella]).reshape(-1, 4).any(axis=1)
+        left = np.concatenate([left, np.flatnonzero(short)])
+        if not left.size:
+            break
     if left.size:
         _forget_poles(umbrella, piece, left, pole)
         stuck = np.isin(piece, piece[left]) & triangle
@@ -168,26 +179,46 @@ def _pair(
     return edges.astype(np.int32), faces[pairing.unpaired], pairing.choices
 
 
-def _add_poles(
+def _leaving(polygons: Polygons, umbrella: NDArray[np.int32], valence: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open."""
+    halves = np.flatnonzero(umbrella >= 0)
+    corner_of = np.empty(len(valence), np.int32)
+    corner_of[umbrella[halves]] = halves.astype(np.int32)
+    borders = halves[polygons.twins[halves] < 0]
+    corner_of[umbrella[borders]] = borders
+    return corner_of
+
+
+def _pole_orders(
     polygons: Polygons,
     umbrella: NDArray[np.int32],
     valence: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    pole: NDArray[np.bool_],
-) -> None:
-    corners, twins = polygons.corners, polygons.twins
-    halves = np.flatnonzero(np.repeat(chosen, 4) & (umbrella >= 0))
-    corner_of = np.full(len(valence), -1, np.int32)
-    corner_of[umbrella[halves[::-1]]] = halves[::-1]
-    borders = halves[twins[halves] < 0]
-    corner_of[umbrella[borders]] = borders
-    candidates = np.flatnonzero(corner_of >= 0)
-    vertex = corners.reshape(-1)[corner_of[candidates]]
+    piece: NDArray[np.int32],
+    left: NDArray[np.int64],
+) -> Iterator[NDArray[np.int32]]:
+    """Orders in which to try the vertices of some pieces as poles: each piece begins with another one each time."""
+    if not left.size:
+        return
+    faces = np.isin(piece, piece[left])
+    corner_of = _leaving(polygons, umbrella, valence)
+    order = np.unique(umbrella.reshape(-1, 4)[faces][:, :3])
+    feasible = np.zeros(len(valence), np.bool_)
+    missing = np.empty(len(valence), np.int32)
+    find_poles(polygons.corners, polygons.twins, umbrella, valence, corner_of, order, False, feasible, missing)
+    candidates: NDArray[np.int64] = np.flatnonzero(feasible)
     named = np.zeros(len(valence), np.bool_)  # vertices that quads name twice are poles if anything is
-    named[umbrella.reshape(-1, 4)[polygons.folded & chosen, 0]] = True
+    named[umbrella.reshape(-1, 4)[polygons.folded & faces, 0]] = True
+    vertex = polygons.corners.reshape(-1)[corner_of[candidates]]
     count = valence[candidates]
-    order = candidates[np.lexsort((vertex, -np.abs(count), count < 0, ~named[candidates]))]
-    find_poles(corners, twins, umbrella, valence, corner_of, order.astype(np.int32), pole)
+    candidates = candidates[np.lexsort((vertex, -np.abs(count), count < 0, ~named[candidates]))]
+    home = piece[corner_of[candidates] >> 2]
+    by_piece = np.argsort(home, kind="stable")
+    _, start, size = np.unique(home[by_piece], return_index=True, return_counts=True)
+    rank = np.arange(len(candidates)) - np.repeat(start, size)
+    sizes = np.repeat(size, size)
+    tries = _TRIES if faces.sum() < _FEW_FACES else _TRIES_OF_MANY
+    for first in range(min(tries, int(size.max(initial=0)))):
+        yield candidates[by_piece][np.argsort((rank - first) % sizes, kind="stable")].astype(np.int32)
 
 
 def _forget_poles(

@@ -52,7 +52,9 @@ def find_poles(
     valence: NDArray[np.int32],
     corner_of: NDArray[np.int32],
     order: NDArray[np.int32],
+    together: bool,
     pole: NDArray[np.bool_],
+    missing: NDArray[np.int32],
 ) -> None:
     """Find the poles of meshes of triangles: vertices without which the mesh is a grid whose cells are cut in two.
 
@@ -65,19 +67,21 @@ def find_poles(
     corner_of : int32 array of shape (U,)
         A half-edge that leaves each umbrella; with no face before it where the umbrella is open.
     order : int32 array
-        The umbrellas that may be poles, the likeliest first.
+        The umbrellas that may be poles.
+    together : bool
+        Take them one after another, each only if it fits to those before; or else each for itself.
     pole : bool array of shape (U,)
         Filled with those that are.
+    missing : int32 array of shape (U,)
+        Filled with the triangles by which inner vertices are short of six, those of poles beside them counted.
     """
-    missing = np.zeros(valence.size, np.int32)
     for vertex in range(valence.size):
-        if valence[vertex] > 0:
-            missing[vertex] = _REGULAR - valence[vertex]
+        missing[vertex] = _REGULAR - valence[vertex] if valence[vertex] > 0 else 0
     ring = np.empty(valence.size, np.int32)
     for j in range(order.size):
         vertex = order[j]
         faces = abs(valence[vertex])
-        if pole[vertex] or faces < 2 or (valence[vertex] > 0 and faces < _MIN_FAN):
+        if faces < 2 or (valence[vertex] > 0 and faces < _MIN_FAN):
             continue
         # The vertices between two triangles of the fan.
         half = corner_of[vertex]
@@ -85,22 +89,23 @@ def find_poles(
         fits = True
         for turn in range(faces):
             other = umbrella[next_half_edge(corners, half)]
-            fits &= not pole[other]
+            fits &= not (together and pole[other])
             if valence[vertex] > 0 or turn > 0:
                 fits &= missing[other] > 0 if valence[other] > 0 else valence[other] == -2
                 ring[count] = other
                 count += 1
             half = previous_half_edge(corners, half)
             if valence[vertex] < 0 and turn == faces - 1:
-                fits &= not pole[umbrella[half]]
+                fits &= not (together and pole[umbrella[half]])
                 break
             half = twins[half]
         if not fits:
             continue
         pole[vertex] = True
-        missing[vertex] = 0
-        for index in range(count):
-            missing[ring[index]] -= 1
+        if together:
+            missing[vertex] = 0
+            for index in range(count):
+                missing[ring[index]] -= 1
 
 
 @kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import gcd
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..errors import FormatError
 from ..surface import Block, Surface
 from .cut import irregular, trace
 from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, shape_words, with_tips
-from .develop import develop_quads
+from .develop import Development, develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
 from .model import Mesh, name_faces
@@ -155,26 +156,38 @@ class _Recognition:
         self.umbrella = np.empty(4 * len(corners), np.int32)
         valence = np.empty(4 * len(corners), np.int32)
         self.valence = valence[: find_umbrellas(corners, self.twins, self.umbrella, valence)].copy()
-        # Corners of one vertex with the same attributes are the same node, whatever lies between them.
-        self.identity = corners.reshape(-1)
-        if self.seams:
-            keys = np.column_stack([self.identity, *quads.attributes.reshape(len(polygons.names), -1)])
-            self.identity = equal_rows(keys)
+        self.identity = self._nodes() if self.seams else corners.reshape(-1)
         whole = np.concatenate([np.arange(len(mesh.vertices), dtype=np.int32), quads.pole_of])
         self.vertex = whole[corners.reshape(-1)]
+        self.piece = np.empty(0, np.int32)
         self.cuts = 0
 
+    def _nodes(self) -> NDArray[np.int32]:
+        """For each corner its node: one for all corners of a vertex with the same attributes, seam between or not."""
+        corners = self.quads.corners.reshape(-1)
+        first = np.empty(len(self.valence), np.int64)
+        first[self.umbrella[::-1]] = np.arange(len(corners))[::-1]
+        node = np.arange(len(first), dtype=np.int32)
+        apart = np.flatnonzero(np.bincount(corners[first])[corners[first]] > 1)
+        values = self.quads.attributes.reshape(len(self.polygons.names), -1)[:, first[apart]]
+        node[apart] = apart[equal_rows(np.column_stack([corners[first[apart]], *values]))]
+        return node[self.umbrella]
+
     def result(self) -> Recognised:
+        """Find the blocks."""
         grids = self._grids()
-        piece = np.empty(len(self.quads.corners), np.int32)
-        pieces = find_pieces(self.quads.corners, self.quads.twins, piece)
+        piece = self.piece
+        pieces = int(piece.max()) + 1
+        if self.seams:
+            pieces = find_pieces(self.quads.corners, self.quads.twins, piece)
         part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
         blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
-        blocks, merged = join_blocks(blocks, self.mesh.vertices)
+        blocks, merged = join_blocks(blocks, grids, self.mesh.vertices)
         return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), tuple(self._notes(blocks, merged)))
 
     def _grids(self) -> list[Grid]:
         laid = develop_quads(self.quads.corners, self.twins)
+        self.piece = laid.piece
         runs = _runs(laid.piece, len(laid.turns))
         self._check_count(len(runs))
         grids: list[Grid] = []
@@ -186,14 +199,15 @@ class _Recognition:
             else:
                 uncut.append(number)
         if uncut:
-            grids += self._cut(np.isin(laid.piece, uncut))
+            grids += self._cut(laid, np.isin(laid.piece, uncut))
         return sorted(grids, key=_first_face)
 
     def _check_count(self, count: int) -> None:
         quads = len(self.quads.corners)
-        if count > MOST_BLOCKS or (count > MOST_SMALL_BLOCKS and quads < LEAST_QUADS * count):
+        most_small = 1 if self.seams else MOST_SMALL_BLOCKS
+        if count > MOST_BLOCKS or (count > most_small and quads < LEAST_QUADS * count):
             raise FormatError(
-                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {MOST_SMALL_BLOCKS} pieces "
+                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {most_small} pieces "
                 f"{LEAST_QUADS} quads in each on average, got {count:,} pieces of {quads:,} quads in all"
                 f"{self._seam_words()}: weld vertices at the same place first"
             )
@@ -215,24 +229,30 @@ class _Recognition:
         corners = self.quads.corners.reshape(-1)
         return (grid.corners >= 0) & (corners[grid.corners] >= len(self.mesh.vertices))
 
-    def _cut(self, chosen: NDArray[np.bool_]) -> list[Grid]:
+    def _starts(self, laid: Development, chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Half-edges from which to cut the pieces of the chosen faces."""
+        halves = np.repeat(chosen, 4) & (self.twins >= 0)
+        starts = [np.flatnonzero(halves & irregular(self.valence)[self.umbrella])]
+        has_start = np.bincount(laid.piece[starts[0] >> 2], minlength=len(laid.turns)) > 0
+        for number in np.unique(laid.piece[chosen & ~has_start[laid.piece]]).tolist():
+            # A torus that winds, so that it is no torus of rows and columns: along the shorter line it is cut open.
+            a, b, d = (int(value) for value in laid.periods[number])
+            along_rows = d <= a * d // gcd(b, d)
+            inside = np.flatnonzero(halves & np.repeat(laid.piece == number, 4))
+            inside = inside[(laid.heading[inside >> 2] + (inside & 3)) % 2 == (0 if along_rows else 1)]
+            starts.append(inside[self.vertex[inside].argmin()][None])
+        return np.concatenate(starts).astype(np.int32)
+
+    def _cut(self, laid: Development, chosen: NDArray[np.bool_]) -> list[Grid]:
         """Cut the pieces of the chosen faces into blocks."""
         corners = self.quads.corners
-        halves = np.repeat(chosen, 4) & (self.twins >= 0)
         wrong = irregular(self.valence)
-        starts = np.flatnonzero(halves & wrong[self.umbrella])
-        # A piece without irregular vertices winds like a helix, or lies on itself: any vertex will do.
+        starts = self._starts(laid, chosen)
         piece = np.empty(len(corners), np.int32)
-        pieces = find_pieces(corners, self.twins, piece)
-        has_start = np.bincount(piece[starts >> 2], minlength=pieces) > 0
-        for number in np.unique(piece[chosen & ~has_start[piece]]).tolist():
-            inside = np.flatnonzero(halves & np.repeat(piece == number, 4))
-            lowest = inside[self.vertex[inside].argmin()]
-            starts = np.concatenate([starts, inside[self.umbrella[inside] == self.umbrella[lowest]]])
         best: tuple[int, NDArray[np.int32]] | None = None
         for whole in (True, False):
             cut = np.zeros(4 * len(corners), np.bool_)
-            trace(corners, self.twins, self.umbrella, self.valence, starts.astype(np.int32), whole, cut)
+            trace(corners, self.twins, self.umbrella, self.valence, starts, whole, cut)
             apart = np.where(cut, -1, self.twins).astype(np.int32)
             find_pieces(corners, apart, piece)
             count = len(np.unique(piece[chosen]))

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..surface import Block, Surface
 from .cells import unpack_cells
 
-__all__ = ["SIDES", "Faces", "Weld", "face_map", "faces_of", "side_of", "weld"]
+__all__ = ["SIDES", "Faces", "Weld", "face_map", "faces_of", "on_border", "weld"]
 
 #: With fewer points, the faces that join the ends of a closed axis would lie on those already there.
 _MIN_CLOSED = 3
@@ -107,28 +107,66 @@ def weld(surface: Surface) -> Weld:
     InputError
         When the metadata's ``faces`` or ``poles`` are not of the form that they should have.
     """
-    blocks = surface.blocks
-    maps = [face_map(surface.metadata, number, len(blocks)) for number in range(len(blocks))]
-    starts = np.cumsum([0, *(block.points.shape[0] * block.points.shape[1] for block in blocks)])
-    points = [
-        np.arange(start, start + block.shape[0] * block.shape[1]).reshape(block.shape)
-        for start, block in zip(starts.tolist(), blocks, strict=False)
-    ]
     poles = _poles(surface)
-    joined = np.arange(starts[-1])
-    _join_sides(blocks, points, maps, joined)
+    parts, start = [], 0
+    for number, block in enumerate(surface.blocks):
+        parts.append(_Part.of(block, start, face_map(surface.metadata, number, len(surface.blocks))))
+        start += parts[-1].points.size
+    joined = np.arange(start)
+    _join_borders([part for part in parts if part.joins(len(parts))], joined)
     for number, side, _ in poles:
-        if not _joins(maps[number], len(blocks)):
-            row = points[number][SIDES[side]]
+        if not parts[number].joins(len(parts)):
+            row = parts[number].points[SIDES[side]]
             joined[row] = joined[row].min()
-    vertex = _same_vertices(blocks, joined)
+    vertex = _same_vertices(surface.blocks, joined)
     quads, triangles = [], []
-    for number, block in enumerate(blocks):
+    for number, part in enumerate(parts):
         degenerate = any(pole == number and kind == "degenerate" for pole, _, kind in poles)
-        block_quads, block_triangles = _faces(block, points[number], joined, maps[number], degenerate)
-        quads.append(block_quads)
-        triangles.append(block_triangles)
-    return _compressed(blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles))
+        part_quads, part_triangles = _faces(part, joined, degenerate)
+        quads.append(part_quads)
+        triangles.append(part_triangles)
+    return _compressed(surface.blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles))
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A block, its points as numbers among those of all blocks, what is said of its faces, and which cells have one."""
+
+    block: Block
+    points: NDArray[np.int64]
+    faces: Mapping[str, Any]
+    cells: NDArray[np.bool_]
+
+    @staticmethod
+    def of(block: Block, start: int, faces: Mapping[str, Any]) -> _Part:
+        height, width = block.shape
+        valid = np.ones(block.shape, np.bool_) if block.mask is None else block.mask
+        cells = valid.copy()
+        for axis in (0, 1):
+            cells &= np.roll(cells, -1, axis)
+            if not _wraps(block, axis):
+                cells = cells[:-1] if axis == 0 else cells[:, :-1]
+        left_out = unpack_cells(faces.get("left_out"), cells.shape)
+        if left_out is not None:
+            cells &= ~left_out
+        return _Part(block, start + np.arange(height * width).reshape(height, width), faces, cells)
+
+    def joins(self, blocks: int) -> bool:
+        """Whether its border is joined to others at the same place; `blocks` is the number of all."""
+        return bool(self.faces.get("joined", blocks > 1))
+
+
+def _wraps(block: Block, axis: int) -> bool:
+    return block.closed[axis] and block.shape[axis] >= _MIN_CLOSED
+
+
+def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which nodes of a grid have fewer than four faces, from the cells that have one; fewer cells on open axes."""
+    full = np.zeros(shape, np.bool_)
+    full[: cells.shape[0], : cells.shape[1]] = cells
+    for axis in (0, 1):
+        full &= np.roll(full, 1, axis)
+    return ~full
 
 
 def face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[str, Any]:
@@ -147,12 +185,6 @@ def face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[st
     return faces
 
 
-def side_of(array: NDArray[Any], side: str) -> NDArray[Any]:
-    """The values on a side of a block."""
-    result: NDArray[Any] = array[SIDES[side]]
-    return result
-
-
 def _poles(surface: Surface) -> list[tuple[int, str, str]]:
     """Block, side and kind of the poles that are one vertex."""
     result = []
@@ -169,31 +201,21 @@ def _poles(surface: Surface) -> list[tuple[int, str, str]]:
     return result
 
 
-def _joins(faces: Mapping[str, Any], blocks: int) -> bool:
-    return bool(faces.get("joined", blocks > 1))
-
-
-def _join_sides(
-    blocks: tuple[Block, ...],
-    points: list[NDArray[np.int64]],
-    maps: list[Mapping[str, Any]],
-    joined: NDArray[np.int64],
-) -> None:
-    """Let points of open sides at the same place, in blocks of the same part, stand for the first of them."""
-    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[Any]]]] = {}
-    for block, index, faces in zip(blocks, points, maps, strict=True):
-        if not _joins(faces, len(blocks)) or block.points.ndim != 3:
+def _join_borders(parts: list[_Part], joined: NDArray[np.int64]) -> None:
+    """Let border points at the same place, in blocks of the same part of the surface, stand for the first of them."""
+    together: dict[int, list[tuple[NDArray[np.int64], NDArray[Any]]]] = {}
+    for part in parts:
+        block = part.block
+        if block.points.ndim != 3:
             continue
-        border = np.zeros(block.shape, np.bool_)
-        for side, place in SIDES.items():
-            if not block.closed["column" in side]:
-                border[place] = True
+        border = on_border(part.cells, block.shape)
         if block.mask is not None:
             border &= block.mask
-        parts.setdefault(int(faces.get("part", 0)), []).append((index[border], block.points[border][:, :3]))
-    for sides in parts.values():
-        index = np.concatenate([side for side, _ in sides])
-        joined[index] = index[_first_equal([np.concatenate([places for _, places in sides])])]
+        places = block.points[border][:, :3]
+        together.setdefault(int(part.faces.get("part", 0)), []).append((part.points[border], places))
+    for borders in together.values():
+        index = np.concatenate([points for points, _ in borders])
+        joined[index] = index[_first_equal([np.concatenate([places for _, places in borders])])]
 
 
 def _same_vertices(blocks: tuple[Block, ...], joined: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -230,23 +252,13 @@ def _first_equal(columns: list[NDArray[Any]]) -> NDArray[np.int64]:
     return first[inverse.reshape(-1)]
 
 
-def _faces(
-    block: Block,
-    points: NDArray[np.int64],
-    joined: NDArray[np.int64],
-    faces: Mapping[str, Any],
-    degenerate: bool,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _faces(part: _Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Quads and triangles of a block in the order of its cells, over the points of the surface."""
-    rows, width = block.shape
-    down = rows if block.closed[0] and rows >= _MIN_CLOSED else rows - 1
-    across = width if block.closed[1] and width >= _MIN_CLOSED else width - 1
-    r, c = np.arange(down)[:, None], np.arange(across)[None, :]
+    rows, width = part.block.shape
+    r, c = np.nonzero(part.cells)
     below, right = (r + 1) % rows, (c + 1) % width
+    points, faces = part.points, part.faces
     corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
-    corners = corners.reshape(-1, 4)
-    kept = _kept(block, faces, corners - points[0, 0], (down, across))
-    corners = corners[kept]
     ends = joined[corners]
     collapsed = (ends == np.roll(ends, -1, axis=1)).any(axis=1)
     quads, fans = corners[~collapsed], np.empty((0, 3), np.int64)
@@ -257,9 +269,9 @@ def _faces(
     diagonal = faces.get("diagonal")
     if diagonal is not None:
         main = np.full(len(quads), diagonal == "main")
-        crossed = unpack_cells(faces.get("crossed"), (down, across))
+        crossed = unpack_cells(faces.get("crossed"), part.cells.shape)
         if crossed is not None:
-            main ^= crossed.reshape(-1)[kept][~collapsed]
+            main ^= crossed[part.cells][~collapsed]
         quads, fans = quads[:0], np.concatenate([_halves(quads, main), fans])
     quads = np.concatenate([quads, folded])
     if faces.get("reversed"):
@@ -271,19 +283,6 @@ def _halves(quads: NDArray[np.int64], main: NDArray[np.bool_]) -> NDArray[np.int
     """Two triangles for each quad, cut from its first to its third corner, or else from its second to its fourth."""
     turned = np.where(main[:, None], quads, np.roll(quads, -1, axis=1))
     return turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
-
-
-def _kept(
-    block: Block, faces: Mapping[str, Any], corners: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Which of the cells have a face; `corners` are numbers of points of the block."""
-    kept: NDArray[np.bool_] = np.ones(len(corners), np.bool_)
-    if block.mask is not None:
-        kept &= block.mask.reshape(-1)[corners].all(axis=1)
-    left_out = unpack_cells(faces.get("left_out"), shape)
-    if left_out is not None:
-        kept &= ~left_out.reshape(-1)
-    return kept
 
 
 def _fans(corners: NDArray[np.int64], ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

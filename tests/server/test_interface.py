@@ -1,0 +1,104 @@
+"""Thousands of requests made from the OpenAPI document: what it says is what happens, and nothing fails inside."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import requests
+import schemathesis
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from schemathesis import CheckFunction
+from schemathesis.core.result import Ok
+from schemathesis.specs.openapi.checks import negative_data_rejection, positive_data_acceptance
+
+from lodestream_server import Settings, create_app, running_server
+from tests.server.helpers import eventually, hills, npy, push
+
+SCHEMA = schemathesis.openapi.from_dict(create_app(Settings(data=Path("nowhere"))).openapi())
+OPERATIONS = {
+    f"{operation.method.upper()} {operation.path}": operation
+    for operation in (result.ok() for result in SCHEMA.get_all_operations() if isinstance(result, Ok))
+}
+POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE
+EXAMPLES = 200
+
+#: What no schema can say: whether bytes are a surface, how many levels one has.
+INDESCRIBABLE = {"POST /v1/surfaces", "GET /v1/surfaces/{surface}/levels/{level}"}
+
+#: Where something can be wrong that a schema does say; any text may be the name of a surface.
+FALLIBLE = {"GET /v1/surfaces", *INDESCRIBABLE}
+
+CASES = [(name, POSITIVE) for name in OPERATIONS] + [(name, NEGATIVE) for name in sorted(FALLIBLE)]
+
+
+@dataclass
+class Server:
+    """A server with one surface that stays, and others to be had."""
+
+    url: str
+    http: httpx.Client
+    stays: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        self._seeds = itertools.count(100)
+
+    def real(self, method: str) -> dict[str, str]:
+        """Path parameters of something that there is."""
+        surface = self.stays
+        if method == "delete":
+            answer = self.http.post("/v1/surfaces", content=npy(hills(3, 4, seed=next(self._seeds))))
+            surface = {**answer.json(), "container": ""}
+        return {"surface": surface["id"], "sha256": surface["container"]}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with (
+        running_server(tmp_path_factory.mktemp("data"), workers=1, upload_bytes=1 << 20) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        eventually(lambda: http.get("/readyz").status_code == 200, "warm kernels")
+        yield Server(url, http, push(http, npy(hills(40, 30))))
+
+
+@pytest.mark.parametrize(("name", "mode"), CASES, ids=[f"{name}, {mode.value}" for name, mode in CASES])
+def test_what_the_document_says_is_what_happens(
+    server: Server, name: str, mode: schemathesis.GenerationMode, caplog: pytest.LogCaptureFixture
+) -> None:
+    operation = OPERATIONS[name]
+    excluded: list[CheckFunction] = []
+    if name in INDESCRIBABLE:
+        excluded.append(positive_data_acceptance)
+    if name == "POST /v1/surfaces":
+        # In a form the number 0 is the text 0, and that may be the beginning of a surface.
+        excluded.append(negative_data_rejection)
+    statuses: Counter[int] = Counter()
+    caplog.set_level(logging.ERROR)
+    with requests.Session() as session:
+        session.trust_env = False
+
+        @given(case=operation.as_strategy(generation_mode=mode), real=st.integers(0, 3))
+        @settings(max_examples=EXAMPLES)
+        def ask(case: schemathesis.Case[Any], real: int) -> None:
+            if real == 0:
+                known = server.real(operation.method)
+                case.path_parameters = {key: known.get(key, value) for key, value in case.path_parameters.items()}
+                if case.media_type == "application/octet-stream":
+                    case.body = npy(hills(4, 5))
+            answer = case.call(base_url=server.url, session=session, allow_redirects=False)
+            statuses[answer.status_code] += 1
+            case.validate_response(answer, excluded_checks=excluded)
+
+        ask()
+    assert statuses.total() > 0
+    assert max(statuses) < 500
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR] == []
