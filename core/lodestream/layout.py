@@ -174,13 +174,14 @@ class Layout:
         """All tiles, coarsest level first, then group by group (curves first), row by row."""
         every = range(len(self.grids))
         tiles = [Tile(0, (0, 0), *self._members(every, 0), -1)]
-        parents: dict[int, tuple[int, int, int]] = {}  # group -> number of its first tile, tiles down, tiles across
+        parents: dict[int, tuple[int, int, int]] = {}  # grid -> number of its first tile, tiles down, tiles across
         groups = self._groups()
         for level in range(1, self.levels + 1):
-            for number, group in enumerate(groups):
+            found = {}
+            for group in groups[level]:
                 first, bounds = len(tiles), self._bounds(group, level)
                 down, across = (len(b) - 1 for b in bounds)
-                before, parents_down, parents_across = parents.get(number, (0, 1, 1))
+                before, parents_down, parents_across = parents.get(group[0], (0, 1, 1))
                 halves = self._halves(group[0], level) if len(group) == 1 else (0, 0)
                 for i in range(down):
                     for j in range(across):
@@ -190,23 +191,33 @@ class Layout:
                             parent = before + up[0] * parents_across + up[1]
                         members = self._members(group, level, bounds, (i, j))
                         tiles.append(Tile(level, (i, j), *members, parent))
-                parents[number] = first, down, across
+                found.update(dict.fromkeys(group, (first, down, across)))
+            parents = found
         return tuple(tiles)
 
-    def _groups(self) -> list[list[int]]:
-        """Grids whose tiles are common: the curves, and consecutive small parts."""
-        groups: list[list[int]] = []
-        size = 0
-        for number, grid in enumerate(self.grids):
-            points = grid.shape[0] * grid.shape[1]
-            joins = groups and grid.curve == self.grids[groups[-1][0]].curve
-            if joins and (grid.curve or size + points <= GROUP_POINTS):
-                groups[-1].append(number)
-                size += points
-            else:
-                groups.append([number])
-                size = points
-        return groups
+    def _groups(self) -> list[list[list[int]]]:
+        """For each level the grids whose tiles are common: all curves, and neighbouring parts that are small there.
+
+        Grids that have a tile in common have one at the coarser levels too.
+        """
+        groups = [[number] for number in range(len(self.grids))]
+        levels = [groups]
+        for level in range(self.levels, 0, -1):
+            merged: list[list[int]] = []
+            size = 0
+            for group in groups:
+                shapes = [self.shape(number, level) for number in group]
+                points = sum(rows * columns for rows, columns in shapes)
+                joins = merged and self.grids[group[0]].curve == self.grids[merged[-1][0]].curve
+                if joins and (self.grids[group[0]].curve or size + points <= GROUP_POINTS):
+                    merged[-1] = merged[-1] + group
+                    size += points
+                else:
+                    merged.append(group)
+                    size = points
+            groups = merged
+            levels.append(groups)
+        return levels[::-1]
 
     def _halves(self, grid: int, level: int) -> tuple[int, int]:
         """For each axis 1 if it steps from the level below to the one below that."""

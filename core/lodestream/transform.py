@@ -272,13 +272,28 @@ def _bits(
 
 
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
-    """Squared norms of what one unit of a coefficient of a grid adds to it, in its middle.
+    """Squared norms of what one unit of a coefficient of a grid adds to the surface, in the middle of the grid.
+
+    What a curve adds reaches into the parts beside it, as their nodes do.
 
     Returns
     -------
     float64, shape (level, 2, 2)
         By level of the band and its kind along either axis (node, detail); at level 0 only [0, 0, 0] has a meaning.
     """
+    lines = _line_norms(layout, predictors, number)
+    norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
+    if layout.grids[number].curve:
+        for part, grid in enumerate(layout.grids):
+            for side, source in enumerate(grid.sources):
+                if source is not None and source.grid == number and not grid.curve:
+                    across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
+                    return norms * points * _line_norms(layout, predictors, part)[across, :, 0][:, None, None]
+    return norms
+
+
+def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> NDArray[np.float64]:
+    """Squared norms along each axis of a grid: float64, shape (axis, level, node or detail)."""
     lines = np.ones((2, layout.levels + 1, 2))
     for axis in range(2):
         stepping = []
@@ -289,8 +304,7 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
         for level in range(layout.levels + 1):
             above = tuple(step for step in stepping if step[0] >= level)
             lines[axis, level] = [_line_norm(above, max(level, 1), kind) for kind in (0, 1)]
-    norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
-    return norms
+    return lines
 
 
 @lru_cache(maxsize=4096)
