@@ -90,7 +90,7 @@ def _makes(rule: Rule, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
 
 def plain(number: Any) -> Any:
     """Whole numbers as integers, which take fewer bytes; -0.0 is none."""
-    whole = number is not True and number == int(number) and str(number) != "-0.0"
+    whole = number is not True and abs(number) < 2**53 and number == int(number) and str(number) != "-0.0"
     return int(number) if whole else number
 
 

@@ -45,13 +45,12 @@ class _Connection(H11Protocol):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._head_timer: asyncio.TimerHandle | None = None
-        self._unsent = 0
-        self._moved = False
+        self._watch: _Watch | None = None
         self._upgraded = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._watch()
+        self._watch = _Watch(transport, self.loop, self.idle_seconds)
         if len(self.connections) > self.most:
             self._refuse(503, "busy", f"expected at most {self.most} connections; come back in a few seconds")
         else:
@@ -68,6 +67,8 @@ class _Connection(H11Protocol):
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         self._upgraded = True
+        if self._watch is not None:
+            self._watch.upgraded = True
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -75,7 +76,8 @@ class _Connection(H11Protocol):
         super().connection_lost(exc)
 
     def resume_writing(self) -> None:
-        self._moved = True
+        if self._watch is not None:
+            self._watch.moved = True
         super().resume_writing()
 
     def _follow_head(self) -> None:
@@ -115,18 +117,38 @@ class _Connection(H11Protocol):
             self.transport.write(self.conn.send(event))
         self.transport.close()
 
-    def _watch(self) -> None:
-        self.loop.call_later(self.idle_seconds, self._look)
+
+class _Watch:
+    """Looks from time to time whether the other side takes what is to be sent; breaks the connection if it does not.
+
+    It holds the transport and not the connection, which is gone once it has become a stream.
+
+    Attributes
+    ----------
+    moved : bool
+        Something has been taken since the last look.
+    upgraded : bool
+        The connection has become a stream.
+    """
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, seconds: float) -> None:
+        self.moved = False
+        self.upgraded = False
+        self._transport = transport
+        self._loop = loop
+        self._seconds = seconds
+        self._unsent = 0
+        loop.call_later(seconds, self._look)
 
     def _look(self) -> None:
         # A transport that is told to close first sends what it holds, for as long as that takes: this is its end, too.
-        unsent, closing = self.transport.get_write_buffer_size(), self.transport.is_closing()
+        unsent, closing = self._transport.get_write_buffer_size(), self._transport.is_closing()
         if closing and not unsent:
             return
         # In a stream the other side's credit and the stream's own clock decide, until it is being closed.
-        judged = closing or not self._upgraded
-        if judged and not self._moved and 0 < self._unsent <= unsent:
-            self.transport.abort()
+        judged = closing or not self.upgraded
+        if judged and not self.moved and 0 < self._unsent <= unsent:
+            self._transport.abort()
             return
-        self._unsent, self._moved = unsent, False
-        self._watch()
+        self._unsent, self.moved = unsent, False
+        self._loop.call_later(self._seconds, self._look)

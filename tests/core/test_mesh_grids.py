@@ -226,7 +226,7 @@ def test_meshes_that_are_no_grid_are_refused_with_a_reason(faces: list[list[int]
 
 def test_a_soup_of_quads_is_refused() -> None:
     faces = [[4 * k, 4 * k + 1, 4 * k + 2, 4 * k + 3] for k in range(100)]
-    with pytest.raises(FormatError, match=r"got 100 pieces of 100 quads in all: weld vertices"):
+    with pytest.raises(FormatError, match=r"got 100 pieces of 100 faces in all: weld vertices"):
         surface_of(mesh_of(faces, 400))
 
 

@@ -275,14 +275,14 @@ LEGACY = (
         (
             LEGACY + "\nPOINT_DATA 6\nFIELD F 1\na 1000000 100000000 double\n1 2 3\n",
             FormatError,
-            "expected structured grids that VTK reads|expected 6 values of a",
+            "expected structured grids that VTK reads|expected 6 values of a|a grid with points, got none",
         ),
         (
             LEGACY + "\nPOINT_DATA 60000000000\nSCALARS a double\nLOOKUP_TABLE default\n1\n",
             FormatError,
             "expected struc",
         ),
-        (LEGACY.replace("0 1 2", "nan nan nan"), InputError, "at least one valid point"),
+        (LEGACY.replace("0 1 2", "nan nan nan"), InputError, "at least one valid point|that VTK reads"),
     ],
 )
 def test_a_legacy_file_that_lies_is_refused(tmp_path: Path, text: str, error: type[InputError], message: str) -> None:

@@ -26,6 +26,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 import lodestream as ls
 from lodestream.messages import MAX_CREDIT, Header, Layer, Open, Stop
 from lodestream_server import logs, running_server
+from lodestream_server.table import TABLE
 from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, push, raw_stream
 
 
@@ -110,6 +111,16 @@ def test_builds_uploads_and_errors_are_counted(http: httpx.Client, server: str) 
     with raw_stream(f"{server}/v1/surfaces/nothing") as stream, pytest.raises(ConnectionClosed):
         stream.until_end()
     assert grown(http, before, "lodestream_errors_total", "not-found") == 2
+
+
+def test_the_page_tells_of_every_figure_and_of_settings_that_there_are(http: httpx.Client) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "operating.md").read_text()
+    families = text_string_to_metric_families(http.get("/metrics").text)
+    there = {f"{family.name}_total" if family.type == "counter" else family.name for family in families}
+    told = set(re.findall(r"^\| `(lodestream_\w+)` \|", page, re.MULTILINE))
+    assert told == {name for name in there if name.startswith("lodestream_")}
+    variables = {setting.variable for setting in TABLE.values()} | {"LODESTREAM_TOKEN"}
+    assert set(re.findall(r"LODESTREAM_[A-Z_]+", page)) - variables == set()
 
 
 def test_strangers_cannot_make_figures(http: httpx.Client) -> None:

@@ -20,7 +20,7 @@ from .source import Source, number
 
 __all__ = ["read", "sniff"]
 
-_KEYWORD = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?=[\s#]|$)")
+_KEYWORD = re.compile(rb"(?:\s*#[^\n]*\n)*\s*(ST)?(C)?(N)?(4)?(n)?OFF(?=[\s#]|$)")
 _ROWS = 1 << 16
 
 #: A vertex is three numbers and a face four, each with a separator.
@@ -64,7 +64,7 @@ class _Lines:
         assert keyword is not None  # or it would not have been taken for OFF
         self.texture, self.colours, self.normals = (part is not None for part in keyword.groups()[:3])
         if keyword[4] or keyword[5]:
-            raise FormatError(f"expected OFF of three dimensions, got {keyword[0].decode('ascii').strip()}")
+            raise FormatError(f"expected OFF of three dimensions, got {keyword[0].split()[-1].decode('ascii')}")
         before = content[: keyword.end()].count(b"\n")
         texts = content[keyword.end() :].split(b"\n")
         del content

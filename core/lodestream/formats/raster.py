@@ -154,7 +154,7 @@ def _metadata(dataset: Any, band: int) -> dict[str, Any]:
 
 
 def _plain(nodata: float) -> int | float | str:
-    """Make the value one that JSON holds too, which has no NaN; ``float()`` takes it back."""
+    """Make the value one that MessagePack and JSON hold, which has no NaN; ``float()`` takes it back."""
     if not math.isfinite(nodata):
         return str(nodata)
-    return int(nodata) if nodata == int(nodata) else float(nodata)
+    return int(nodata) if abs(nodata) < 2**63 and nodata == int(nodata) else float(nodata)

@@ -21,6 +21,7 @@ MORE = "y, or y and z, each an array of the shape of the first, which is x then"
 
 _NUMBER = rb"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
 _LINE = re.compile(rb"[ \t]*" + _NUMBER + rb"(?:[ \t]*[,;\t ][ \t]*" + _NUMBER + rb")*[ \t,;]*", re.IGNORECASE)
+_HEAD = 4096  # bytes that are looked at to know a format
 _LONGEST_LINE = 64 << 20
 _MOST_FILES = 3
 
@@ -29,13 +30,11 @@ def sniff(head: bytes, suffix: str) -> bool:
     """Whether a file of such a suffix begins with a line of numbers, comments aside."""
     if suffix not in SUFFIXES:
         return False
-    lines = head.splitlines()
-    if len(head) >= 4096 and len(lines) > 1:
-        lines.pop()  # cut in the middle
-    for line in lines:
+    for line in head.splitlines():
         if line.strip() and not line.lstrip().startswith(b"#"):
-            # A line longer than the head may be cut within a number.
-            return _LINE.fullmatch(line if len(lines) > 1 else line.rpartition(b" ")[0] or line) is not None
+            if len(head) >= _HEAD and head.endswith(line):  # cut, perhaps within a number
+                line = re.split(rb"[ \t,;](?=[^ \t,;]*$)", line)[0]
+            return _LINE.fullmatch(line) is not None
     return False
 
 

@@ -57,7 +57,7 @@ def main(kind: str, path: str, budget: int) -> None:
             getattr(reader, f"ReadAll{name}On")()
     reader.Update()
     text = messages.GetOutput() or ""
-    if errors or "ERR|" in text or reader.GetErrorCode():
+    if errors or re.search(r"\bERR(OR)?\b|Error reading", text) or reader.GetErrorCode():
         code = vtkErrorCode.GetStringFromErrorCode(reader.GetErrorCode())
         unknown = "what it cannot read (links to other files are never followed)"
         reasons = (_first_message(text), code, unknown)
@@ -113,8 +113,8 @@ def _leaves(data: Any) -> Iterator[Any]:
 
 def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
     """Describe a grid; give its arrays, those of its points first."""
-    dims = [0, 0, 0]
-    data.GetDimensions(dims)
+    extent = data.GetExtent()
+    dims = [extent[axis + 1] - extent[axis] + 1 for axis in (0, 2, 4)]
     if data.IsA("vtkRectilinearGrid"):
         axes = (data.GetXCoordinates(), data.GetYCoordinates(), data.GetZCoordinates())
         named = [("axis", letter, vtk_to_numpy(axis)) for letter, axis in zip("ijk", axes, strict=True)]
@@ -150,7 +150,7 @@ def _first_message(text: str) -> str:
     """The words of the first error of VTK, without where in VTK it arose."""
     for line in text.splitlines():
         words = line.split("): ", 1)[-1].strip()
-        if words and not words.startswith(("ERROR:", "Warning:", "ERR|")):
+        if words and not words.startswith(("ERROR:", "Warning:", "Generic Warning:", "ERR|")):
             return re.sub(r" \(0x[0-9a-f]+\)", "", words)
     return ""
 

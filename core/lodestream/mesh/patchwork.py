@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from .halfedges import Corners, find_pieces, find_twins, find_umbrellas
+from .limits import check_pieces
 from .model import Mesh, name_faces
 from .poles import find_fans, find_poles, unfold
 from .polygons import Polygons
@@ -117,6 +118,7 @@ def _poles_and_pairs(
     corners, twins = polygons.corners, polygons.twins
     piece = np.empty(len(corners), np.int32)
     pieces = find_pieces(corners, twins, piece)
+    check_pieces(pieces, len(corners))
     triangle = corners[:, 3] < 0
     has_triangles = np.bincount(piece[triangle], minlength=pieces) > 0
     has_quads = np.bincount(piece[~triangle], minlength=pieces) > 0

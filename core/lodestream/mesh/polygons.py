@@ -79,22 +79,21 @@ def _fold(mesh: Mesh, attributes: NDArray[np.int32]) -> tuple[Corners, NDArray[n
     if not repeated.any():
         return corners, attributes, folded
     corners, attributes = corners.copy(), attributes.copy()
-    bad = []
-    for face in np.flatnonzero(repeated).tolist():
-        row = corners[face]
-        same = [k for k in range(4) if row[k] == row[(k + 1) % 4]]
-        if row[3] < 0 or len(same) != 1 or len(set(row.tolist())) != 3:
-            bad.append(face)
-            continue
-        around = np.roll(np.arange(4), -same[0])  # the repeated vertex twice, then the two others
-        corners[face] = (*row[around[1:]], -1)
-        attributes[:, face] = attributes[:, face][:, (*around[1:], around[0])]
-        folded[face] = True
-    if bad:
+    same = np.stack(pairs, axis=-1)
+    distinct = np.diff(np.sort(corners, axis=1), axis=1).astype(np.bool_).sum(axis=1) + 1
+    folded = (corners[:, 3] >= 0) & (same.sum(axis=1) == 1) & (distinct == 3)
+    bad = np.flatnonzero(repeated & ~folded)
+    if bad.size:
         raise FormatError(
             f"expected faces that name each vertex once (quads at a pole may name it twice in a row), got "
             f"{name_faces(mesh, bad)}: remove faces without area first"
         )
+    # The second mention of the vertex comes first, then the two others; the first mention is in the fourth place.
+    faces = np.flatnonzero(folded)
+    around = (same[faces].argmax(axis=1)[:, None] + np.arange(1, 5)) % 4
+    corners[faces] = corners[faces[:, None], around]
+    attributes[:, faces] = attributes[:, faces[:, None], around]
+    corners[faces, 3] = -1
     return corners, attributes, folded
 
 

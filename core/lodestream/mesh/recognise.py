@@ -17,6 +17,7 @@ from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, sh
 from .develop import Development, develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
+from .limits import LEAST_QUADS, MOST_BLOCKS, MOST_SMALL_BLOCKS, check_pieces
 from .model import Mesh, name_faces
 from .patchwork import Quads, make_quads
 from .polygons import Polygons, prepare
@@ -24,13 +25,6 @@ from .tearing import equal_rows, sort_attributes, tear
 from .weld import SIDES
 
 __all__ = ["Recognised", "RecognisedBlock", "recognise"]
-
-#: A mesh that has to be cut into blocks is refused when they have fewer quads than this on average.
-LEAST_QUADS = 9
-
-#: More blocks are refused, as are more than this many that are small.
-MOST_BLOCKS = 4096
-MOST_SMALL_BLOCKS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,18 +193,11 @@ class _Recognition:
             else:
                 uncut.append(number)
         if uncut:
-            grids += self._cut(laid, np.isin(laid.piece, uncut))
+            grids += self._cut(laid, runs, np.isin(laid.piece, uncut))
         return sorted(grids, key=_first_face)
 
     def _check_count(self, count: int) -> None:
-        quads = len(self.quads.corners)
-        most_small = 1 if self.seams else MOST_SMALL_BLOCKS
-        if count > MOST_BLOCKS or (count > most_small and quads < LEAST_QUADS * count):
-            raise FormatError(
-                f"expected at most {MOST_BLOCKS:,} connected pieces, and of more than {most_small} pieces "
-                f"{LEAST_QUADS} quads in each on average, got {count:,} pieces of {quads:,} quads in all"
-                f"{self._seam_words()}: weld vertices at the same place first"
-            )
+        check_pieces(count, len(self.quads.corners), 1 if self.seams else MOST_SMALL_BLOCKS, self._seam_words())
 
     def _seam_words(self) -> str:
         return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
@@ -229,25 +216,26 @@ class _Recognition:
         corners = self.quads.corners.reshape(-1)
         return (grid.corners >= 0) & (corners[grid.corners] >= len(self.mesh.vertices))
 
-    def _starts(self, laid: Development, chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+    def _starts(self, laid: Development, runs: list[NDArray[np.int64]], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
         """Half-edges from which to cut the pieces of the chosen faces."""
         halves = np.repeat(chosen, 4) & (self.twins >= 0)
         starts = [np.flatnonzero(halves & irregular(self.valence)[self.umbrella])]
-        has_start = np.bincount(laid.piece[starts[0] >> 2], minlength=len(laid.turns)) > 0
+        has_start = np.bincount(laid.piece[starts[0] >> 2], minlength=len(runs)) > 0
         for number in np.unique(laid.piece[chosen & ~has_start[laid.piece]]).tolist():
             # A torus that winds, so that it is no torus of rows and columns: along the shorter line it is cut open.
             a, b, d = (int(value) for value in laid.periods[number])
-            along_rows = d <= a * d // gcd(b, d)
-            inside = np.flatnonzero(halves & np.repeat(laid.piece == number, 4))
-            inside = inside[(laid.heading[inside >> 2] + (inside & 3)) % 2 == (0 if along_rows else 1)]
-            starts.append(inside[self.vertex[inside].argmin()][None])
+            along_rows = d > 0 and d <= a * d // gcd(b, d)
+            inside = (4 * runs[number][:, None] + np.arange(4)).reshape(-1)
+            inside = inside[halves[inside] & ((laid.heading[inside >> 2] + inside) % 2 == (0 if along_rows else 1))]
+            if inside.size:
+                starts.append(inside[self.vertex[inside].argmin()][None])
         return np.concatenate(starts).astype(np.int32)
 
-    def _cut(self, laid: Development, chosen: NDArray[np.bool_]) -> list[Grid]:
+    def _cut(self, laid: Development, runs: list[NDArray[np.int64]], chosen: NDArray[np.bool_]) -> list[Grid]:
         """Cut the pieces of the chosen faces into blocks."""
         corners = self.quads.corners
         wrong = irregular(self.valence)
-        starts = self._starts(laid, chosen)
+        starts = self._starts(laid, runs, chosen)
         piece = np.empty(len(corners), np.int32)
         best: tuple[int, NDArray[np.int32]] | None = None
         for whole in (True, False):

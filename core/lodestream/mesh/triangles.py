@@ -17,6 +17,9 @@ __all__ = ["Pairing", "pair_in_order", "pair_triangles"]
 #: diagonals.
 _AXES = np.array([[[1, 1], [-1, 0]], [[0, 1], [-1, -1]], [[-1, 0], [0, -1]]])
 
+#: Poles that are none cut a mesh into more pieces than are looked at one by one.
+_MOST_PIECES = 1 << 14
+
 #: Mean lengths that differ by less decide nothing.
 _EQUAL_LENGTHS = 1e-9
 
@@ -95,6 +98,8 @@ def pair_triangles(corners: Corners, twins: NDArray[np.int32], points: NDArray[n
     """
     laid = develop_triangles(corners, twins)
     pieces = len(laid.turns)
+    if pieces > _MOST_PIECES:
+        return Pairing(np.zeros(0, np.int32), np.ones(len(corners), np.bool_), ())
     low = np.full((pieces, 3, 2), np.iinfo(np.int64).max)
     high = np.full((pieces, 3, 2), np.iinfo(np.int64).min)
     single = np.zeros((pieces, 3), np.int64)

@@ -1,0 +1,13 @@
+"""Kill -9 at random moments: what was acknowledged is there, bit for bit, and nothing is half there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.torture import kills
+
+
+def test_a_server_that_is_killed_again_and_again(tmp_path: Path) -> None:
+    done = kills.run(tmp_path, 5, longest=1.5)
+    assert done.servers == 5
+    assert done.uploads > 0
