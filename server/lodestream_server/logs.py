@@ -77,6 +77,10 @@ class _Text(logging.Formatter):
         pairs = "".join(f" {key}={_value(value)}" for key, value in _fields(record).items() if value is not None)
         return _line(super().formatMessage(record)) + pairs
 
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - the library's name
+        # Indented, so that nothing in it looks like a line of its own.
+        return "\n".join(f"    {_line(line)}" for line in super().formatException(ei).splitlines())
+
 
 class _Json(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:

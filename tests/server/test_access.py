@@ -444,6 +444,14 @@ def test_a_ticket_that_is_too_old_is_refused(tmp_path: Path) -> None:
             assert refused(stream) == "bad-message"
 
 
+def test_without_tokens_a_stream_with_a_forged_host_needs_one(server: str) -> None:
+    address = urlsplit(server)
+    connection = socket.create_connection((address.hostname, address.port), timeout=60)
+    with raw_stream(f"http://example.org:{address.port}/v1/surfaces/{'0' * 20}", sock=connection) as stream:
+        stream.send(Open())
+        assert refused(stream) == "no-token"
+
+
 @pytest.mark.parametrize("name", ["X-Forwarded-For", "Forwarded"])
 def test_without_tokens_a_stream_through_a_proxy_needs_one(server: str, name: str) -> None:
     address = server + "/v1/surfaces/" + "0" * 20

@@ -188,12 +188,15 @@ def test_lines_are_lines_whatever_strangers_say() -> None:
 def test_an_error_keeps_its_traceback() -> None:
     def say(log: logging.Logger) -> None:
         try:
-            raise ZeroDivisionError("here")
+            raise ZeroDivisionError("here\n2026-01-01 ERROR forged\x1b[2J")
         except ZeroDivisionError:
             log.exception("failed")
 
     log = logging.getLogger("tests.server.errors")
-    assert "ZeroDivisionError: here" in formatted("text", log, say)
+    first, *rest = formatted("text", log, say).splitlines()
+    assert first.endswith("ERROR tests.server.errors: failed")
+    assert all(line.startswith("    ") and line.isprintable() for line in rest)
+    assert "    ZeroDivisionError: here" in rest
     assert "ZeroDivisionError: here" in json.loads(formatted("json", log, say))["error"]
 
 
