@@ -10,7 +10,6 @@ the difference that it had.
 
 from __future__ import annotations
 
-import zlib
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,11 @@ from numpy.typing import NDArray
 from .binary_coder import INDEX, WIDEST, code_bit, finish, start
 from .errors import CorruptStreamError
 from .kernels import inlined, kernel
+from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["decode_piece", "difference", "encode_piece", "restore"]
+__all__ = ["decode_piece", "encode_piece"]
 
-_RAW, _PATTERNS, _DECIMALS = range(3)
+_RAW, _PATTERNS, _DECIMALS, _OFFSETS = range(4)
 _MOST_DECIMALS = 15
 _LARGEST_WHOLE = 2.0**53
 #: Values that are on no line near the others, NaN and infinity, are told by their place in a list.
@@ -52,13 +52,15 @@ _SPREAD = 0x9E3779B97F4A7C15 - (1 << 64)
 _Ints = NDArray[np.int64]
 
 
-def encode_piece(original: NDArray[Any], restored: NDArray[Any]) -> bytes:
+def encode_piece(original: NDArray[Any], restored: NDArray[Any], step: float | None = None) -> bytes:
     """What turns restored values into the original ones.
 
     Parameters
     ----------
     original, restored : integers or floats, shape (value,), of one dtype
         ``restored`` is finite.
+    step : float, optional
+        Of the lattice that restores; needed where it is one of `lattice.offset_lattice`.
 
     Returns
     -------
@@ -78,6 +80,8 @@ def encode_piece(original: NDArray[Any], restored: NDArray[Any]) -> bytes:
         places = _decimal_places(original[usual])
         if places is not None:
             candidates.append(_encoded(_DECIMALS, places, original, restored, specials))
+    if step is not None and not specials.size and have_offsets(original, restored, step):
+        candidates += _with_offsets(original, restored, step)
     return min(candidates, key=len)
 
 
@@ -98,8 +102,10 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
             raise CorruptStreamError(f"expected {restored.nbytes} bytes of values, got {len(data) - 1}", offset + 1)
         return np.frombuffer(data, unsigned, offset=1).astype(unsigned.newbyteorder("=")).view(dtype)
     rule, argument = data[0] & 3, data[0] >> 2
+    if rule == _OFFSETS:
+        return _decoded_offsets(restored, data, argument, offset)
     limit = 8 * dtype.itemsize - 1 if rule == _PATTERNS else _MOST_DECIMALS
-    if rule > _DECIMALS or argument > limit or (rule == _DECIMALS and dtype.kind != "f"):
+    if argument > limit or (rule == _DECIMALS and dtype.kind != "f"):
         raise CorruptStreamError(f"expected a rule of exactness for {dtype} values, got {data[0]}", offset)
     packed = int.from_bytes(data[1:3], "little")
     most, count = packed & 4095, packed >> 12
@@ -144,6 +150,30 @@ def _encoded(rule: int, argument: int, original: NDArray[Any], restored: NDArray
     head = bytes([rule | argument << 2]) + (most | specials.size << 12).to_bytes(2, "little")
     listed = specials.astype(specials.dtype.newbyteorder("<")).tobytes()
     return head + listed + _written_length(length) + coded[:length].tobytes() + stored[:size].tobytes()
+
+
+def _with_offsets(original: NDArray[Any], restored: NDArray[Any], step: float) -> list[bytes]:
+    places = places_of(original)
+    bits = int(np.abs(places - places_of(restored)).max()).bit_length() + 1
+    if bits > MOST_BITS:
+        return []
+    # A value takes at most 45 decisions of 11 bits.
+    data = np.empty(64 + 64 * original.size, np.uint8)
+    length = code_offsets(False, restored, step, bits, places, data)
+    return [bytes([_OFFSETS | bits << 2]) + np.array(step, "<f8").tobytes() + data[:length].tobytes()]
+
+
+def _decoded_offsets(restored: NDArray[Any], data: bytes, bits: int, offset: int) -> NDArray[Any]:
+    if restored.dtype != np.float32 or bits > MOST_BITS or len(data) < 9:
+        raise CorruptStreamError(f"expected a rule of exactness for {restored.dtype} values, got {data[0]}", offset)
+    step = float(np.frombuffer(data, "<f8", 1, 1)[0])
+    if not (np.isfinite(step) and step > 0):
+        raise CorruptStreamError(f"expected a step above 0, got {step}", offset + 1)
+    places = np.zeros(restored.size, np.int64)
+    read = code_offsets(True, restored, step, bits, places, np.frombuffer(data[9:], np.uint8).copy())
+    if len(data) - 9 > read:
+        raise CorruptStreamError(f"expected at most {9 + read} bytes of exactness, got {len(data)}", offset + 9 + read)
+    return values_at(places)
 
 
 def _written_length(length: int) -> bytes:
@@ -402,60 +432,3 @@ def _code(
         stored[at & INDEX] = queue & 255
         at += 1
     return place if decoding else finish(low, width, place, data), at
-
-
-def _ordered(values: NDArray[Any]) -> NDArray[Any]:
-    """Bit patterns as unsigned integers in the order of the values; a copy."""
-    unsigned = np.dtype(f"u{values.dtype.itemsize}")
-    bits = values.view(unsigned).copy()
-    if values.dtype.kind == "f":
-        sign = unsigned.type(1 << (8 * values.dtype.itemsize - 1))
-        negative = (bits & sign) != 0
-        bits = np.where(negative, ~bits, bits | sign)
-    return bits
-
-
-def _from_ordered(bits: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    if dtype.kind == "f":
-        sign = bits.dtype.type(1 << (8 * dtype.itemsize - 1))
-        bits = np.where((bits & sign) != 0, bits & ~sign, ~bits)
-    return bits.view(dtype)
-
-
-def difference(original: NDArray[Any], restored: NDArray[Any]) -> bytes:
-    """What turns ``restored`` into ``original`` (same shape and dtype); empty when they agree bit for bit."""
-    unsigned = np.dtype(f"u{original.dtype.itemsize}")
-    original, restored = np.ascontiguousarray(original), np.ascontiguousarray(restored)
-    if np.array_equal(original.view(unsigned), restored.view(unsigned)):
-        return b""
-    delta = _ordered(original) - _ordered(restored)
-    signed = delta.view(f"i{delta.dtype.itemsize}")
-    bits = 8 * delta.dtype.itemsize
-    folded = (delta << delta.dtype.type(1)) ^ (signed >> (bits - 1)).view(delta.dtype)
-    planes = folded.astype(folded.dtype.newbyteorder("<")).reshape(-1, 1).view(np.uint8).T
-    return zlib.compress(np.ascontiguousarray(planes).tobytes(), 6)
-
-
-def restore(restored: NDArray[Any], payload: bytes, offset: int) -> NDArray[Any]:
-    """Undo `difference`.
-
-    Raises
-    ------
-    CorruptStreamError
-        When the payload, which stands at ``offset`` of the container, does not hold one difference for each value.
-    """
-    expected = restored.size * restored.dtype.itemsize
-    inflater = zlib.decompressobj()
-    try:
-        data = inflater.decompress(payload, expected + 1)
-    except zlib.error as error:
-        raise CorruptStreamError(f"the exactness section does not decompress: {error}", offset) from None
-    if len(data) != expected:
-        raise CorruptStreamError(f"expected {expected} bytes of exactness, got {len(data)} or more", offset)
-    planes = np.frombuffer(data, np.uint8).reshape(restored.dtype.itemsize, -1)
-    unsigned = np.dtype(f"<u{restored.dtype.itemsize}")
-    folded = np.ascontiguousarray(planes.T).view(unsigned).ravel().astype(unsigned.newbyteorder("="))
-    one = folded.dtype.type(1)
-    delta = (folded >> one) ^ (~(folded & one) + one)
-    bits = _ordered(np.ascontiguousarray(restored)).ravel() + delta
-    return _from_ordered(bits, restored.dtype).reshape(restored.shape)

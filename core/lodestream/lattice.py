@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LATTICE_BITS", "Lattice", "find_lattice", "precision_lattice"]
+__all__ = ["LATTICE_BITS", "Lattice", "find_lattice", "offset_lattice", "precision_lattice"]
 
 #: Lattice coordinates of valid values are below two to this power in magnitude.
 LATTICE_BITS = 24
@@ -26,6 +26,10 @@ _MOST_DECIMALS = 9
 #: Values that were computed from coded integers, 0.1 k or -10000 + 0.1 k (Mapbox's terrain), are no rounded decimals.
 _CODED_ORIGINS = (0.0, -10000.0)
 _SAMPLE = 4096
+#: Share of the differences that a step must divide to count, differences that propose one, and metres in a foot.
+_MOST = 0.7
+_SEEN = 64
+_FOOT = 0.3048
 _STRIP = 1 << 15  # values worked on together, so that what is in between stays in the cache
 
 
@@ -180,6 +184,54 @@ def _checked(flat: NDArray[Any], lattice: Lattice) -> Lattice | None:
         if not np.array_equal(lattice.values(lattice.coordinates(values), flat.dtype), values):
             return None
     return lattice
+
+
+def offset_lattice(values: NDArray[Any]) -> Lattice | None:
+    """A lattice off which float32 values, shape (row, column), lie by as much as their neighbours do, or None.
+
+    Its step divides most differences of neighbours in a row, but for their rounding. Lossy compressors that quantise
+    blocks of a raster leave such values: the lattice does not restore them, but `exactness` finds the offsets.
+    """
+    if values.dtype != np.float32 or values.ndim != 2 or values.shape[1] < 2:
+        return None
+    low, high = float(values.min()), float(values.max())
+    stride = max(1, values.size // (16 * _SAMPLE))
+    rows = values[:: min(stride, max(1, values.shape[0] // 8))].astype(np.float64)
+    differences = np.diff(rows, axis=1).ravel()
+    differences = differences[:: max(1, differences.size // (16 * _SAMPLE))]
+    tolerance = 2 * float(np.spacing(np.float32(max(abs(low), abs(high)))))
+    moved = np.abs(differences[np.abs(differences) > 64 * tolerance])
+    if 2 * moved.size < differences.size:
+        return None
+    for step in _spacings(moved, 64 * tolerance):
+        share = _share(moved, step, tolerance)
+        if (high - low) / step < 2**LATTICE_BITS - 4 and share > _MOST:
+            short = float(f"{step:.5g}")
+            step = short if _share(moved, short, tolerance) >= share else step
+            return _centred("affine", float(np.rint(low / step)) * step, step, int((high - low) / step) + 1)
+    return None
+
+
+def _spacings(moved: NDArray[np.float64], least: float) -> list[float]:
+    """Steps to be tried, the largest first: round numbers, and what small differences say."""
+    round_ones = [m * 10.0**k * unit for k in range(-9, 4) for m in (1.0, 2.0, 2.5, 5.0) for unit in (1.0, _FOOT)]
+    seen = []
+    for first in np.sort(moved)[:: max(1, moved.size // _SEEN)]:
+        step = float(first)
+        for reach in (2, 8, 32, 128, 512):
+            near = moved[moved < reach * step]
+            times = np.rint(near / step)
+            whole = np.abs(near - times * step) < max(least / 16, 0.2 * step / reach)
+            if (times * whole).any():
+                step = float((near * times)[whole].sum() / (times * times)[whole].sum())
+        seen.append(step)
+    return sorted((step for step in {*round_ones, *seen} if least <= step <= moved.max()), reverse=True)
+
+
+def _share(differences: NDArray[np.float64], step: float, tolerance: float) -> float:
+    """How many of the differences are whole multiples of a step."""
+    off = np.abs(differences - np.rint(differences / step) * step)
+    return float((off <= tolerance).mean())
 
 
 def precision_lattice(low: float, high: float, step: float) -> Lattice:

@@ -11,7 +11,12 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from lodestream.errors import CorruptStreamError
-from lodestream.exactness import difference, restore
+from lodestream.exactness import decode_piece, encode_piece
+from lodestream.lattice import offset_lattice
+
+from .coding import uncompiled
+
+Values = NDArray[Any]
 
 DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
 
@@ -22,71 +27,201 @@ def assert_same_bits(a: NDArray[Any], b: NDArray[Any]) -> None:
     assert a.tobytes() == b.tobytes()
 
 
+def normal(dtype: str, count: int = 5000) -> Values:
+    return np.random.default_rng(0).normal(size=count).astype(dtype)
+
+
+def on_lattice(values: Values, step: float) -> Values:
+    """What a lattice of this step restores."""
+    return np.asarray((np.rint(values.astype(np.float64) / step) * step).astype(values.dtype))
+
+
+def assert_comes_back(original: Values, restored: Values) -> bytes:
+    data = encode_piece(original, restored)
+    assert len(data) <= original.nbytes + 1
+    assert_same_bits(decode_piece(restored, data, 0), original)
+    return data
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @given(data=st.data())
 def test_any_values_restore_any_others(dtype: str, data: st.DataObject) -> None:
     kind = np.dtype(dtype)
-    elements = (
-        st.integers(int(np.iinfo(kind).min), int(np.iinfo(kind).max))
-        if kind.kind in "iu"
-        else st.floats(allow_nan=False, allow_infinity=False, width=32 if kind.itemsize == 4 else 64)
-    )
-    original, picture = (data.draw(arrays.arrays(kind, (3, 5), elements=elements)) for _ in range(2))
-    payload = difference(original, picture)
-    assert_same_bits(restore(picture, payload, 0) if payload else picture, original)
+    if kind.kind in "iu":
+        integers = st.integers(int(np.iinfo(kind).min), int(np.iinfo(kind).max))
+        original, restored = (data.draw(arrays.arrays(kind, 30, elements=integers)) for _ in range(2))
+    else:
+        finite = st.floats(allow_nan=False, allow_infinity=False, width=32 if kind.itemsize == 4 else 64)
+        # Patterns rather than values: every NaN is one of its own.
+        original = data.draw(arrays.arrays(f"u{kind.itemsize}", 30)).view(kind)
+        restored = data.draw(arrays.arrays(kind, 30, elements=finite))
+    assert_comes_back(original, restored)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_signed_zeros_subnormals_and_extremes_come_back(dtype: str) -> None:
+def test_what_is_no_usual_number_comes_back(dtype: str) -> None:
     info = np.finfo(dtype)
-    extremes = [0.0, -0.0, info.tiny, -info.tiny, info.smallest_subnormal, -info.smallest_subnormal, info.max, info.min]
-    original = np.array([extremes, extremes[::-1]], dtype)
-    for picture in (np.zeros_like(original), original[::-1].copy(), np.full_like(original, -1e30)):
-        assert_same_bits(restore(picture, difference(original, picture), 0), original)
+    zeros = [0.0, -0.0, info.tiny, -info.tiny, info.smallest_subnormal, -info.smallest_subnormal]
+    original = np.array([*zeros, info.max, info.min, np.nan, -np.nan, np.inf, -np.inf] * 3, dtype)
+    for restored in (np.zeros_like(original), np.full_like(original, -1e30), np.full_like(original, info.max)):
+        assert_comes_back(original, restored)
+
+
+def test_many_kinds_of_nan_come_back() -> None:
+    original = (np.arange(100, dtype=np.uint32) + np.uint32(0x7FC00000)).view(np.float32)
+    assert_comes_back(original, np.zeros(100, np.float32))
 
 
 @pytest.mark.parametrize("dtype", ["int64", "uint64"])
 def test_the_extremes_of_64_bits_come_back(dtype: str) -> None:
     limits = np.iinfo(dtype)
-    original = np.array([[limits.min, limits.max, 0, 1]], dtype)
-    assert_same_bits(restore(original[:, ::-1], difference(original, original[:, ::-1]), 0), original)
+    original = np.array([limits.min, limits.max, 0, 1] * 10, dtype)
+    assert_comes_back(original, original[::-1])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_equal_values_need_nothing(dtype: str) -> None:
-    values = np.arange(12).reshape(3, 4).astype(dtype)
-    assert difference(values, values.copy()) == b""
+    values = np.arange(12).astype(dtype)
+    assert encode_piece(values, values.copy()) == b""
+    assert_same_bits(decode_piece(values, b"", 0), values)
 
 
 def test_a_negative_zero_needs_something() -> None:
-    assert difference(np.array([[-0.0]]), np.array([[0.0]]))
+    assert encode_piece(np.array([-0.0]), np.array([0.0]))
 
 
-def test_near_values_take_fewer_bytes_than_far_ones() -> None:
-    original = np.random.default_rng(0).normal(size=(100, 100)).astype(np.float32)
-    near = np.nextafter(original, np.float32(0))
-    far = original + np.float32(1)
-    assert len(difference(original, near)) < 0.1 * original.nbytes < len(difference(original, far))
+@pytest.mark.parametrize(("dtype", "step"), [("float32", 2.0**-18), ("float32", 1e-5), ("float64", 2.0**-18)])
+def test_noise_costs_little_more_than_its_bits(dtype: str, step: float) -> None:
+    values = normal(dtype, 60000)
+    spacing = np.spacing(np.abs(values)).astype(np.float64)
+    bits = float(np.log2(np.maximum(step / spacing, 1.0)).sum())
+    assert len(assert_comes_back(values, on_lattice(values, step))) < 1.01 * bits / 8 + 0.06 * values.size
+
+
+def planes(original: Values, restored: Values) -> int:
+    """Bytes of what a general compressor makes of the differences, the least significant bytes first."""
+    kind = f"u{original.dtype.itemsize}"
+    delta = (original.view(kind) - restored.view(kind)).reshape(-1, 1).view(np.uint8)
+    return len(zlib.compress(np.ascontiguousarray(delta.T).tobytes(), 9))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_noise_costs_less_than_a_general_compressor_needs(dtype: str) -> None:
+    values = normal(dtype, 20000)
+    restored = on_lattice(values, 2.0**-17)
+    assert len(encode_piece(values, restored)) < 0.95 * planes(values, restored)
+
+
+def test_zeros_at_the_end_of_all_patterns_cost_nothing() -> None:
+    single, restored = normal("float32"), on_lattice(normal("float32"), 1e-5)
+    double = assert_comes_back(single.astype(np.float64), on_lattice(single.astype(np.float64), 1e-5))
+    assert len(double) < 1.02 * len(encode_piece(single, restored)) + 20
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_decimals_cost_what_their_places_do(dtype: str) -> None:
+    values = np.round(np.random.default_rng(3).random(10000) * (100 if dtype == "float64" else 10), 6).astype(dtype)
+    assert len(assert_comes_back(values, on_lattice(values, 64e-6))) < 10000 * 6.3 / 8
+
+
+def test_values_that_repeat_cost_next_to_nothing() -> None:
+    values = np.tile(normal("float32", 500), 40)
+    assert len(assert_comes_back(values, on_lattice(values, 1e-4))) < 500 * 4 + values.size * 0.02
+
+
+def test_a_few_holes_in_an_attribute_cost_little() -> None:
+    values = normal("float32", 20000)
+    restored = on_lattice(values, 1e-5)
+    usual = len(encode_piece(values, restored))
+    values[300:400] = np.nan
+    assert len(assert_comes_back(values, restored)) < usual + 40
 
 
 def test_arrays_need_not_be_contiguous() -> None:
-    values = np.random.default_rng(1).normal(size=(6, 8, 3))
-    original, picture = values[::2, ::-1], values[1::2] + 1
-    assert_same_bits(restore(picture, difference(original, picture), 0), np.ascontiguousarray(original))
+    values = normal("float64", 300)
+    assert_comes_back(values[::3], values[1::3])
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"",
-        b"not compressed",
-        zlib.compress(bytes(47)),
-        zlib.compress(bytes(49)),
-        zlib.compress(bytes(48))[:-6],
-        zlib.compress(bytes(50_000_000)),
-    ],
+def blocks(shape: tuple[int, int], step: float, seed: int) -> Values:
+    """Terrain on a lattice, each 8 x 8 of it off by as much."""
+    rng = np.random.default_rng(seed)
+    steps = np.rint(np.cumsum(rng.normal(size=shape), 1) * 5)
+    offsets = np.repeat(np.repeat(rng.random((-(-shape[0] // 8), -(-shape[1] // 8))), 8, 0), 8, 1)
+    return (steps * step + offsets[: shape[0], : shape[1]] * step + 20).astype(np.float32)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.3048, 7.0])
+def test_offsets_that_repeat_cost_little(step: float) -> None:
+    values = blocks((128, 128), step, 1)
+    lattice = offset_lattice(values)
+    assert lattice is not None
+    assert lattice.step == pytest.approx(step, rel=1e-6)
+    restored = lattice.values(lattice.coordinates(values), values.dtype).ravel()
+    data = encode_piece(values.ravel(), restored, lattice.step)
+    assert_same_bits(decode_piece(restored, data, 0), values.ravel())
+    assert len(data) < 0.35 * len(encode_piece(values.ravel(), restored))
+    for cut in range(9, len(data), 97):
+        assert decode_piece(restored, data[:cut], 0).shape == restored.shape
+    with pytest.raises(CorruptStreamError, match="at most"):
+        decode_piece(restored, data + bytes(9), 0)
+
+
+def test_a_step_without_offsets_changes_nothing() -> None:
+    values = normal("float32")
+    restored = on_lattice(values, 1e-4)
+    assert encode_piece(values, restored, 1e-4) == encode_piece(values, restored)
+
+
+@given(
+    data=st.binary(max_size=200),
+    rule=st.sampled_from([0, 1, 2, 3, 1 | 29 << 2, 2 | 6 << 2, 3 | 20 << 2]),
+    dtype=st.sampled_from(DTYPES),
 )
-def test_a_payload_that_does_not_fit_is_corrupt(payload: bytes) -> None:
-    with pytest.raises(CorruptStreamError, match="exactness") as caught:
-        restore(np.zeros((2, 3)), payload, 77)
-    assert caught.value.offset == 77
+def test_any_bytes_are_values_or_refused(data: bytes, rule: int, dtype: str) -> None:
+    restored = normal("float64", 40).astype(dtype)
+    payload = bytes([rule]) + data
+    try:
+        values = decode_piece(restored, payload, 1000)
+    except CorruptStreamError as error:
+        values, offset = restored, error.offset
+    else:
+        offset = 1000
+    assert values.shape == restored.shape
+    assert values.dtype == restored.dtype
+    assert offset is not None
+    assert 1000 <= offset <= 1000 + len(payload)
+
+
+def test_every_prefix_is_refused() -> None:
+    values = normal("float32", 500)
+    restored = on_lattice(values, 1e-4)
+    data = encode_piece(values, restored)
+    for cut in range(1, len(data)):
+        with pytest.raises(CorruptStreamError):
+            decode_piece(restored, data[:cut], 0)
+    with pytest.raises(CorruptStreamError, match="lower bits"):
+        decode_piece(restored, data + b"\0", 0)
+
+
+def samples() -> list[tuple[Values, Values]]:
+    """Originals and what a lattice restores of them."""
+    wide = (normal("float64", 300) * 1e9).astype(np.int64)
+    floats = [normal(dtype, 300) for dtype in ("float32", "float64")]
+    heights = blocks((16, 16), 0.02, 2).ravel()
+    return [
+        (wide, wide // 1000 * 1000),
+        (heights, on_lattice(heights, 0.02)),
+        *((values, on_lattice(values, 1e-4)) for values in floats),
+    ]
+
+
+def test_the_compiled_coder_does_what_the_plain_one_does() -> None:
+    script = (
+        "from lodestream.exactness import decode_piece, encode_piece\n"
+        "from tests.core.test_exactness import samples\n"
+        "for values, restored in samples():\n"
+        "    data = encode_piece(values, restored, 0.02)\n"
+        "    assert decode_piece(restored, data, 0).tobytes() == values.tobytes()\n"
+        "    print(data.hex())"
+    )
+    assert uncompiled(script).split() == [encode_piece(*sample, 0.02).hex() for sample in samples()]

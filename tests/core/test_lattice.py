@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream.lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice, to_dtype
+from lodestream.lattice import LATTICE_BITS, Lattice, find_lattice, offset_lattice, precision_lattice, to_dtype
 
 INTEGERS = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"]
 
@@ -182,3 +182,24 @@ def test_values_computed_from_coded_integers_are_found(dtype: type[np.floating[A
     lattice = find_lattice(values)
     assert lattice is not None
     assert lattice.values(lattice.coordinates(values), values.dtype).tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int16"])
+def test_noise_has_no_lattice_with_offsets(dtype: str) -> None:
+    values = (100 * np.random.default_rng(7).normal(size=(60, 80))).astype(dtype)
+    assert offset_lattice(values) is None
+
+
+def test_lattices_with_offsets_are_found_at_any_scale() -> None:
+    rng = np.random.default_rng(8)
+    steps = np.cumsum(rng.integers(-9, 10, (64, 64)), 1)
+    offsets = np.repeat(np.repeat(rng.random((8, 8)), 8, 0), 8, 1)
+    for step in (1e-9, 0.005, 0.3048, 1.2345, 1e7):
+        lattice = offset_lattice(((steps + offsets) * step).astype(np.float32))
+        assert lattice is not None
+        assert lattice.step == pytest.approx(step, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (5, 1), (3, 3)])
+def test_small_and_flat_surfaces_have_no_lattice_with_offsets(shape: tuple[int, int]) -> None:
+    assert offset_lattice(np.zeros(shape, np.float32)) is None
