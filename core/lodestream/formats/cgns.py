@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from ..errors import FormatError
 from ..surface import Surface
 from . import planes
-from .source import Source
+from .source import Source, number
 from .vtk_grids import Reading, read_grids
 
 __all__ = ["OPTIONS", "read", "sniff"]
@@ -18,6 +19,10 @@ OPTIONS: Mapping[str, str] = {"plane": planes.HELP}
 
 _ADF = b"ADF Database Version"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+
+#: Two places in the header of ADF, each a block of 4096 bytes and an offset into it: the root, and the end of the file.
+_ENDS = re.compile(rb"AdF4[0-9A-Fa-f]{12}([0-9A-Fa-f]{8})([0-9A-Fa-f]{4})")
+_ADF_BLOCK = 4096
 
 #: A node of ADF begins with this tag; its type stands so many bytes after it, and that of a link is LK.
 _NODE, _TYPE, _LINK = b"NoDe", 96, b"LK"
@@ -30,19 +35,26 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 def read(source: Source) -> Surface:
     """Read the structured zones of a file as blocks, with what is stored at their vertices as attributes."""
-    if _has_links(source):
-        raise FormatError("expected a CGNS file that is complete, got one with a link to another node or file")
+    _check_adf(source)
     return read_grids(source, "cgns", [Reading("cgns", source.path, 8 * source.size)])
 
 
-def _has_links(source: Source) -> bool:
-    content = np.memmap(source.path, np.uint8, "r")
-    if _ADF not in content[:64].tobytes():
-        return False  # VTK may open no second file, and HDF5 says so
-    raw = content.tobytes()
+def _check_adf(source: Source) -> None:
+    """Refuse what ADF would read as it is: a file that is cut short, or one with links.
+
+    HDF5 finds the first itself, and says no to the second because VTK may open no second file.
+    """
+    raw = np.memmap(source.path, np.uint8, "r").tobytes()
+    if _ADF not in raw[:64]:
+        return
+    ends = _ENDS.search(raw, 0, 512)
+    last = int(ends[1], 16) * _ADF_BLOCK + int(ends[2], 16) if ends else 0
+    if last >= len(raw):
+        raise FormatError(
+            f"expected a CGNS file of at least {number(last + 1)} bytes by its header, got {number(len(raw))}"
+        )
     place = raw.find(_NODE)
     while place >= 0:
-        if raw[place + _TYPE : place + _TYPE + 2] == _LINK:
-            return True
+        if raw[place + _TYPE : place + _TYPE + len(_LINK)] == _LINK:
+            raise FormatError("expected a CGNS file that is complete, got one with a link to another node or file")
         place = raw.find(_NODE, place + 1)
-    return False
