@@ -20,13 +20,13 @@ __all__ = ["MOST_BITS", "code_offsets", "have_offsets", "places_of", "values_at"
 
 #: Bits of a difference from the lattice that is no offset in the list.
 MOST_BITS = 34
-_LISTED = 32
+_LISTED = 64
 #: An offset in the list gives a value to within so many places.
 _CLOSE = 4
 # Contexts: is it the first of the list, by how many in turn were; is it in the list; which; how far off; new ones.
 _REST = 16
 _WHICH = _REST + 1
-_OFF = _WHICH + 32
+_OFF = _WHICH + _LISTED
 _NEW = _OFF + 2 * 8
 _CONTEXTS = _NEW + 16 + MOST_BITS
 _UNKNOWN = (1 << 27) | 1
@@ -147,11 +147,11 @@ def _code(
                 bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _REST)
                 if bit:
                     node, number = 1, rank
-                    for step in range(5):
-                        bit = (number >> (4 - step)) & 1
+                    for step in range(6):
+                        bit = (number >> (5 - step)) & 1
                         bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _WHICH + node)
                         node = 2 * node + bit
-                    rank = min(node & 31, listed - 1)
+                    rank = min(node & 63, listed - 1)
                 else:
                     rank = listed
         if rank < listed:
