@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["VALUES", "Rule", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
+__all__ = ["VALUES", "Rule", "along_rows", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
 
 Rule = list[Any]
 
@@ -70,7 +70,8 @@ def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule
     Returns
     -------
     list or None
-        One of the first four kinds of rules of the module; None where there is none, also where all are the same.
+        One of the first four kinds of rules of the module, the fourth running along the columns; None where there is
+        none, also where all are the same.
     """
     index = np.arange(len(line)) if known is None else np.flatnonzero(known)
     values = line[index]
@@ -81,6 +82,12 @@ def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule
         if all(_makes(rule, index[part], values[part]) for part in (sample, slice(None))):
             return [plain(number) for number in rule]
     return None
+
+
+def along_rows(rule: Rule) -> Rule:
+    """A rule of `fit_axis` for a coordinate that runs along the rows."""
+    general = len(rule) == 4 and rule[-1] is not True
+    return [rule[0], rule[2], rule[1], rule[3]] if general else rule
 
 
 def _makes(rule: Rule, index: NDArray[np.int64], values: NDArray[Any]) -> bool:

@@ -114,11 +114,13 @@ class View:
             When the complete surface is not the one that was encoded.
         """
         header = self._reconstruction.header
-        finest = level is None or level == header.levels
+        asked, finest = level is not None, level is None or level == header.levels
         level = header.levels if level is None else level
         if not 0 <= level <= header.levels:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
+        if asked:  # the grid of that level, without what a seam repeats
+            values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
         digest = self._digest.get(DIGEST)
         if not finest and self._wish.region is not None:
             raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .coordinate_rules import VALUES, Rule, bits, evaluate, fit_axis, neighbours, plain, rounded
+from .coordinate_rules import VALUES, Rule, along_rows, bits, evaluate, fit_axis, neighbours, plain, rounded
 from .errors import InputError
 from .georeference import has_gap, level_coordinates, level_geotransform
 from .seams import wrapped
 from .surface import Closed, Surface
 
-__all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz"]
+__all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz", "window_axes"]
 
 _STRIP = 1 << 18
 
@@ -137,13 +137,13 @@ def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rul
         rule = fit_axis(line, known)
         if rule is None:
             continue
+        if axis == 0:
+            rule = along_rows(rule)
         if axis == (0 if down else 1):
             return rule
         if len(rule) == 2:
             rule = [rule[0], rule[1], 0, 0] if axis == 1 else [rule[0], 0, rule[1], 0]
-        elif len(rule) == 4 and rule[-1] is not True:
-            rule = [rule[0], rule[2], rule[1], rule[3]]
-        else:
+        elif len(rule) != 4 or rule[-1] is True:
             continue
         return rule if _holds(rule, plane, mask, down) else None
     return _fit_plane(plane, mask, down)
@@ -254,6 +254,23 @@ def level_metadata(
     ]
     if any(nodes):
         result["nodes"] = nodes
+    return result
+
+
+def window_axes(axes: Any, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> dict[str, Any]:
+    """The ``axes`` of a window: the numbers themselves, from the first row and column to before the last.
+
+    Raises
+    ------
+    InputError
+        When these are no axes.
+    """
+    rules, _, swapped = _axes(axes)
+    result = dict(axes)
+    for name, rule, down in (("x", rules[0], swapped), ("y", rules[1], not swapped)):
+        place, still = np.arange(shape[0 if down else 1], dtype=np.float64), np.zeros((1, 1))
+        values = evaluate(rule, place[:, None] if down else still, still if down else place[None, :], down).ravel()
+        result[name] = [*values[slice(*(rows if down else columns))].tolist(), VALUES]
     return result
 
 

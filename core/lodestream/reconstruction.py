@@ -112,7 +112,7 @@ class Reconstruction:
         if corrected:
             self._correct(blocks)
         for block, mask in zip(blocks, level_masks(header.parts, header.layout, level, header.masks), strict=True):
-            if mask is not None:
+            if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
                 block.clear(~mask, header.hole)
         return blocks
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from .heights import window_axes
 from .surface import Surface
 from .target import Region
 
@@ -34,5 +35,7 @@ def window_of(surface: Surface, metadata: dict[str, Any], region: Region) -> tup
         x0, x_column, x_row, y0, y_column, y_row = transform
         x0, y0 = x0 + left * x_column + top * x_row, y0 + left * y_column + top * y_row
         values["geotransform"] = [x0, x_column, x_row, y0, y_column, y_row]
+    if "axes" in values:
+        values["axes"] = window_axes(values["axes"], block.shape, *region)
     window = Surface(block.points[place], (closed[0], closed[1]), mask=mask, attributes=attributes)
     return window, values

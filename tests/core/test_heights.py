@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream.axis import axis_lengths
-from lodestream.coordinate_rules import fit_axis
+from lodestream.coordinate_rules import along_rows, fit_axis
 from lodestream.errors import InputError
 from lodestream.georeference import has_gap, level_coordinates
-from lodestream.heights import coordinates, level_metadata, to_heights, to_xyz
+from lodestream.heights import coordinates, level_metadata, to_heights, to_xyz, window_axes
 from lodestream.levels import coarsen
 from lodestream.surface import Block, Surface
 
@@ -52,7 +52,7 @@ def xyz(x: Array, y: Array, dtype: Any = None) -> Array:
 
 
 @pytest.mark.parametrize("x", AXES)
-@pytest.mark.parametrize("y", ["downwards", "linspace", "float32 of anything"])
+@pytest.mark.parametrize("y", ["downwards", "linspace", "float32 of anything", "centres"])
 @pytest.mark.parametrize("n", [2, 3, 41, 300])
 def test_even_axes_are_left_out_and_made_again(x: str, y: str, n: int) -> None:
     across, down = AXES[x](n), AXES[y](17)
@@ -254,6 +254,20 @@ def test_coordinates_of_levels_are_those_of_coarsened_points(
             np.testing.assert_allclose(x, grid[..., 0])
             np.testing.assert_allclose(y, grid[..., 1])
             assert np.array_equal(to_xyz(Surface(grid[..., 2], metadata=metadata)).points[..., 2], grid[..., 2])
+
+
+@pytest.mark.parametrize("rows", ["y", "x"])
+@pytest.mark.parametrize("rule", ["linspace", "decimals", "centres", "metres"])
+def test_axes_of_windows_are_those_of_the_surface(rows: str, rule: str) -> None:
+    x, y = AXES[rule](12), AXES[rule](9)
+    axes: dict[str, Any] = {"x": [*x.tolist(), "values"], "y": along_rows(fit_axis(y) or [])}
+    shape = (9, 12)
+    if rows == "x":
+        axes, shape = {"x": along_rows(fit_axis(x) or []), "y": [*y.tolist(), "values"], "rows": "x"}, (12, 9)
+    window = window_axes(axes, shape, (2, 7), (1, 6))
+    whole = coordinates(Surface(np.zeros(shape), metadata={"axes": axes}))
+    for plane, part in zip(whole, coordinates(Surface(np.zeros((5, 5)), metadata={"axes": window})), strict=True):
+        assert np.ascontiguousarray(plane[2:7, 1:6]).tobytes() == part.tobytes()
 
 
 def test_metadata_of_levels_keep_the_rest_and_drop_the_seam() -> None:
