@@ -13,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import inlined, kernel
-from .halfedges import Corners, find_pieces
+from .halfedges import Corners
 
 __all__ = ["Development", "develop_quads", "develop_triangles"]
-
-#: What is wrong with a piece, as `Development.wrong` says.
-FITS, TURNS = 0, 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +71,26 @@ def _develop(
     piece: NDArray[np.int32],
     first: NDArray[np.int32],
     heading: NDArray[np.int8],
-    turns: NDArray[np.bool_],
-    periods: NDArray[np.int64],
-) -> None:
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Develop faces of so many sides, where turning at a corner goes on by ``len(rows) / sides`` directions."""
     faces = piece.size
     directions = rows.size
     step = directions // sides
     heading[:] = -1
     stack = np.empty(faces, np.int32)
+    turns = np.zeros(64, np.bool_)
+    periods = np.zeros((64, 3), np.int64)
+    number = 0
     for seed in range(faces):
         if heading[seed] >= 0:
             continue
+        if number == turns.size:
+            more_turns, more_periods = np.zeros(2 * number, np.bool_), np.zeros((2 * number, 3), np.int64)
+            more_turns[:number] = turns
+            more_periods[:number] = periods
+            turns, periods = more_turns, more_periods
         heading[seed] = 0
+        piece[seed] = number
         first[seed, 0] = 0
         first[seed, 1] = 0
         stack[0] = seed
@@ -109,15 +113,18 @@ def _develop(
                         v -= columns[(back + step * j) % directions]
                     if heading[other] < 0:
                         heading[other] = back
+                        piece[other] = number
                         first[other, 0] = u
                         first[other, 1] = v
                         stack[top] = other
                         top += 1
                     elif heading[other] != back:
-                        turns[piece[face]] = True
+                        turns[number] = True
                     elif first[other, 0] != u or first[other, 1] != v:
-                        _add_period(periods, piece[face], u - first[other, 0], v - first[other, 1])
+                        _add_period(periods, number, u - first[other, 0], v - first[other, 1])
                 way = (way + step) % directions
+        number += 1
+    return turns[:number], periods[:number]
 
 
 _QUAD_ROWS = np.array([0, 1, 0, -1])
@@ -141,10 +148,7 @@ def _laid_out(
 ) -> Development:
     faces = len(corners)
     piece = np.empty(faces, np.int32)
-    pieces = find_pieces(corners, twins, piece)
     first = np.empty((faces, 2), np.int32)
     heading = np.empty(faces, np.int8)
-    turns = np.zeros(pieces, np.bool_)
-    periods = np.zeros((pieces, 3), np.int64)
-    _develop(sides, rows, columns, twins, piece, first, heading, turns, periods)
+    turns, periods = _develop(sides, rows, columns, twins, piece, first, heading)
     return Development(piece, first, heading, turns, periods)

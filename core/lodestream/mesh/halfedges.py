@@ -177,28 +177,29 @@ def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertice
 
 
 @kernel
-def orient(
-    corners: Corners, twins: NDArray[np.int32], piece: NDArray[np.int32], pieces: int, turned: NDArray[np.bool_]
-) -> int:
+def orient(corners: Corners, twins: NDArray[np.int32], turned: NDArray[np.bool_]) -> int:
     """Find the faces to turn round so that all of a piece are wound alike: the fewer of the two possible sets.
 
     Fills `turned`, of shape (F,). Gives -1, or the first face at which a surface with only one side was noticed.
     """
     faces = corners.shape[0]
     seen = np.zeros(faces, np.bool_)
-    stack = np.empty(faces, np.int32)
-    balance = np.zeros(pieces, np.int64)
+    queue = np.empty(faces, np.int32)
+    end = 0
     for seed in range(faces):
         if seen[seed]:
             continue
         seen[seed] = True
         turned[seed] = False
-        stack[0] = seed
-        top = 1
-        while top > 0:
-            top -= 1
-            face = stack[top]
-            balance[piece[face]] += -1 if turned[face] else 1
+        begin = end
+        queue[end] = seed
+        end += 1
+        place = begin
+        balance = 0
+        while place < end:
+            face = queue[place]
+            place += 1
+            balance += -1 if turned[face] else 1
             for k in range(4):
                 twin = twins[4 * face + k]
                 if twin < 0:
@@ -208,13 +209,13 @@ def orient(
                 if not seen[other]:
                     seen[other] = True
                     turned[other] = turned[face] != same
-                    stack[top] = other
-                    top += 1
+                    queue[end] = other
+                    end += 1
                 elif turned[other] != (turned[face] != same):
                     return int(face)
-    for face in range(faces):
-        if balance[piece[face]] < 0:
-            turned[face] = not turned[face]
+        if balance < 0:
+            for place in range(begin, end):
+                turned[queue[place]] = not turned[queue[place]]
     return -1
 
 

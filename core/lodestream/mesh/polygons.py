@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
-from .halfedges import Corners, find_pieces, find_twins, orient, turn
+from .halfedges import Corners, find_twins, orient, turn
 from .model import Mesh, name_faces
 
 __all__ = ["Polygons", "prepare"]
@@ -109,10 +109,8 @@ def _crossing(mesh: Mesh, corners: Corners, half: int) -> str:
 
 def _wound_alike(mesh: Mesh, polygons: Polygons) -> Polygons:
     corners, twins = polygons.corners, polygons.twins
-    piece = np.empty(len(corners), np.int32)
-    pieces = find_pieces(corners, twins, piece)
     turned = np.zeros(len(corners), np.bool_)
-    wrong = orient(corners, twins, piece, pieces, turned)
+    wrong = orient(corners, twins, turned)
     if wrong >= 0:
         raise FormatError(
             f"expected a surface with two sides, got one on which a way round comes back to the other side, noticed at "
