@@ -38,6 +38,7 @@ def axis_lengths(length: int, closed: bool, stops: bool = False) -> list[int]:
     return lengths[::-1]
 
 
+@lru_cache(maxsize=4096)
 def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int) -> NDArray[np.int64]:
     """Where to find the details beyond the ends, and with which sign.
 
@@ -73,6 +74,7 @@ def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int)
                 index, sign = 0, 0
             sign = -sign
         table[place] = index, sign
+    table.setflags(write=False)
     return table
 
 

@@ -155,6 +155,9 @@ class Layout:
         self.grids, self.tile = tuple(grids), tile
         self.levels = max(len(axis) for grid in grids for axis in grid.lengths) - 1
         self.shared = any(any(grid.taken) for grid in grids)
+        above = range(self.levels, -1, -1)
+        self._shapes = [[grid.shape_at(level) for level in above] for grid in grids]
+        self._steps = [[grid.steps_at(level) for level in above] for grid in grids]
 
     @classmethod
     def single(cls, shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> Layout:
@@ -163,11 +166,11 @@ class Layout:
 
     def shape(self, grid: int, level: int) -> tuple[int, int]:
         """Rows and columns of a grid at a level."""
-        return self.grids[grid].shape_at(self.levels - level)
+        return self._shapes[grid][level]
 
     def steps(self, grid: int, level: int) -> tuple[AxisStep, AxisStep]:
         """The steps along axis 0 and axis 1 of a grid from ``level`` (at least 1) to the level below."""
-        return self.grids[grid].steps_at(self.levels - level)
+        return self._steps[grid][level]
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .layout import Grid, Layout
 from .sides import Part
 
-__all__ = ["Shape", "assemble", "level_masks", "level_positions", "level_shapes"]
+__all__ = ["Shape", "assemble", "level_masks", "level_positions", "level_shapes", "part_positions"]
 
 Shape = tuple[int, int]
 Positions = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -34,13 +34,14 @@ def level_positions(parts: Sequence[Part], layout: Layout, level: int, block: in
     columns: set[int] = set()
     for number, part in enumerate(parts):
         if part.block == block:
-            down, right = _part_positions(part, layout, level, number, len(parts), shape)
+            down, right = part_positions(part, layout, level, number, len(parts), shape)
             rows.update(down.tolist())
             columns.update(right.tolist())
     return np.array(sorted(rows), np.int64), np.array(sorted(columns), np.int64)
 
 
-def _part_positions(part: Part, layout: Layout, level: int, number: int, count: int, shape: Shape) -> Positions:
+def part_positions(part: Part, layout: Layout, level: int, number: int, count: int, shape: Shape) -> Positions:
+    """Which rows and columns of its block, of this shape, the nodes of a part (``number`` of ``count``) stand at."""
     grid = layout.grids[len(layout.grids) - count + number]
     found = []
     for axis, window in enumerate((part.rows, part.columns)):
@@ -82,7 +83,7 @@ def assemble(
     rows, columns = level_positions(parts, layout, level, block, shape)
     whole = np.zeros((rows.size, columns.size, *grids[own[0][0]].shape[2:]), grids[own[0][0]].dtype)
     for number, part in own:
-        down, right = _part_positions(part, layout, level, number, len(parts), shape)
+        down, right = part_positions(part, layout, level, number, len(parts), shape)
         whole[np.ix_(np.searchsorted(rows, down), np.searchsorted(columns, right))] = grids[number]
     return whole
 

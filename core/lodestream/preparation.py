@@ -257,9 +257,10 @@ def _valid_points(blocks: tuple[Block, ...], arrays: Arrays) -> NDArray[Any]:
 
 
 def _may_share(block: Block, points: NDArray[Any]) -> bool:
-    """Whether one block might share a side with itself, or have a pole: whether any two of its corners agree."""
-    if min(block.shape) < 2:
+    """Whether one block might share a side with itself, or have a pole: whether any points of its outline agree."""
+    rows, columns = block.shape
+    if min(rows, columns) < 2:
         return False
-    corners = [points[i, j, :3].tobytes() for i in (0, -1) for j in (0, -1)]
-    ends = [line[0, :3].tobytes() == line[-1, :3].tobytes() for line in _lines(points)]
-    return len(set(corners)) < 4 or any(ends) or block.mask is not None
+    outline = np.concatenate([points[0], points[-1], points[1:-1, 0], points[1:-1, -1]])[:, :3]
+    outline = outline + outline.dtype.type(0)  # -0.0 and 0.0 are one place
+    return len(np.unique(outline, axis=0)) < len(outline) or block.mask is not None
