@@ -5,18 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 import lodestream
-from lodestream.errors import LodestreamError
+from lodestream.errors import FormatWarning, LodestreamError
 
-from .commands import decode, demo, encode, info, pull, push, surfaces
+from .commands import decode, demo, encode, formats, info, pull, push, surfaces
 from .commands.arguments import Subparsers, add_command
+from .commands.output import note
 
 __all__ = ["build_parser", "main"]
 
-_MODULES = (demo, encode, decode, info, push, pull, surfaces)
+_MODULES = (demo, encode, decode, info, push, pull, surfaces, formats)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -67,7 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = build_parser().parse_args(argv)
-        code: int = args.run(args)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", FormatWarning)
+            warnings.showwarning = partial(_show_warning, warnings.showwarning)
+            code: int = args.run(args)
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read our output has seen enough. What is still buffered would raise again when Python exits.
@@ -79,6 +86,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"lodestream: {_one_line(error)}", file=sys.stderr)
         return 1
     return code
+
+
+def _show_warning(
+    others: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any, **more: Any
+) -> None:
+    """What a file leaves out is a note, not a line of the program."""
+    if issubclass(category, FormatWarning):
+        note(" ".join(str(message).split()))
+    else:
+        others(message, category, *place, **more)
 
 
 def _one_line(error: Exception) -> str:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from typing import TYPE_CHECKING, BinaryIO
+
+from lodestream.errors import FormatWarning
+from lodestream.formats import formats
 
 from .containers import OpenContainer
 
@@ -15,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["MEDIA_TYPES", "write_level"]
 
 #: The formats of a level, and what they are called on the way.
-MEDIA_TYPES = {"npy": "application/octet-stream", "obj": "model/obj", "ply": "application/octet-stream"}
+MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
 
 
 def write_level(container: OpenContainer, level: int, format_name: str, folder: Path) -> BinaryIO:
@@ -42,7 +46,9 @@ def write_level(container: OpenContainer, level: int, format_name: str, folder: 
     # Whoever takes the file closes it.
     file: BinaryIO = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
     try:
-        write_stream(surface, format_name, file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FormatWarning)  # whoever asked for a format knows what it holds
+            write_stream(surface, format_name, file)
         file.seek(0)
     except BaseException:
         file.close()

@@ -5,22 +5,29 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
+import queue
 import re
 import secrets
+import threading
+import time
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
 
-__all__ = ["configure", "event", "new_request", "request_id"]
+__all__ = ["configure", "drain", "event", "new_request", "request_id"]
 
 _FIELDS = "lodestream_fields"
+_STANDARD_ERROR = 2
+_MOST_LINES = 10_000
+_DRAIN_SECONDS = 1.0
 _request: ContextVar[str | None] = ContextVar("lodestream_request", default=None)
 _USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 _PLAIN = re.compile(r"[A-Za-z0-9._:/@+*,;<>()\[\]-]+", re.ASCII)
 
 
 def configure(style: str, level: str) -> None:
-    """Write the log to standard error.
+    """Write the log to standard error, without ever waiting for whoever reads it.
 
     Parameters
     ----------
@@ -28,13 +35,19 @@ def configure(style: str, level: str) -> None:
     level : str
         The least that is worth a line, of what this server says; libraries are heard from ``warning`` on.
     """
-    handler = logging.StreamHandler()
+    handler = _Patient()
     handler.setFormatter(_Json() if style == "json" else _Text())
     handler.addFilter(_is_worth_a_line)
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(logging.WARNING)
     logging.getLogger("lodestream_server").setLevel(level.upper())
+
+
+def drain() -> None:
+    """Give whoever reads the log a second to take what is left of it."""
+    for handler in logging.getLogger().handlers:
+        handler.flush()
 
 
 def event(log: logging.Logger, words: str, level: int = logging.INFO, **fields: Any) -> None:
@@ -67,6 +80,48 @@ def _fields(record: logging.LogRecord) -> dict[str, Any]:
     if (name := request_id()) is not None:
         fields["request"] = name
     return fields
+
+
+class _Patient(logging.Handler):
+    """A handler that writes from a thread: a terminal that is held, or a pipe that nobody reads, stops nobody."""
+
+    def __init__(self, descriptor: int = _STANDARD_ERROR) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._lines: queue.Queue[str] = queue.Queue(_MOST_LINES)
+        self._lost = 0
+        self._idle = threading.Event()
+        threading.Thread(target=self._write, name="lodestream-log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._idle.clear()
+        try:
+            self._lines.put_nowait(self.format(record))
+        except queue.Full:
+            self._lost += 1
+
+    def flush(self) -> None:
+        until = time.monotonic() + _DRAIN_SECONDS
+        while not (self._lines.empty() and self._idle.is_set()) and time.monotonic() < until:
+            self._idle.wait(0.01)
+
+    def _write(self) -> None:
+        while True:
+            try:
+                line = self._lines.get_nowait()
+            except queue.Empty:
+                self._idle.set()
+                line = self._lines.get()
+                self._idle.clear()
+            if self._lost:
+                line, self._lost = f"{self._lost} lines of the log were lost, since nobody took them\n{line}", 0
+            data = f"{line}\n".encode("utf-8", "backslashreplace")
+            try:
+                # Not through Python's own stream, whose lock would be held when the process ends.
+                while data:
+                    data = data[os.write(self._descriptor, data) :]
+            except OSError:
+                continue
 
 
 class _Text(logging.Formatter):

@@ -15,8 +15,7 @@ __all__ = ["Observation"]
 
 _log = logging.getLogger(__name__)
 
-# Probes come every few seconds and say nothing.
-_QUIET = {"/healthz", "/readyz", "/metrics"}
+_READING = {"GET", "HEAD", "OPTIONS"}
 _METHODS = {"DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT"}
 
 
@@ -66,7 +65,8 @@ class Observation:
         event(
             _log,
             "request",
-            logging.DEBUG if scope["path"] in _QUIET else logging.INFO,
+            # Who reads much would otherwise write much.
+            logging.INFO if method not in _READING or status >= 500 else logging.DEBUG,
             method=method[:20],
             path=scope["path"][:200],
             status=status,

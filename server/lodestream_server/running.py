@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import resource
 import threading
@@ -17,6 +18,7 @@ from lodestream.messages import MAX_MESSAGE
 
 from .app import create_app
 from .connections import connections
+from .logs import drain
 from .settings import Settings
 
 __all__ = ["Server", "make_server", "raise_file_limit", "running_server"]
@@ -56,6 +58,8 @@ class Server(uvicorn.Server):
         if parts is not None:
             parts.limits.end()
         await super().shutdown(sockets)
+        # The signal that was caught is raised again after this, and ends the process at once.
+        await asyncio.to_thread(drain)
 
 
 def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:

@@ -10,7 +10,7 @@ from pathlib import Path
 from lodestream_client.__main__ import main
 
 PATH = Path(__file__).parents[2] / "docs" / "cli.md"
-COMMANDS = ("demo", "serve", "fsck", "token", "encode", "decode", "info", "push", "pull", "list", "rm")
+COMMANDS = ("demo", "serve", "fsck", "token", "encode", "decode", "info", "push", "pull", "list", "rm", "formats")
 ACTIONS = {"token": ("create", "list", "revoke")}
 
 _INTRODUCTION = """\

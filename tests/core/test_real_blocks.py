@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import formats
 from lodestream.errors import FormatWarning
+from lodestream.preparation import Preparation
 from lodestream.surface import Block, Surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -173,6 +174,25 @@ def _valid(block: Block) -> NDArray[Any]:
         points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
     result: NDArray[Any] = points + 0.0
     return result
+
+
+@pytest.mark.parametrize("name", ["combxyz.bin", "StructuredGrid.vts", "bun000.ply"])
+def test_levels_are_within_the_lattice_of_the_optimum_of_the_filled_grid(name: str) -> None:
+    surface = read(next(row for row in reversed(ROWS) if row.files[0] == name))
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(surface))
+    decoder.finish()
+    prepared = Preparation(surface, (None, {}))
+    assert decoder.header is not None
+    for channel, lattice in enumerate(decoder.header.lattices[:3]):  # those of attributes follow
+        filled = prepared.coordinates(channel, lattice)[0]
+        for number, optimum in enumerate(ls.hierarchy(filled, surface.closed)):
+            level = decoder.surface(number)
+            if level.mask is None and surface.mask is not None:
+                continue  # no node of so coarse a level stands for a valid one
+            valid = np.ones(level.shape, np.bool_) if level.mask is None else level.mask
+            away = lattice.coordinates(level.points[..., channel][valid]) - optimum[valid]
+            assert np.abs(away).max() <= 5  # four steps, and one where values are rounded to their type
 
 
 def sides(block: Block) -> list[NDArray[Any]]:

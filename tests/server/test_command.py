@@ -52,6 +52,7 @@ def serving(tmp_path: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[
     script.write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "LODESTREAM_WORKERS": "1"}
     command = [sys.executable, str(script), "serve", "--port", "0", "--data", str(tmp_path / "data"), *arguments]
+    # Nobody reads the pipe after the address has come: the server must not mind.
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stderr is not None

@@ -22,7 +22,7 @@ def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, d
     """A server that waits for nobody, and a surface on it that no buffer takes whole."""
     with running_server(tmp_path_factory.mktemp("data"), workers=1, head_seconds=0.5, idle_seconds=0.5) as url:
         with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
-            made = push(http, npy(hills(1400, 1300)))
+            made = push(http, npy(hills(700, 700)))
         yield url, made
 
 

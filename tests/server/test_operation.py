@@ -281,18 +281,42 @@ def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None
         assert http.get(made["url"]).json() == made
 
 
-def test_the_log_tells_of_requests_but_not_of_probes_and_tokens(tmp_path: Path) -> None:
+def test_the_log_tells_of_requests_that_write_but_not_of_tokens(tmp_path: Path) -> None:
     with serving(tmp_path) as (_, url, log):
         with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
-            http.get("/healthz")
-            http.get("/v1/surfaces?token=secret-1", headers={"authorization": "Bearer secret-2", "x-request-id": "r-7"})
+            http.get("/v1/surfaces?token=secret-1", headers={"authorization": "Bearer secret-2"})
+            headers = {"authorization": "Bearer secret-3", "x-request-id": "r-7"}
+            http.delete("/v1/surfaces/0?token=secret-4", headers=headers)
         eventually(lambda: "r-7" in log.read_text(), "the line")
         text = log.read_text()
     line = next(line for line in text.splitlines() if "r-7" in line)
-    assert "method=GET path=/v1/surfaces status=200" in line
+    assert "method=DELETE path=/v1/surfaces/0 status=404" in line
     assert "client=127.0.0.1" in line
     assert "secret" not in text
-    assert "healthz" not in text
+    assert "method=GET" not in text
+
+
+def test_a_log_that_nobody_reads_stops_nobody() -> None:
+    read, write = os.pipe()
+    try:
+        handler = logs._Patient(write)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        record = logging.LogRecord("x", logging.INFO, "", 0, "l" * 100, None, None)
+        for _ in range(20_000):
+            handler.emit(record)
+        # Now somebody does.
+        taken = b""
+        while b"were lost" not in taken:
+            taken += os.read(read, 1 << 16)
+            handler.emit(record)
+        lost = re.search(rb"\n(\d+) lines of the log were lost", taken)
+        assert lost is not None
+        assert 9000 < int(lost[1]) < 20_000
+    finally:
+        # The thread writes on until there is nobody to write to.
+        os.close(read)
+        eventually(lambda: handler._lines.empty() and handler._idle.is_set(), "the thread to have written all")
+        os.close(write)
 
 
 def test_links_and_clients_behind_a_proxy(tmp_path: Path) -> None:

@@ -16,8 +16,6 @@ from .output import human_size, note, print_json, progress_bar, replacing, requi
 
 __all__ = ["register", "run"]
 
-_CLOSED = {"none": (False, False), "rows": (True, False), "cols": (False, True), "both": (True, True)}
-
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-command."""
@@ -49,11 +47,9 @@ def run(args: argparse.Namespace) -> int:
     started = time.monotonic()
     with input_files(args.parser, args.files) as files:
         first, *more = files.paths
-        surface = ls.read(first, *more, filename=files.filename, **_format_options(options))
+        surface = ls.read(first, *more, closed=args.closed, filename=files.filename, **_format_options(options))
     if args.name:
         surface.metadata["name"] = args.name
-    if args.closed != "auto":
-        surface = ls.Surface(surface.points, _CLOSED[args.closed], metadata=surface.metadata)
     with progress_bar() as progress:
         task = progress.add_task("encoding", total=1.0, figures="")
         container = ls.encode(
@@ -65,27 +61,30 @@ def run(args: argparse.Namespace) -> int:
         with replacing(Path(args.out)) as temporary:
             temporary.write_bytes(container)
     seconds = time.monotonic() - started
+    blocks = surface.blocks
+    raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
     if args.json:
+        alone = blocks[0] if len(blocks) == 1 else None
         print_json(
             {
                 "out": args.out,
                 "bytes": len(container),
-                "raw_bytes": surface.points.nbytes,
-                "shape": list(surface.shape),
-                "closed": list(surface.closed),
+                "raw_bytes": raw,
+                "shape": None if alone is None else list(alone.shape),
+                "closed": None if alone is None else list(alone.closed),
                 "seconds": round(seconds, 3),
             }
         )
     else:
-        rows, columns = surface.shape
-        share = len(container) / surface.points.nbytes
-        note(f"{rows} x {columns} points, {human_size(len(container))} ({share:.1%} of the array) in {seconds:.1f} s")
+        size = " x ".join(map(str, blocks[0].shape)) if len(blocks) == 1 else f"{len(blocks)} blocks of"
+        share = len(container) / raw
+        note(f"{size} points, {human_size(len(container))} ({share:.1%} of the arrays) in {seconds:.1f} s")
     return 0
 
 
 def _format_options(options: dict[str, str]) -> dict[str, Any]:
     # Parameters of `read` that are no options of any format.
-    for key in ("path", "max_vertices", "filename"):
+    for key in ("path", "closed", "max_vertices", "filename"):
         if key in options:
             raise OptionError(f"{key} is not an option of any format")
     return dict(options)

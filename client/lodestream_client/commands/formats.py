@@ -1,0 +1,66 @@
+"""``lodestream formats``: which files are read and written."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from .arguments import Subparsers, add_command, add_json_option
+from .output import console, print_json
+
+__all__ = ["register", "run"]
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-command."""
+    parser = add_command(
+        subparsers,
+        "formats",
+        run,
+        "list the formats of files, which of them are read and written, and their -o options",
+        "The content of a file decides about its format; its suffix only where any content would do.\n"
+        "What is written follows the suffix of OUT. docs/formats.md says more of each.",
+    )
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table."""
+    from lodestream.formats import formats
+
+    rows: list[dict[str, Any]] = [
+        {
+            "name": format_.name,
+            "suffixes": list(format_.suffixes),
+            "read": format_.read is not None,
+            "write": format_.write is not None,
+            "more": format_.more or None,
+            "options": dict(format_.options),
+            "media_type": format_.media_type,
+        }
+        for format_ in formats()
+    ]
+    if args.json:
+        print_json({"formats": rows})
+    else:
+        _show(rows)
+    return 0
+
+
+def _show(rows: list[dict[str, Any]]) -> None:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    out = console()
+    table = Table(box=box.SIMPLE_HEAD if out.is_terminal else None, pad_edge=False)
+    for name in ("format", "suffixes", "", "options"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        ways = " ".join(word for word in ("read", "write") if row[word])
+        options = [f"-o {name}= {text}" for name, text in row["options"].items()]
+        if row["more"]:
+            options.insert(0, f"further files: {row['more']}")
+        cells = (row["name"], " ".join(row["suffixes"]), ways, "\n".join(options))
+        table.add_row(*map(Text, cells))
+    out.print(table)
