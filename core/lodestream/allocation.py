@@ -18,8 +18,8 @@ __all__ = ["MOST_LAYERS", "TileCurve", "assign_layers", "hull_slopes"]
 
 MOST_LAYERS = 24
 _FIRST_LAYER = 48  # bytes of coefficients in the first layer
-_LEAST_GROWTH = 1.2
-_LEAST_LAYER = 40  # bytes: a layer's frame takes about 25
+_LEAST_GROWTH = 1.3
+_LEAST_LAYER = 160  # bytes: a layer's frame takes about 30
 _LAST_LOSSY = 0.92
 
 

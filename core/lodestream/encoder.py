@@ -314,7 +314,8 @@ class _Encoding:
             original, restored = self._given(window), self._last[window.block].window(window)
             chosen = slice(None) if block.mask is None else block.mask[rows, columns]
             original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
-            piece = exactness.encode_piece(original, restored)
+            step = self.lattices[window.channel].step if original.dtype == np.float32 else None
+            piece = exactness.encode_piece(original, restored, step)
             if piece and kept[window.channel]:
                 exact[0 if window.channel < self.geometric else 1] = False
                 piece = b""

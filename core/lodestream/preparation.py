@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from .arrangement import VertexCounter, grids_of
 from .container.model import AttributeKind
 from .heights import to_heights
-from .lattice import Lattice
+from .lattice import Lattice, find_lattice, offset_lattice
 from .layout import Layout
 from .measure import extent_of
 from .picture import Original
-from .quantise import attribute_lattices, choose_lattices
+from .quantise import DEFAULT_STEPS, attribute_lattices, choose_lattices
 from .sides import Arrangement, Curve, LatticeBlock, Part, Side, arrange, stored, whole_part
+from .steps import default_steps
 from .surface import Block, Surface
 from .target import Tolerance
 from .transform import allocate
@@ -72,6 +73,10 @@ class Preparation:
         if precision is not None and precision.relative and not self.extent:
             precision = None  # a fraction of nothing: one point, which a lattice holds exactly
         self.precision = None if precision is None else precision.absolute(self.extent)
+        largest = max(self.arrays, key=lambda arrays: arrays[0].size)[0]
+        self._steps = DEFAULT_STEPS
+        if self.precision is None:
+            self._steps = default_steps([largest[..., channel] for channel in range(self.geometric)])
         self.arrangement = self._arranged()
         if self.arrangement is None:
             shape = first.shape
@@ -85,7 +90,11 @@ class Preparation:
 
     def lattices(self, bits: int | None) -> list[Lattice]:
         """A lattice for each channel; ``bits``: keep no more than so many of any channel's range."""
-        found = choose_lattices(self._valid, self.geometric, self.precision, bits)
+        found = choose_lattices(self._valid, self.geometric, self.precision, bits, steps=self._steps)
+        if self.precision is None and bits is None and self.point_channels == 1 and self.arrangement is None:
+            offset = offset_lattice(self.arrays[0][0][..., 0])
+            if offset is not None and find_lattice(self._valid) is None:
+                found[0] = offset
         for number, kind in enumerate(self.kinds, 1):
             values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in self.arrays])
             found += attribute_lattices(values, self.attribute_precisions.get(kind.name), bits)
@@ -145,7 +154,7 @@ class Preparation:
             if len(blocks) == 1:
                 return None
             return Arrangement(tuple(whole_part(k, b.shape, b.closed) for k, b in enumerate(blocks)), ())
-        lattices = choose_lattices(self._valid, self.geometric, self.precision, None)
+        lattices = choose_lattices(self._valid, self.geometric, self.precision, None, steps=self._steps)
         sources = []
         for block, arrays in zip(blocks, self.arrays, strict=True):
             channels = [lattices[k].coordinates(arrays[0][..., k]) for k in range(self.geometric)]

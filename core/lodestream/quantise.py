@@ -12,9 +12,10 @@ from .errors import InputError
 from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
 from .target import Tolerance
 
-__all__ = ["attribute_lattices", "channel_of", "choose_lattices"]
+__all__ = ["DEFAULT_STEPS", "attribute_lattices", "channel_of", "choose_lattices"]
 
-_DEFAULT_STEPS = 2.0**20
+#: Steps of the widest extent, unless something else is known to cost less.
+DEFAULT_STEPS = 2.0**20
 #: Sums and differences of pictures on their way to such values do not overflow.
 LARGEST_VALUE = 1e300
 
@@ -25,7 +26,12 @@ def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def choose_lattices(
-    points: NDArray[Any], geometric: int, precision: float | None, bits: int | None = None
+    points: NDArray[Any],
+    geometric: int,
+    precision: float | None,
+    bits: int | None = None,
+    *,
+    steps: float = DEFAULT_STEPS,
 ) -> list[Lattice]:
     """A lattice for each channel.
 
@@ -39,6 +45,8 @@ def choose_lattices(
         leaves out is stored.
     bits : int, optional
         Keep no more of any channel than so many bits of its range.
+    steps : float
+        Into how many the widest extent is divided where there is neither a lattice nor a precision.
 
     Returns
     -------
@@ -58,13 +66,13 @@ def choose_lattices(
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:
         raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
-    wanted = widest / _DEFAULT_STEPS if precision is None else _step_for(points.dtype, precision, geometric, spans)
+    wanted = widest / steps if precision is None else _step_for(points.dtype, precision, geometric, spans)
     lattices = []
     for channel in range(count):
         low, high = spans[channel]
         own = find_lattice(channel_of(points, channel))
         if channel >= geometric:
-            lattices.append(own or precision_lattice(low, high, (high - low) / _DEFAULT_STEPS))
+            lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_STEPS))
         elif own is not None and (precision is None or _spacing(own) >= wanted):
             lattices.append(own)
         else:

@@ -38,8 +38,9 @@ def default_steps(channels: Sequence[NDArray[Any]]) -> float:
     span = max(float(channel.max()) - float(channel.min()) for channel in channels)
     if not 0.0 < span < np.inf:
         return _USUAL
-    saved = _bits(channels, span / _USUAL) - _bits(channels, span / _FINEST)
-    return _FINEST if saved > _WORTH else _USUAL
+    with np.errstate(over="ignore", invalid="ignore"):  # values at the ends of their type: the usual steps will do
+        saved = _bits(channels, span / _USUAL) - _bits(channels, span / _FINEST)
+    return _FINEST if _WORTH < saved < np.inf else _USUAL
 
 
 def _bits(channels: Sequence[NDArray[Any]], step: float) -> float:
