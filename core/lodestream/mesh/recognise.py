@@ -17,7 +17,7 @@ from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, sh
 from .develop import Development, develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
-from .limits import LEAST_QUADS, MOST_BLOCKS, MOST_SMALL_BLOCKS, check_pieces
+from .limits import LEAST_QUADS, SMALL_PIECES, check_pieces, most_blocks
 from .model import Mesh, name_faces
 from .patchwork import Quads, make_quads
 from .polygons import Polygons, prepare
@@ -197,7 +197,7 @@ class _Recognition:
         return sorted(grids, key=_first_face)
 
     def _check_count(self, count: int) -> None:
-        check_pieces(count, len(self.quads.corners), 1 if self.seams else MOST_SMALL_BLOCKS, self._seam_words())
+        check_pieces(count, len(self.quads.corners), 1 if self.seams else SMALL_PIECES, self._seam_words())
 
     def _seam_words(self) -> str:
         return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
@@ -248,7 +248,8 @@ class _Recognition:
                 best = count, apart
         assert best is not None
         count, apart = best
-        if count > MOST_BLOCKS or int(chosen.sum()) < LEAST_QUADS * count:
+        size = int(chosen.sum())
+        if count > most_blocks(size) or size < LEAST_QUADS * count:
             raise FormatError(self._too_small(chosen, count, wrong))
         self.cuts += count
         laid = develop_quads(corners, apart)
@@ -268,6 +269,7 @@ class _Recognition:
     def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
         at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
         irregular_ones = len(np.unique(self.umbrella[at]))
+        size = int(chosen.sum())
         where = "and winds or lies on itself"
         if at.size:
             around = at[self.umbrella[at] == self.umbrella[at[0]]] >> 2
@@ -276,8 +278,224 @@ class _Recognition:
                 f"{name_faces(self.mesh, self.quads.origin[around])}"
             )
         return (
-            f"expected a grid, or a mesh that grid lines cut into at most {MOST_BLOCKS:,} blocks of {LEAST_QUADS} "
-            f"quads or more on average, got {int(chosen.sum()):,} quads in {count:,} blocks{self._seam_words()}: the "
+            f"expected a grid, or a mesh that grid lines cut into at most {most_blocks(size):,} blocks of "
+            f"{LEAST_QUADS} quads or more on average, got {size:,} quads in {count:,} blocks{self._seam_words()}: the "
+            f"mesh has {irregular_ones:,} irregular vertices (inner ones without four quads, outer ones with three or "
+            f"more), {where}; make it again with fewer of them, or with finer quads"
+        )
+
+    def _block(self, block: RecognisedBlock) -> Block:
+        valid = block.vertices >= 0
+        attributes = {name: values[block.vertices] for name, values in self.mesh.attributes.items()}
+        for name, rows in block.rows.items():
+            attributes[name] = self.mesh.corner_attributes[name].values[rows]
+        points = self.mesh.vertices[block.vertices]
+        if valid.all():
+            return Block(points, block.closed, attributes=attributes)
+        for values in (points, *attributes.values()):
+            values[~valid] = np.nan if values.dtype.kind == "f" else 0
+        return Block(points, block.closed, mask=valid, attributes=attributes)
+
+
+def recognise(mesh: Mesh) -> Recognised:
+    """Find the grids that the faces of a mesh make, whatever the order of its vertices and faces.
+
+    A mesh whose inner vertices have four quads is one grid for each connected piece, open or closed; triangles may be
+    the halves of quads, or fans round a pole. Any other mesh is cut along the grid lines that leave its irregular
+    vertices. Where the corners of faces have different values at a vertex, the surface has a seam. Attributes for which
+    there is no grid with such seams are left out, which `Recognised.words` says.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Faces name existing vertices.
+
+    Returns
+    -------
+    Recognised
+        The same for the same order of vertices and faces; a mesh in row order keeps it.
+
+    Raises
+    ------
+    FormatError
+        When there are no such grids, naming the first faces that do not fit and what to do about them.
+    """
+    if not len(mesh.corners):
+        raise FormatError("expected faces, got none")
+    shared, seams, left_out = sort_attributes(mesh)
+    while True:
+        attributes = (
+            np.stack([seams[name] for name in seams]) if seams else np.zeros((0, len(mesh.corners), 4), np.int32)
+        )
+        polygons = prepare(mesh, tuple(seams), attributes)
+        quads = make_quads(mesh, polygons)
+        gone = [polygons.names[number] for number in quads.torn]
+        if not gone:
+            try:
+                return _Recognition(mesh, polygons, quads, shared, left_out).result()
+            except FormatError:
+                if not seams:
+                    raise
+                torn = tear(quads, quads.twins.copy())
+                gone = [polygons.names[int(torn.argmax())]]
+        for name in gone:
+            left_out[name] = "different on too many faces side by side"
+            del seams[name]
+
+
+class _Recognition:
+    """What is known of a mesh of quads on the way to its blocks."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        polygons: Polygons,
+        quads: Quads,
+        shared: Mapping[str, NDArray[np.int32]],
+        left_out: Mapping[str, str],
+    ) -> None:
+        self.mesh = mesh
+        self.polygons = polygons
+        self.quads = quads
+        self.shared = shared
+        self.left_out = left_out
+        corners = quads.corners
+        self.twins = quads.twins.copy() if polygons.names else quads.twins
+        torn = tear(quads, self.twins)
+        self.seams = tuple(name for name, count in zip(polygons.names, torn, strict=True) if count)
+        self.umbrella = np.empty(4 * len(corners), np.int32)
+        valence = np.empty(4 * len(corners), np.int32)
+        self.valence = valence[: find_umbrellas(corners, self.twins, self.umbrella, valence)].copy()
+        self.identity = self._nodes() if self.seams else corners.reshape(-1)
+        whole = np.concatenate([np.arange(len(mesh.vertices), dtype=np.int32), quads.pole_of])
+        self.vertex = whole[corners.reshape(-1)]
+        self.piece = np.empty(0, np.int32)
+        self.cuts = 0
+
+    def _nodes(self) -> NDArray[np.int32]:
+        """For each corner its node: one for all corners of a vertex with the same attributes, seam between or not."""
+        corners = self.quads.corners.reshape(-1)
+        first = np.empty(len(self.valence), np.int64)
+        first[self.umbrella[::-1]] = np.arange(len(corners))[::-1]
+        node = np.arange(len(first), dtype=np.int32)
+        apart = np.flatnonzero(np.bincount(corners[first])[corners[first]] > 1)
+        values = self.quads.attributes.reshape(len(self.polygons.names), -1)[:, first[apart]]
+        node[apart] = apart[equal_rows(np.column_stack([corners[first[apart]], *values]))]
+        return node[self.umbrella]
+
+    def result(self) -> Recognised:
+        """Find the blocks."""
+        grids = self._grids()
+        piece = self.piece
+        pieces = int(piece.max()) + 1
+        if self.seams:
+            pieces = find_pieces(self.quads.corners, self.quads.twins, piece)
+        part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
+        blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
+        blocks, merged = join_blocks(blocks, grids, self.mesh.vertices)
+        return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), tuple(self._notes(blocks, merged)))
+
+    def _grids(self) -> list[Grid]:
+        laid = develop_quads(self.quads.corners, self.twins)
+        self.piece = laid.piece
+        runs = _runs(laid.piece, len(laid.turns))
+        self._check_count(len(runs))
+        grids: list[Grid] = []
+        uncut: list[int] = []
+        for number, faces in enumerate(runs):
+            grid = make_grid(faces, laid, number, self.identity, self.vertex)
+            if grid is not None and self._poles_fit(grid):
+                grids.append(grid)
+            else:
+                uncut.append(number)
+        if uncut:
+            grids += self._cut(laid, runs, np.isin(laid.piece, uncut))
+        return sorted(grids, key=_first_face)
+
+    def _check_count(self, count: int) -> None:
+        check_pieces(count, len(self.quads.corners), 1 if self.seams else SMALL_PIECES, self._seam_words())
+
+    def _seam_words(self) -> str:
+        return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
+
+    def _poles_fit(self, grid: Grid) -> bool:
+        """Whether the nodes at poles fill sides of the grid."""
+        if not len(self.quads.pole_of):
+            return True
+        pole = self._at_pole(grid)
+        for side in SIDES.values():
+            if pole[side].all():
+                pole[side] = False
+        return not pole.any()
+
+    def _at_pole(self, grid: Grid) -> NDArray[np.bool_]:
+        corners = self.quads.corners.reshape(-1)
+        return (grid.corners >= 0) & (corners[grid.corners] >= len(self.mesh.vertices))
+
+    def _starts(self, laid: Development, runs: list[NDArray[np.int64]], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Half-edges from which to cut the pieces of the chosen faces."""
+        halves = np.repeat(chosen, 4) & (self.twins >= 0)
+        starts = [np.flatnonzero(halves & irregular(self.valence)[self.umbrella])]
+        has_start = np.bincount(laid.piece[starts[0] >> 2], minlength=len(runs)) > 0
+        for number in np.unique(laid.piece[chosen & ~has_start[laid.piece]]).tolist():
+            # A torus that winds, so that it is no torus of rows and columns: along the shorter line it is cut open.
+            a, b, d = (int(value) for value in laid.periods[number])
+            along_rows = d > 0 and d <= a * d // gcd(b, d)
+            inside = (4 * runs[number][:, None] + np.arange(4)).reshape(-1)
+            inside = inside[halves[inside] & ((laid.heading[inside >> 2] + inside) % 2 == (0 if along_rows else 1))]
+            if inside.size:
+                starts.append(inside[self.vertex[inside].argmin()][None])
+        return np.concatenate(starts).astype(np.int32)
+
+    def _cut(self, laid: Development, runs: list[NDArray[np.int64]], chosen: NDArray[np.bool_]) -> list[Grid]:
+        """Cut the pieces of the chosen faces into blocks."""
+        corners = self.quads.corners
+        wrong = irregular(self.valence)
+        starts = self._starts(laid, runs, chosen)
+        piece = np.empty(len(corners), np.int32)
+        best: tuple[int, NDArray[np.int32]] | None = None
+        for whole in (True, False):
+            cut = np.zeros(4 * len(corners), np.bool_)
+            trace(corners, self.twins, self.umbrella, self.valence, starts, whole, cut)
+            apart = np.where(cut, -1, self.twins).astype(np.int32)
+            find_pieces(corners, apart, piece)
+            count = len(np.unique(piece[chosen]))
+            if best is None or count < best[0]:
+                best = count, apart
+        assert best is not None
+        count, apart = best
+        size = int(chosen.sum())
+        if count > most_blocks(size) or size < LEAST_QUADS * count:
+            raise FormatError(self._too_small(chosen, count, wrong))
+        self.cuts += count
+        laid = develop_quads(corners, apart)
+        grids = []
+        for number, faces in enumerate(_runs(laid.piece, len(laid.turns))):
+            if not chosen[faces[0]]:
+                continue
+            grid = make_grid(faces, laid, number, self.identity, self.vertex)
+            if grid is None or (grid.faces < 0).any() or not self._poles_fit(grid):
+                raise FormatError(
+                    f"expected a mesh that grid lines cut into rectangles, got a patch of {len(faces):,} quads that is "
+                    f"none, with {name_faces(self.mesh, self.quads.origin[faces])}"
+                )
+            grids.append(grid)
+        return grids
+
+    def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
+        at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
+        irregular_ones = len(np.unique(self.umbrella[at]))
+        size = int(chosen.sum())
+        where = "and winds or lies on itself"
+        if at.size:
+            around = at[self.umbrella[at] == self.umbrella[at[0]]] >> 2
+            where = (
+                f"the first of them vertex {int(self.vertex[at[0]]) + 1} of "
+                f"{name_faces(self.mesh, self.quads.origin[around])}"
+            )
+        return (
+            f"expected a grid, or a mesh that grid lines cut into at most {most_blocks(size):,} blocks of {LEAST_QUADS} "
+            f"quads or more on average, got {size:,} quads in {count:,} blocks{self._seam_words()}: the "
             f"mesh has {irregular_ones:,} irregular vertices (inner ones without four quads, outer ones with three or "
             f"more), {where}; make it again with fewer of them, or with finer quads"
         )
