@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import AsyncIterator, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from fastapi import Request
 from python_multipart.exceptions import FormParserError
@@ -25,7 +25,7 @@ from .settings import Settings
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Upload", "digest_of", "receive"]
+__all__ = ["Body", "Upload", "digest_of", "receive", "take_apart"]
 
 # Larger blocks than the network's, so that a thread is asked less often; small enough for many uploads at once.
 _BUFFER = 64 * 1024
@@ -98,6 +98,16 @@ def digest_of(files: Iterable[Path]) -> str:
                 size += len(block)
         digest.update(size.to_bytes(8, "big"))
     return digest.hexdigest()
+
+
+class Body(Protocol):
+    """A body as it comes."""
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes."""
+
+    def finish(self) -> None:
+        """Say that no more come."""
 
 
 class _Raw:
@@ -201,12 +211,7 @@ async def receive(request: Request, folder: Path, settings: Settings, name: str 
     _check_promised(request, settings.upload_bytes)
     upload = Upload(folder, settings.upload_files)
     try:
-        kind, options = parse_options_header(request.headers.get("content-type"))
-        reader: _Raw | _Multipart
-        if kind == b"multipart/form-data":
-            reader = _multipart(upload, options)
-        else:
-            reader = await asyncio.to_thread(_Raw, upload, name)
+        reader = await asyncio.to_thread(take_apart, upload, request.headers.get("content-type"), name)
         async for block in _blocks(request, settings):
             await asyncio.to_thread(reader.feed, block)
         await asyncio.to_thread(reader.finish)
@@ -215,7 +220,17 @@ async def receive(request: Request, folder: Path, settings: Settings, name: str 
     return upload
 
 
-def _multipart(upload: Upload, options: dict[bytes, bytes]) -> _Multipart:
+def take_apart(upload: Upload, content_type: str | None, name: str | None = None) -> Body:
+    """What takes a body of this type: raw, or the parts of a form.
+
+    Raises
+    ------
+    FormatError
+        When a form has no boundary, or not a usable one.
+    """
+    kind, options = parse_options_header(content_type)
+    if kind != b"multipart/form-data":
+        return _Raw(upload, name)
     boundary = options.get(b"boundary")
     if not boundary:
         raise FormatError("expected a boundary in the content type multipart/form-data, got none")

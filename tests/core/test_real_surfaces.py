@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import formats
 from lodestream.errors import FormatError, FormatWarning
-from lodestream.heights import coordinates
+from lodestream.heights import coordinates, to_xyz
 from lodestream.preparation import Preparation
 from lodestream.seams import restore
 from lodestream.surface import Surface
@@ -216,6 +216,19 @@ def test_another_library_finds_heights_holes_and_place(tmp_path: Path, name: str
     if name.endswith((".tif", ".dem")):
         with rasterio.open(DATA / name) as dataset:
             np.testing.assert_array_equal(heights, dataset.read(1))
+
+
+@pytest.mark.parametrize("name", ["SainteHelens.dem", "lidar_dsm_2m.tif", BIJOU])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_heights_given_as_xyz_take_hardly_more_bytes(name: str, dtype: str) -> None:
+    surface = read(of(name))
+    heights = np.where(valid_of(surface), surface.points, np.nan).astype(dtype)
+    points = to_xyz(Surface(heights, metadata=surface.metadata)).points.astype(dtype)
+    plain, placed = (ls.encode(Surface(array)) for array in (heights, points))
+    assert len(placed) <= len(plain) + 64
+    back = ls.decode(placed)
+    assert back.dtype == points.dtype
+    np.testing.assert_array_equal(back.points, points)
 
 
 def test_a_level_of_real_heights_lies_where_the_surface_lies(tmp_path: Path) -> None:

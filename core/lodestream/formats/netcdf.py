@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, OptionError
+from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..seams import merge
 from ..surface import Closed, Surface
 from . import hdf5_guard, vmec
@@ -82,8 +82,10 @@ def _opened(source: Source) -> Iterator[Any]:
                 path, decode_cf=False, create_default_indexes=False, cache=False, **options
             ) as dataset:
                 yield dataset
-    except (InputError, MemoryError):
+    except InputError:
         raise
+    except MemoryError:
+        raise TooLargeError("expected a NetCDF that fits into memory, got one that promises more") from None
     except Exception as error:  # none of these libraries says what it may raise
         reason = " ".join(str(error).replace(path, "the file").split()) or type(error).__name__
         raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None

@@ -17,7 +17,7 @@ from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, sh
 from .develop import Development, develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
-from .limits import LEAST_QUADS, MOST_BLOCKS, MOST_SMALL_BLOCKS, check_pieces
+from .limits import LEAST_QUADS, SMALL_PIECES, check_pieces, most_blocks
 from .model import Mesh, name_faces
 from .patchwork import Quads, make_quads
 from .polygons import Polygons, prepare
@@ -197,7 +197,7 @@ class _Recognition:
         return sorted(grids, key=_first_face)
 
     def _check_count(self, count: int) -> None:
-        check_pieces(count, len(self.quads.corners), 1 if self.seams else MOST_SMALL_BLOCKS, self._seam_words())
+        check_pieces(count, len(self.quads.corners), 1 if self.seams else SMALL_PIECES, self._seam_words())
 
     def _seam_words(self) -> str:
         return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
@@ -248,7 +248,8 @@ class _Recognition:
                 best = count, apart
         assert best is not None
         count, apart = best
-        if count > MOST_BLOCKS or int(chosen.sum()) < LEAST_QUADS * count:
+        size = int(chosen.sum())
+        if count > most_blocks(size) or size < LEAST_QUADS * count:
             raise FormatError(self._too_small(chosen, count, wrong))
         self.cuts += count
         laid = develop_quads(corners, apart)
@@ -268,6 +269,7 @@ class _Recognition:
     def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
         at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
         irregular_ones = len(np.unique(self.umbrella[at]))
+        size = int(chosen.sum())
         where = "and winds or lies on itself"
         if at.size:
             around = at[self.umbrella[at] == self.umbrella[at[0]]] >> 2
@@ -276,8 +278,8 @@ class _Recognition:
                 f"{name_faces(self.mesh, self.quads.origin[around])}"
             )
         return (
-            f"expected a grid, or a mesh that grid lines cut into at most {MOST_BLOCKS:,} blocks of {LEAST_QUADS} "
-            f"quads or more on average, got {int(chosen.sum()):,} quads in {count:,} blocks{self._seam_words()}: the "
+            f"expected a grid, or a mesh that grid lines cut into at most {most_blocks(size):,} blocks of "
+            f"{LEAST_QUADS} quads or more on average, got {size:,} quads in {count:,} blocks{self._seam_words()}: the "
             f"mesh has {irregular_ones:,} irregular vertices (inner ones without four quads, outer ones with three or "
             f"more), {where}; make it again with fewer of them, or with finer quads"
         )
