@@ -44,7 +44,7 @@ _CRASHES = 3
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 _FIRST_DELAY = 2.0
-_LONGEST_DELAY = 300.0
+_LONGEST_DELAY = 60.0
 
 
 @dataclass
@@ -85,6 +85,7 @@ class Builder:
         self._running: dict[str, _Running] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._warming: asyncio.Task[None] | None = None
+        self._room = asyncio.Event()
         self._closing = False
 
     @property
@@ -126,13 +127,23 @@ class Builder:
             return "queued", 0.0
         return "building", worker.read_progress(running.folder)
 
-    async def cancel(self, surface: str) -> None:
-        """Stop building a surface; its process is killed."""
+    async def delete(self, surface: str) -> None:
+        """Remove a surface; the process that builds it is killed. Builds that wait for room on the disk try again.
+
+        Raises
+        ------
+        NotFoundError
+            When there is none.
+        """
+        self._storage.get(surface)
         task = self._tasks.get(surface)
         if task is not None:
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
+        await asyncio.to_thread(self._storage.delete, surface)
+        room, self._room = self._room, asyncio.Event()
+        room.set()
 
     async def wait(self) -> None:
         """Wait until nothing is queued any more."""
@@ -169,7 +180,9 @@ class Builder:
             except _FullError as error:
                 _log.error("the build of %s waits for room on the disk: %s", record.id, error)
                 self._storage.waiting(record.id, "waits for room on the server's disk")
-                await asyncio.sleep(delay)
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(delay):
+                        await self._room.wait()
                 delay = min(2 * delay, _LONGEST_DELAY)
                 continue
             except Exception:

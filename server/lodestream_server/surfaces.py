@@ -95,9 +95,7 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(404))
 async def delete(parts: Parts, surface: str) -> Response:
     """Remove a surface; its build is stopped. Streams of it that are open go on to their end."""
-    parts.storage.get(surface)
-    await parts.builder.cancel(surface)
-    await asyncio.to_thread(parts.storage.delete, surface)
+    await parts.builder.delete(surface)
     return Response(status_code=204)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,8 +11,8 @@ from lodestream_server.storage import Storage
 from tests.server import slow
 from tests.server.disks import CountingDisk, FullDisk
 from tests.server.helpers import eventually, hills, npy, push, settled
-from tests.server.programs import server
 from tests.server.test_builds import running
+from tests.torture import small_disk
 
 
 @pytest.fixture(autouse=True)
@@ -135,38 +133,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
         assert list(tmp_path.iterdir()) == [path]
 
 
-def can_mount() -> bool:
-    """Whether a small disk can be had: in name spaces of its own, which asks nobody's permission on most machines."""
-    if shutil.which("unshare") is None:
-        return False
-    command = ["unshare", "-Urm", "mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", "/tmp"]
-    return subprocess.run(command, capture_output=True, check=False).returncode == 0
-
-
-@pytest.mark.skipif(not can_mount(), reason="no small disk can be mounted on this machine")
+@pytest.mark.skipif(not small_disk.can_mount(), reason="no small disk can be mounted on this machine")
 def test_a_disk_that_is_really_small(tmp_path: Path) -> None:
-    (tmp_path / "disk").mkdir()
-    mount = f'mount -t tmpfs -o size=1m tmpfs "{tmp_path}/disk" && exec "$0" "$@"'
-    with (
-        server(tmp_path / "disk", ["unshare", "-Urm", "sh", "-c", mount], keep_free=0) as running_there,
-        running_there.client() as http,
-    ):
-        made, refused = [], []
-        for seed in range(12):
-            answer = http.post("/v1/surfaces", content=npy(hills(150, 150, seed=seed)))
-            if answer.status_code == 202:
-                made.append(answer.headers["location"])
-            else:
-                # Either the server saw that there is too little room, or the disk said so.
-                assert answer.status_code == 507, answer.text
-                refused.append(seed)
-        assert made
-        assert refused
-        listed = [entry["url"] for entry in http.get("/v1/surfaces", params={"limit": 100}).json()["surfaces"]]
-        assert sorted(listed) == sorted(made)
-        # Where there is no room for a container, its build waits until there is.
-        while made:
-            states = [http.get(location).json()["state"] for location in made]
-            assert set(states) <= {"queued", "building", "ready"}
-            http.delete(made.pop(0)).raise_for_status()
-        assert push(http, npy(hills(150, 150)))["state"] == "ready"
+    done = small_disk.run(tmp_path, 40)
+    assert min(done.uploads, done.refused, done.deletes, done.kept) > 0
