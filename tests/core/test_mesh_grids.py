@@ -95,6 +95,16 @@ def test_a_sphere_and_a_wedge_of_it(cut: str, closed: bool, kind: str) -> None:
     assert_same_faces(surface, cut_in_two(faces, cut) if cut else faces)
 
 
+@pytest.mark.parametrize("count", [4, 5, 6, 12])
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_fan_alone(count: int, closed: bool) -> None:
+    faces = [[0, k + 1, (k + 1) % (count + (not closed)) + 1] for k in range(count)]
+    vertices = 1 + count + (not closed)
+    surface = surface_of(mesh_of(scrambled(faces, vertices, np.random.default_rng(0)), vertices))
+    assert sorted(surface.shape) == [2, vertices - 1]
+    assert sum(surface.closed) == closed
+
+
 def test_quads_that_name_the_pole_twice_come_back_so() -> None:
     faces = [[max(corner - 7, 0) for corner in face] for face in grid_faces(5, 8, (False, True))]
     surface = surface_of(mesh_of(faces, 33))

@@ -105,7 +105,8 @@ def find_poles(
         if together:
             missing[vertex] = 0
             for index in range(count):
-                missing[ring[index]] -= 1
+                if valence[ring[index]] > 0:
+                    missing[ring[index]] -= 1
 
 
 @kernel
