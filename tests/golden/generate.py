@@ -6,7 +6,10 @@ Until Lodestream 1.0 this goes with each new version of the format and nothing e
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +18,32 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 
-__all__ = ["FOLDER", "digest", "expectations", "originals"]
+__all__ = ["FOLDER", "Original", "digest", "digests", "expectations", "lines", "originals"]
 
 FOLDER = Path(__file__).parent
 
+Floats = NDArray[np.float64]
 
-def _wave(rows: int, columns: int) -> NDArray[np.float64]:
+
+@dataclass(frozen=True)
+class Original:
+    """A surface, and with what precision it is encoded."""
+
+    surface: ls.Surface
+    precision: str | None = None
+    attribute_precision: Mapping[str, str] = field(default_factory=dict)
+
+    def encode(self) -> bytes:
+        """Its container."""
+        return ls.encode(self.surface, self.precision, attribute_precision=dict(self.attribute_precision))
+
+
+def _wave(rows: int, columns: int) -> Floats:
     y, x = np.mgrid[:rows, :columns] / 8.0
     return np.asarray(np.sin(1.3 * x) * np.cos(0.7 * y) + 0.2 * np.sin(5 * x + 3 * y))
 
 
-def _torus(rows: int, columns: int) -> NDArray[np.float64]:
+def _torus(rows: int, columns: int) -> Floats:
     turns = [np.linspace(0, 2 * np.pi, n, endpoint=False) for n in (rows, columns)]
     v, u = np.meshgrid(*turns, indexing="ij")
     radius = 1 + 0.1 * np.sin(3 * u + 2 * v)
@@ -33,8 +51,58 @@ def _torus(rows: int, columns: int) -> NDArray[np.float64]:
     return np.stack([ring * np.cos(u), ring * np.sin(u), radius * np.sin(v)], axis=-1)
 
 
-def originals() -> dict[str, tuple[ls.Surface, str | None]]:
-    """Name -> surface and precision."""
+def _terrain(rows: int, columns: int) -> Floats:
+    """Ground as (row, column, 3) with uneven distances, no two points alike."""
+    y, x = np.mgrid[:rows, :columns].astype(np.float64)
+    return np.stack([x + 0.1 * np.sin(y), y + 0.2 * np.cos(x / 3), 3 * _wave(rows, columns)], axis=-1)
+
+
+def _sphere(rows: int, columns: int) -> Floats:
+    """Latitudes from pole to pole, closed along the columns' axis."""
+    v, u = np.meshgrid(np.linspace(0, np.pi, rows), 2 * np.pi * np.arange(columns) / columns, indexing="ij")
+    points = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=2)
+    points[0], points[-1] = (0, 0, 1), (0, 0, -1)
+    return points
+
+
+def _cube_sphere(count: int) -> list[Floats]:
+    """Six patches of a sphere; what they share is the same to the bit."""
+    turns = np.linspace(-np.pi / 4, np.pi / 4, count)
+    t: Floats = np.round((np.tan(turns) - np.tan(turns[::-1])) / 2, 6)
+    a, b = np.meshgrid(t, t, indexing="ij")
+    one = np.ones(a.shape)
+    faces: list[tuple[Floats, Floats, Floats]] = [
+        (one, a, b),
+        (-one, b, a),
+        (b, one, a),
+        (a, -one, b),
+        (a, b, one),
+        (b, a, -one),
+    ]
+    return [np.round(np.stack(face, axis=-1) / np.sqrt(1 + a**2 + b**2)[..., None], 9) for face in faces]
+
+
+def _moebius(rows: int, columns: int) -> Floats:
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, rows), np.linspace(-0.4, 0.4, columns), indexing="ij")
+    ring = 1 + v * np.cos(u / 2)
+    strip = np.stack([ring * np.cos(u), ring * np.sin(u), v * np.sin(u / 2)], axis=2)
+    strip[-1] = strip[0, ::-1]
+    return strip
+
+
+def _cut(points: Floats, rows: Sequence[int], columns: Sequence[int]) -> list[Floats]:
+    """Windows between cuts, which have the points at a cut in common."""
+    return [
+        points[a : b + 1, c : d + 1].copy() for a, b in itertools.pairwise(rows) for c, d in itertools.pairwise(columns)
+    ]
+
+
+def _blocks(arrays: Sequence[NDArray[Any]], closed: tuple[bool, bool] = (False, False)) -> ls.Surface:
+    return ls.Surface(blocks=[ls.Block(points, closed) for points in arrays])
+
+
+def _simple() -> dict[str, Original]:
+    """One block, without holes and attributes of other types."""
     rng = np.random.default_rng(2002)
     wave = _wave(37, 54)
     rough = np.cumsum(np.cumsum(rng.normal(size=(33, 41)), 0), 1)
@@ -43,66 +111,199 @@ def originals() -> dict[str, tuple[ls.Surface, str | None]]:
     tower = np.zeros((9, 9), np.float32)
     tower[4, 4] = 1
     return {
-        "heights-int16": (
-            ls.Surface(np.rint(20 * rough).astype(np.int16), metadata={"name": "rough", "unit": "m"}),
-            None,
+        "heights-int16": Original(
+            ls.Surface(np.rint(20 * rough).astype(np.int16), metadata={"name": "rough", "unit": "m"})
         ),
-        "heights-uint8-even": (ls.Surface(rng.integers(0, 256, (16, 24)).astype(np.uint8)), None),
-        "heights-int64-far": (ls.Surface(rng.integers(-(2**62), 2**62, (7, 6))), None),
-        "heights-decimal": (ls.Surface(np.round(wave * 50, 1)), None),
-        "heights-float32": (ls.Surface(wave.astype(np.float32)), None),
-        "heights-float64-hostile": (ls.Surface(hostile), None),
-        "heights-precision": (ls.Surface(_wave(90, 70)), "1e-4d"),
-        "heights-constant": (ls.Surface(np.full((5, 8), 12.5)), None),
-        "heights-tower": (ls.Surface(tower), None),
-        "planar-open": (ls.Surface(_torus(13, 11)[..., :2].astype(np.float32)), None),
-        "torus-odd": (ls.Surface(_torus(21, 33).astype(np.float32), (True, True)), None),
-        "cylinder-even": (ls.Surface(_torus(24, 18), (True, False)), "1e-3d"),
-        "attributes": (ls.Surface(attributes, (False, True)), None),
-        "curve": (ls.Surface(_torus(1, 70)[0][:, None].astype(np.float32), (True, False)), None),
-        "two-points": (ls.Surface(np.array([[1.0, 4.0]])), None),
-        "several-tiles": (ls.Surface(np.rint(300 * _wave(330, 520)).astype(np.int32)), "2"),
+        "heights-uint8-even": Original(ls.Surface(rng.integers(0, 256, (16, 24)).astype(np.uint8))),
+        "heights-int64-far": Original(ls.Surface(rng.integers(-(2**62), 2**62, (7, 6)))),
+        "heights-decimal": Original(ls.Surface(np.round(wave * 50, 1))),
+        "heights-float32": Original(ls.Surface(wave.astype(np.float32))),
+        "heights-float64-hostile": Original(ls.Surface(hostile)),
+        "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
+        "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
+        "heights-tower": Original(ls.Surface(tower)),
+        "planar-open": Original(ls.Surface(_torus(13, 11)[..., :2].astype(np.float32))),
+        "torus-odd": Original(ls.Surface(_torus(21, 33).astype(np.float32), (True, True))),
+        "cylinder-even": Original(ls.Surface(_torus(24, 18), (True, False)), "1e-3d"),
+        "attributes": Original(ls.Surface(attributes, (False, True))),
+        "curve": Original(ls.Surface(_torus(1, 70)[0][:, None].astype(np.float32), (True, False))),
+        "two-points": Original(ls.Surface(np.array([[1.0, 4.0]]))),
+        "several-tiles": Original(ls.Surface(np.rint(300 * _wave(386, 389)).astype(np.int32)), "20"),
+        "several-tiles-line": Original(ls.Surface(np.rint(300 * _wave(1, 50000).T).astype(np.int32)), "20"),
     }
 
 
-def digest(points: NDArray[Any]) -> str:
-    """SHA-256 of an array's values, in C order and little-endian."""
-    return hashlib.sha256(points.astype(points.dtype.newbyteorder("<")).tobytes()).hexdigest()
+def _with_holes() -> dict[str, Original]:
+    rng = np.random.default_rng(2003)
+    y, x = np.mgrid[:41, :60]
+    lake = (np.hypot(y - 15, x - 22) < 9) | (np.hypot(y - 38, x - 50) < 12) | (rng.random((41, 60)) < 0.01)
+    floats = _wave(41, 60).astype(np.float32)
+    floats[lake] = np.nan
+    metres = np.rint(900 * _wave(41, 60)).astype(np.int16)
+    metres[lake] = -32768
+    tube = _torus(19, 26)
+    tube[5:9, 20:] = np.nan
+    tube[5:9, :3] = np.nan
+    return {
+        "holes-float32": Original(ls.Surface(floats)),
+        "holes-int16": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -32768})),
+        "holes-closed": Original(ls.Surface(tube, (True, True)), "1e-4d"),
+    }
+
+
+def _with_attributes() -> dict[str, Original]:
+    rng = np.random.default_rng(2004)
+    temperature = 280 + 10 * _wave(22, 31)
+    temperature[3:5, 7:12] = np.nan
+    temperature[0, 0], temperature[0, 1], temperature[0, 2] = np.inf, -np.inf, -0.0
+    attributes: dict[str, NDArray[Any]] = {
+        "color": rng.integers(0, 256, (22, 31, 3)).astype(np.uint8),
+        "temperature": temperature,
+        "label": np.rint(40 * _wave(22, 31)).astype(np.int32) ** 3,
+        "flow": _torus(22, 31)[..., :2].astype(np.float32),
+    }
+    points = _torus(22, 31).astype(np.float32)
+    mask = np.ones((22, 31), bool)
+    mask[10:15, 11:17] = False
+    smooth: dict[str, NDArray[Any]] = {
+        "pressure": 1e5 + 300 * _wave(40, 33),
+        "count": np.arange(40 * 33, dtype=np.uint16).reshape(40, 33),
+    }
+    return {
+        "attributes-types": Original(ls.Surface(points, (True, False), mask=mask, attributes=attributes)),
+        "attributes-precision": Original(
+            ls.Surface(np.round(_wave(40, 33), 3), attributes=smooth), None, {"pressure": "0.5"}
+        ),
+    }
+
+
+def _planes() -> dict[str, Original]:
+    """x and y over regular and turned grids, and one over a grid of uneven lines."""
+    z = _wave(33, 65)
+    row, column = np.mgrid[:33, :65].astype(np.float64)
+    lines = (
+        np.broadcast_to(np.linspace(0.1, 2.35, 65), z.shape),
+        np.broadcast_to(np.geomspace(1, 7, 33)[:, None], z.shape),
+    )
+    grids = {
+        "plane-steps": (500000.0 + 30.0 * column, (4 * row - 7) / 10),
+        "plane-lines": lines,
+        "plane-turned": (
+            3.0 * (column + 0.5) + 4.0 * (row + 0.5) + 0.1,
+            4.0 * (column + 0.5) - 3.0 * (row + 0.5) - 7.0,
+        ),
+    }
+    found = {name: np.stack([x, y, z], axis=-1) for name, (x, y) in grids.items()}
+    found["plane-steps"][4:7, 20:25] = np.nan
+    found["plane-uneven"] = found["plane-turned"][:29, :54]
+    return {name: Original(ls.Surface(points), "1e-3d") for name, points in found.items()}
+
+
+def _arrangements() -> dict[str, Original]:
+    """Blocks with common sides, and blocks that meet themselves."""
+    three = _cut(_terrain(26, 48), [0, 25], [0, 13, 29, 47])
+    three[1] = three[1][::-1, ::-1].copy()
+    holes = _cut(_terrain(24, 31), [0, 9, 23], [0, 30])
+    holes[0][-4:, 10:20] = np.nan
+    holes[1][:6, 10:20] = np.nan
+    bricks = [*_cut(_terrain(19, 49)[:10], [0, 9], [0, 16, 32, 48]), *_cut(_terrain(19, 49)[9:], [0, 9], [0, 22, 48])]
+    whole = [np.rint(block * 40).astype(np.int32) for block in _cut(_terrain(30, 33), [0, 17, 29], [0, 14, 32])]
+    ball = _sphere(17, 24)
+    turns = 2 * np.pi * np.arange(22) / 22
+    wall = np.stack([[np.cos(turns), np.sin(turns), np.full(22, h / 5)] for h in range(7)]).transpose(0, 2, 1).copy()
+    disc = np.stack([wall[0] * [r, r, 1] for r in (1.0, 0.7, 0.4, 0.0)])
+    flap = np.stack([np.roll(wall[0], 6, 0)[:11] * [r, r, 1] for r in (1.0, 1.4, 1.7, 2.0, 2.2)])
+    large = _cut(_terrain(197, 345)[..., :2], [0, 150, 196], [0, 344])
+    wide = [ls.Block(block, attributes={"speed": (7 * block[..., 2]).astype(np.float32)}) for block in holes]
+    return {
+        "blocks-reversed": Original(_blocks(three)),
+        "blocks-holes": Original(ls.Surface(blocks=wide)),
+        "blocks-bricks": Original(_blocks(bricks)),
+        "blocks-integers": Original(_blocks(whole)),
+        "cube-sphere": Original(_blocks([patch.astype(np.float32) for patch in _cube_sphere(14)])),
+        "sphere-closed": Original(_blocks([ball], (False, True))),
+        "sphere-seam": Original(_blocks([np.concatenate([ball, ball[:, :1]], axis=1)])),
+        "sphere-halves": Original(_blocks(_cut(np.concatenate([ball, ball[:, :1]], axis=1), [0, 16], [0, 9, 24]))),
+        "cylinder-disc": Original(_blocks([wall, disc], (False, True))),
+        "cylinder-flap": Original(ls.Surface(blocks=[ls.Block(wall, (False, True)), ls.Block(flap)])),
+        "moebius": Original(_blocks(_cut(_moebius(41, 8), [0, 12, 26, 40], [0, 7]))),
+        "blocks-groups": Original(_blocks(large), "2e-3d"),
+    }
+
+
+def originals() -> dict[str, Original]:
+    """All that there is a golden file of."""
+    return {**_simple(), **_with_holes(), **_with_attributes(), **_planes(), **_arrangements()}
+
+
+def digest(arrays: Sequence[NDArray[Any]]) -> str:
+    """The first 20 digits of the SHA-256 of the values of arrays, one after another, in C order and little-endian."""
+    digested = hashlib.sha256()
+    for array in arrays:
+        digested.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digested.hexdigest()[:20]
+
+
+def digests(surface: ls.Surface) -> list[str]:
+    """Of each block, the digest of its points and then its attributes."""
+    return [digest([block.points, *block.attributes.values()]) for block in surface.blocks]
+
+
+def _kind(array: NDArray[Any]) -> dict[str, Any]:
+    return {"type": array.dtype.name, "shape": list(array.shape)}
 
 
 def expectations(container: bytes) -> dict[str, Any]:
-    """What a container decodes to: shape, type, errors and values of each layer, and the grid of each level."""
+    """What a container decodes to: shapes, types, errors and values of each layer, and the grids of each level."""
     decoder = ls.Decoder()
     decoder.feed(container)
     decoder.finish()
     header = decoder.header
     assert header is not None
     return {
-        "shape": list(decoder.surface().points.shape),
-        "type": header.dtype.name,
-        "closed": list(header.closed),
+        "blocks": [
+            {
+                "closed": list(block.closed),
+                "holes": block.holes,
+                "points": _kind(block.points),
+                "attributes": {name: _kind(array) for name, array in block.attributes.items()},
+            }
+            for block in decoder.surface().blocks
+        ],
         "layers": [
             {
                 "bytes": view.bytes,
                 "level": view.level,
                 "rms": view.rms,
                 "max": view.max_error,
-                "sha256": digest(view.points),
+                "sha256": digests(view.surface()),
             }
             for view in decoder.layers
         ],
-        "levels": [digest(decoder.points_at(level)) for level in range(header.levels + 1)],
+        "levels": [digests(decoder.surface(level)) for level in range(header.levels + 1)],
     }
+
+
+def lines(expected: Mapping[str, Mapping[str, Any]]) -> str:
+    """Expectations as JSON, a line for each block, layer and level."""
+    surfaces = []
+    for name, parts in expected.items():
+        lists = (
+            f"  {json.dumps(part)}: [\n" + ",\n".join(f"   {json.dumps(entry)}" for entry in entries) + "\n  ]"
+            for part, entries in parts.items()
+        )
+        surfaces.append(f" {json.dumps(name)}: {{\n" + ",\n".join(lists) + "\n }")
+    return "{\n" + ",\n".join(surfaces) + "\n}\n"
 
 
 def main() -> None:
     """Write all files."""
     expected = {}
-    for name, (surface, precision) in originals().items():
-        container = ls.encode(surface, precision)
+    for name, original in originals().items():
+        container = original.encode()
         (FOLDER / f"{name}.lode").write_bytes(container)
         expected[name] = expectations(container)
-    (FOLDER / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
+    (FOLDER / "expected.json").write_text(lines(expected))
 
 
 if __name__ == "__main__":

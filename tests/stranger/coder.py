@@ -58,12 +58,12 @@ class RangeDecoder:
 
 
 class Model:
-    """Section 7.2: the contexts of one unit, and the weights of its two mixtures."""
+    """Section 7.2: contexts, by the probabilities and surenesses that they start with, and the weights of mixtures."""
 
-    def __init__(self) -> None:
-        self._chance = [256 * c + 128 for c in START_CHANCE]
-        self._sureness = list(START_SURENESS)
-        self._weights = [[32768, 32768], [32768, 32768]]
+    def __init__(self, chances: list[int], surenesses: list[int], pairs: int = 0) -> None:
+        self._chance = list(chances)
+        self._sureness = list(surenesses)
+        self._weights = [[32768, 32768] for _ in range(pairs)]
 
     def _learn(self, context: int, bit: int) -> None:
         n = self._sureness[context]
@@ -91,6 +91,16 @@ class Model:
         return bit
 
 
+def model_of_unit() -> Model:
+    """Where the contexts of a unit start, and the weights of its two mixtures."""
+    return Model([256 * c + 128 for c in START_CHANCE], START_SURENESS, 2)
+
+
+def new_contexts(count: int, pairs: int = 0) -> Model:
+    """Contexts that know nothing yet."""
+    return Model([2**19] * count, [1] * count, pairs)
+
+
 def _zeros(rows: int, columns: int, margin: int, value: int = 0) -> Grid:
     return [[value] * (columns + 2 * margin) for _ in range(rows + 2 * margin)]
 
@@ -99,10 +109,11 @@ def _zeros(rows: int, columns: int, margin: int, value: int = 0) -> Grid:
 class Band:
     """A tile's part of a band: rows and columns first ... first + count - 1 of the band of the level.
 
-    `place` is where the part stands in the channel's array of coefficients.
+    `place` is where the part stands in the array of coefficients of a channel of a grid.
     """
 
     kind: int
+    grid: int
     first: tuple[int, int]
     rows: int
     columns: int
@@ -126,8 +137,9 @@ class Band:
         return 0
 
     def parent_place(self, row: int, column: int) -> tuple[int, int]:
-        """The index in the parent's band of the parent of a coefficient of this part."""
-        return (row + self.first[0]) >> self.shift[0], (column + self.first[1]) >> self.shift[1]
+        """The index in the whole band of the parent of a coefficient of this part."""
+        down, along = self.shift
+        return (self.first[0] + down >> down) + (row >> down), (self.first[1] + along >> along) + (column >> along)
 
 
 CLASS = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5]
@@ -154,7 +166,7 @@ class Unit:
     bands: list[Band]
     top: int = 0
     remaining: int = -1  # passes; -1 before the first segment
-    model: Model = field(default_factory=Model)
+    model: Model = field(default_factory=model_of_unit)
 
     def decode(self, top: int | None, passes: int, segment: bytes, most: int) -> None:
         """Takes the next segment of a unit that may have so many bit-planes at most."""

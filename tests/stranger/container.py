@@ -1,66 +1,20 @@
-"""Sections 1 to 3, 6 and 9 to 12 of the page: what the bytes of a container hold, before anything is decoded."""
+"""Sections 2, 6 and 9 to 12 of the page: what the bytes of a container hold, before anything is decoded."""
 
 from __future__ import annotations
 
-import struct
 import zlib
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgpack
 
+from tests.stranger.fields import DamagedError, Fields
+from tests.stranger.header import Header, read_header
+
 MAGIC = b"\x89LODE\r\n"
+VERSION = 2
 FOOTER_MAGIC = b"LODEEND\n"
-TYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-HEADER, LAYER, EXACTNESS, METADATA, INDEX = 1, 2, 3, 4, 5
-
-
-class DamagedError(ValueError):
-    """The bytes are not those of a container, or not of one that this reader knows."""
-
-
-class CutError(DamagedError):
-    """There are fewer bytes than a field needs."""
-
-
-class Fields:
-    """Reads one field after another."""
-
-    def __init__(self, data: bytes, position: int = 0) -> None:
-        self.data = data
-        self.position = position
-
-    def bytes(self, count: int) -> bytes:
-        """The next bytes as they are."""
-        if count > len(self.data) - self.position:
-            raise CutError("the bytes end within a field")
-        self.position += count
-        return self.data[self.position - count : self.position]
-
-    def number(self, layout: str) -> int:
-        """A whole number of fixed size."""
-        (value,) = struct.unpack("<" + layout, self.bytes(struct.calcsize("<" + layout)))
-        return int(value)
-
-    def f64(self) -> float:
-        """A binary64."""
-        (value,) = struct.unpack("<d", self.bytes(8))
-        return float(value)
-
-    def varint(self) -> int:
-        """A varint: seven bits a byte, at most nine bytes."""
-        value = 0
-        for place in range(9):
-            byte = self.number("B")
-            value |= (byte & 127) << 7 * place
-            if byte < 128:
-                return value
-        raise DamagedError("a varint of more than nine bytes")
-
-    def finish(self) -> None:
-        """Nothing may be left."""
-        if self.position != len(self.data):
-            raise DamagedError("bytes are left over")
+HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
 
 
 @dataclass(frozen=True)
@@ -76,76 +30,11 @@ def read_section(data: bytes, position: int) -> Section:
     """The section at a place of the file."""
     fields = Fields(data, position)
     kind = fields.number("B")
-    payload = fields.bytes(fields.varint())
+    payload = fields.take(fields.varint())
     body = data[position : fields.position]
     if fields.number("I") != zlib.crc32(body):
         raise DamagedError("a section's CRC is wrong")
     return Section(kind, payload, fields.position)
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """The rule that makes values of a channel's whole numbers."""
-
-    decimal: bool
-    origin: float
-    step: float
-
-
-@dataclass(frozen=True)
-class Header:
-    """Section 3; `predictors` are the pairs in the order of the file, which section 4 says how to hand out."""
-
-    closed: tuple[bool, bool]
-    flat: bool
-    exact: bool
-    has_exactness: bool
-    type: str
-    height: int
-    width: int
-    channels: int
-    layers: int
-    tile: tuple[int, int]
-    fraction: int
-    extent: float
-    lattices: list[Lattice]
-    empty: list[int]
-    predictors: list[tuple[int, int]]
-
-
-def read_header(payload: bytes) -> Header:
-    """The header of the file."""
-    fields = Fields(payload)
-    flags = fields.number("B")
-    if flags >> 5:
-        raise DamagedError("unknown flags")
-    kind = TYPES[fields.number("B")]
-    height, width, channels, layers = (fields.varint() for _ in range(4))
-    tile = fields.number("B")
-    fraction = fields.number("B")
-    extent = fields.f64()
-    lattices = [Lattice(fields.number("B") == 1, fields.f64(), fields.f64()) for _ in range(channels)]
-    empty = [fields.varint() for _ in range(channels)]
-    predictors = []
-    while fields.position < len(payload):
-        predictors.append((fields.number("b"), fields.number("b")))
-    return Header(
-        closed=(bool(flags & 1), bool(flags & 2)),
-        flat=bool(flags & 4),
-        exact=bool(flags & 8),
-        has_exactness=bool(flags & 16),
-        type=kind,
-        height=height,
-        width=width,
-        channels=channels,
-        layers=layers,
-        tile=(tile & 15, tile >> 4),
-        fraction=fraction,
-        extent=extent,
-        lattices=lattices,
-        empty=empty,
-        predictors=predictors,
-    )
 
 
 @dataclass(frozen=True)
@@ -183,9 +72,40 @@ def read_layer(section: Section) -> Layer:
         size = fields.varint()
         top = fields.number("B") if size & 1 else None
         entries.append((unit, passes, top, size >> 1))
-    segments = [Segment(unit, passes, top, fields.bytes(length)) for unit, passes, top, length in entries]
+    segments = [Segment(unit, passes, top, fields.take(length)) for unit, passes, top, length in entries]
     fields.finish()
     return Layer(rms, maximum, segments, section.end)
+
+
+def pieces_of(header: Header) -> list[tuple[int, range, range, int]]:
+    """The pieces of exactness, in order: block, rows, columns, channel."""
+    down, along = (2 ** (t + 1) for t in header.tile)
+    return [
+        (number, range(row, min(row + down, block.rows)), range(column, min(column + along, block.columns)), channel)
+        for number, block in enumerate(header.blocks)
+        for row in range(0, block.rows, down)
+        for column in range(0, block.columns, along)
+        for channel in range(header.channels)
+    ]
+
+
+@dataclass(frozen=True)
+class Exactness:
+    """Section 9: the pieces as they are in the file, and the errors that are left."""
+
+    rms: float
+    maximum: float
+    pieces: list[bytes]
+
+
+def read_exactness(section: Section, header: Header) -> Exactness:
+    """The pieces of exactness."""
+    fields = Fields(section.payload)
+    rms, maximum = fields.f64(), fields.f64()
+    lengths = [fields.varint() for _ in pieces_of(header)]
+    pieces = [fields.take(length) for length in lengths]
+    fields.finish()
+    return Exactness(rms, maximum, pieces)
 
 
 @dataclass
@@ -193,15 +113,16 @@ class Container:
     """What a file or the beginning of one holds."""
 
     header: Header
+    masks: bytes | None = None
     layers: list[Layer] = field(default_factory=list)
-    exactness: bytes | None = None
+    exactness: Exactness | None = None
     metadata: dict[str, Any] | None = None
 
 
 def read_container(data: bytes) -> Container:
     """Reads from the front; what follows the first damaged or unfinished section is left alone."""
-    if data[:7] != MAGIC or data[7:8] != b"\x01":
-        raise DamagedError("not a container of version 1")
+    if data[:7] != MAGIC or data[7] != VERSION:
+        raise DamagedError(f"not a container of version {VERSION}")
     section = read_section(data, 8)
     if section.kind != HEADER:
         raise DamagedError("the first section is not the header")
@@ -213,8 +134,10 @@ def read_container(data: bytes) -> Container:
             return container
         if section.kind == LAYER:
             container.layers.append(read_layer(section))
+        elif section.kind == MASKS:
+            container.masks = section.payload
         elif section.kind == EXACTNESS:
-            container.exactness = section.payload
+            container.exactness = read_exactness(section, container.header)
         elif section.kind == METADATA:
             container.metadata = msgpack.unpackb(section.payload)
         elif section.kind == INDEX:
@@ -244,23 +167,26 @@ class Entry:
 
 @dataclass(frozen=True)
 class Index:
-    """Section 11: errors and entries layer by layer, errors level by level."""
+    """Section 11: errors and entries layer by layer, errors level by level, and the pieces of exactness."""
 
     layer_errors: list[tuple[float, float]]
     entries: list[list[Entry]]
     level_errors: list[tuple[float, float]]
+    pieces: list[bytes]
 
 
-def read_index(data: bytes, levels: int) -> Index:
+def read_index(data: bytes, header: Header, levels: int) -> Index:
     """The index, found by the footer; every place that it gives is held to the others."""
     footer = Fields(data, len(data) - 24)
     offset, length = footer.number("Q"), footer.number("I")
-    if footer.number("I") != zlib.crc32(data[-24:-12]) or footer.bytes(8) != FOOTER_MAGIC:
+    if footer.number("I") != zlib.crc32(data[-24:-12]) or footer.take(8) != FOOTER_MAGIC:
         raise DamagedError("the footer is wrong")
     section = read_section(data, offset)
     if section.kind != INDEX or section.end - offset != length or section.end + 24 != len(data):
         raise DamagedError("the footer does not name the index")
     position = read_section(data, 8).end
+    if header.has_masks:
+        position = read_section(data, position).end
     fields = Fields(section.payload)
     errors: list[tuple[float, float]] = []
     entries: list[list[Entry]] = []
@@ -280,8 +206,26 @@ def read_index(data: bytes, levels: int) -> Index:
             entries[-1].append(Entry(unit, passes, top, start, size, crc))
             start += size
     level_errors = [(fields.f64(), fields.f64()) for _ in range(levels)]
-    position += fields.varint() + fields.varint()
+    exactness_length = fields.varint()
+    position += exactness_length
+    pieces = _read_pieces(fields, data, header, position - 4) if exactness_length else []
+    position += fields.varint()
     fields.finish()
     if position != offset:
         raise DamagedError("the lengths of the index do not lead to the index")
-    return Index(errors, entries, level_errors)
+    return Index(errors, entries, level_errors, pieces)
+
+
+def _read_pieces(fields: Fields, data: bytes, header: Header, end: int) -> list[bytes]:
+    named = []
+    for _ in pieces_of(header):
+        length = fields.varint()
+        named.append((length, fields.number("I") if length else zlib.crc32(b"")))
+    pieces = []
+    position = end - sum(length for length, _ in named)
+    for length, crc in named:
+        pieces.append(data[position : position + length])
+        if zlib.crc32(pieces[-1]) != crc:
+            raise DamagedError("a piece's CRC is wrong")
+        position += length
+    return pieces

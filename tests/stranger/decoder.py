@@ -3,20 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
-from tests.stranger.coder import MARGIN, Grid, clamp
-from tests.stranger.container import Container, Header, Segment
-from tests.stranger.picture import Levels, Points, exact, known_part, rounded, undo_level, units_of, value
+import numpy as np
+
+from tests.stranger.container import Container, Exactness, Segment, pieces_of
+from tests.stranger.exactness import restore
+from tests.stranger.header import Header
+from tests.stranger.layout import Levels, units_of
+from tests.stranger.masks import Masks, read_masks
+from tests.stranger.picture import Arrays, Values, block_places, plane_value, put_together, rounded, value
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a block shows: its points and then its attributes, and which points are valid."""
+
+    arrays: list[Values]
+    valid: Values
 
 
 class Decoder:
     """Decodes segments in any order that the page allows, and remembers what was known after every layer."""
 
-    def __init__(self, header: Header) -> None:
-        self.header = header
-        self.levels = Levels(header)
-        self.units = units_of(header, self.levels)
+    def __init__(self, container: Container) -> None:
+        self.header: Header = container.header
+        self.levels = Levels(self.header)
+        self.units = units_of(self.header, self.levels)
         self.known = [self._remaining()]  # passes that remain of every unit, after 0, 1, 2, ... layers
+        self.masks: Masks | None = None
+        if container.masks is not None:
+            self.masks = read_masks(container.masks, self.header.blocks)
 
     def _remaining(self) -> list[int]:
         return [unit.remaining for unit in self.units]
@@ -34,6 +51,7 @@ class Decoder:
             unit = self.units[number]
             is_known = (
                 remaining[number] == 0
+                or not unit.bands
                 or self.header.empty[channel] >> unit.level & 1
                 or (complete and remaining[number] < 0)
             )
@@ -41,56 +59,92 @@ class Decoder:
                 unknown = min(unknown, unit.level)
         return unknown - 1
 
-    def _coordinates(self, channel: int, level: int, remaining: list[int], complete: bool) -> list[float]:
-        rows, columns = self.levels.shape[level]
-        scale = 2**self.header.fraction
-        limit = 2 ** (27 - self.header.fraction)
+    def _channel(self, channel: int, level: int, remaining: list[int], complete: bool) -> list[Values]:
+        """The values of a channel, block by block."""
+        header = self.header
+        scale = 2**header.fraction
         whole = self.whole(channel, level, remaining, complete)
-        grid: Grid = [[0] * columns for _ in range(rows)]
-        for number in range(channel, len(self.units), self.header.channels):
+        arrays = Arrays(header, self.levels, channel, level)
+        for number in range(channel, len(self.units), header.channels):
             unit = self.units[number]
-            if unit.level > level or remaining[number] < 0:
-                continue
-            factor = scale if unit.level > whole else 1
-            for band in unit.bands:
-                for r in range(band.rows):
-                    for c in range(band.columns):
-                        magnitude = band.magnitude[r + MARGIN][c + MARGIN]
-                        shown = known_part(magnitude, band.born[r][c], remaining[number])
-                        place = band.sign[r + MARGIN][c + MARGIN] * shown * factor
-                        grid[band.place[0] + r][band.place[1] + c] = place
-        for step in range(1, level + 1):
-            if step == whole + 1:
-                for row in range(self.levels.shape[step - 1][0]):
-                    for column in range(self.levels.shape[step - 1][1]):
-                        grid[row][column] = clamp(grid[row][column], -limit, limit) * scale
-            undo_level(grid, self.levels, step, self.levels.predictors[channel])
+            if unit.level <= level and remaining[number] >= 0:
+                arrays.put(unit, remaining[number], scale if unit.level > whole else 1)
+        arrays.to_points(whole)
         over = scale if whole < level else 1
-        return [number / over for row in grid for number in row]
+        shown = []
+        for block in range(len(header.blocks)):
+            grid = put_together(header, self.levels, block, level, arrays.numbers)
+            numbers = [value(header.lattices[channel], q / over) for row in grid for q in row]
+            shown.append(rounded(numbers, header.types[channel]).reshape(len(grid), len(grid[0])))
+        return shown
 
-    def picture(self, layers: int | None = None, level: int | None = None) -> Points:
-        """The picture after so many layers (or calls of `take`), or the grid of a coarser level."""
+    def channels(self, layers: int | None = None, level: int | None = None) -> list[list[Values]]:
+        """The values after so many layers (or calls of `take`), or those of a coarser level: block, then channel."""
         layers = len(self.known) - 1 if layers is None else layers
         level = self.levels.last if level is None else level
         complete = layers == self.header.layers
-        channels = []
-        for channel, lattice in enumerate(self.header.lattices):
-            coordinates = self._coordinates(channel, level, self.known[layers], complete)
-            channels.append([value(lattice, q) for q in coordinates])
-        numbers = [number for point in zip(*channels, strict=True) for number in point]
-        shape = self.levels.shape[level] if self.header.flat else (*self.levels.shape[level], self.header.channels)
-        return rounded(numbers, self.header.type).reshape(shape)
+        found = [self._channel(n, level, self.known[layers], complete) for n in range(self.header.channels)]
+        return [[channel[block] for channel in found] for block in range(len(self.header.blocks))]
+
+    def shown(self, channels: list[list[Values]], level: int | None = None) -> list[Shown]:
+        """Blocks as they are handed out, from the values of their channels: with x and y, and with holes."""
+        level = self.levels.last if level is None else level
+        return [self._block(number, values, level) for number, values in enumerate(channels)]
+
+    def _block(self, number: int, channels: list[Values], level: int) -> Shown:
+        header = self.header
+        rows, columns = block_places(header, self.levels, number, level)
+        valid = np.ones((len(rows), len(columns)), bool)
+        if self.masks is not None:
+            valid = self.masks.masks[number][np.ix_(rows, columns)]
+        points = list(channels[: header.points_channels])
+        if header.plane is not None:
+            size = header.blocks[number].rows, header.blocks[number].columns
+            for axis, rule in zip((0, 1), reversed(header.plane["grid"]), strict=True):
+                numbers = [plane_value(rule, axis, (row, column), size) for row in rows for column in columns]
+                points.insert(0, rounded(numbers, header.type).reshape(valid.shape))
+        arrays = [_with_holes(np.stack(points, axis=-1), valid, 0 if self.masks is None else self.masks.hole)]
+        if header.flat and header.plane is None:
+            arrays[0] = arrays[0][..., 0]
+        first = header.points_channels
+        for attribute in header.attributes:
+            array = np.stack(channels[first : first + attribute.channels], axis=-1)
+            array = _with_holes(array, valid, 0)
+            arrays.append(array if attribute.components else array[..., 0])
+            first += attribute.channels
+        return Shown(arrays, valid)
+
+    def picture(self, layers: int | None = None, level: int | None = None) -> list[Shown]:
+        """The picture after so many layers (or calls of `take`), or the grids of a coarser level."""
+        return self.shown(self.channels(layers, level), level)
+
+    def exact(self, exactness: Exactness) -> list[Shown]:
+        """The surface itself."""
+        found = self.channels()
+        for piece, (block, rows, columns, channel) in zip(exactness.pieces, pieces_of(self.header), strict=True):
+            window = (slice(rows.start, rows.stop), slice(columns.start, columns.stop))
+            valid = np.ones((len(rows), len(columns)), bool)
+            if self.masks is not None:
+                valid = self.masks.masks[block][window]
+            values = found[block][channel][window]
+            values[valid] = restore(piece, values[valid])
+        return self.shown(found)
+
+
+def _with_holes(array: Values, valid: Values, hole: int) -> Values:
+    array = array.copy()
+    array[~valid] = np.nan if array.dtype.kind == "f" else hole
+    return array
 
 
 def decode(container: Container) -> Decoder:
     """Decodes all layers of a container, or of the beginning of one."""
-    decoder = Decoder(container.header)
+    decoder = Decoder(container)
     for layer in container.layers:
         decoder.take(layer.segments)
     return decoder
 
 
-def surface(container: Container, decoder: Decoder) -> Points:
+def surface(container: Container, decoder: Decoder) -> list[Shown]:
     """The surface itself: the last picture, with exactness where the container has it."""
-    points = decoder.picture()
-    return points if container.exactness is None else exact(container.exactness, points)
+    return decoder.picture() if container.exactness is None else decoder.exact(container.exactness)

@@ -1,136 +1,24 @@
-"""Sections 4, 5, 8 and 9 of the page: levels, tiles, and the way from coefficients to points."""
+"""Sections 3 and 8 of the page: from the coefficients of a channel to its numbers, and from those to values."""
 
 from __future__ import annotations
 
-import zlib
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.stranger.coder import Band, Grid, Unit, clamp
-from tests.stranger.container import Header, Lattice
-from tests.stranger.tables import TAPS
+from tests.stranger.coder import MARGIN, Unit, clamp
+from tests.stranger.header import Header, Lattice, Part
+from tests.stranger.layout import Grid, Levels
+from tests.stranger.lifting import details, undo
 
-Points = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Step:
-    """The step of one axis from a level to the next coarser one."""
-
-    samples: int
-    periodic: bool  # a closed axis of an even number of samples
-
-    @property
-    def midpoints(self) -> int:
-        """M of the page."""
-        return self.samples // 2 if self.periodic else (self.samples - 1) // 2
-
-    @property
-    def run(self) -> int:
-        """R of the page."""
-        return (self.samples + 1) // 2
-
-    @property
-    def nodes(self) -> int:
-        """Samples of the coarser level."""
-        return self.samples - self.midpoints
-
-
-def steps_of(samples: int, closed: bool) -> list[Step]:
-    """The steps of an axis, the finest first."""
-    steps = []
-    while samples >= (5 if closed else 3):
-        steps.append(Step(samples, closed and samples % 2 == 0))
-        samples = steps[-1].nodes
-    return steps
-
-
-class Levels:
-    """Section 4: the grid of every level, and the steps between them."""
-
-    def __init__(self, header: Header) -> None:
-        steps = [steps_of(header.height, header.closed[0]), steps_of(header.width, header.closed[1])]
-        self.last = max(len(steps[0]), len(steps[1]))
-        size = [header.height, header.width]
-        self.shape = [(0, 0)] * (self.last + 1)
-        self.shape[self.last] = (size[0], size[1])
-        self.steps: list[list[Step | None]] = [[None, None] for _ in range(self.last + 1)]  # from this level down
-        for level in range(self.last, 0, -1):
-            for axis in (0, 1):
-                done = self.last - level
-                if done < len(steps[axis]):
-                    self.steps[level][axis] = steps[axis][done]
-                    size[axis] = steps[axis][done].nodes
-            self.shape[level - 1] = (size[0], size[1])
-        self.predictors = self._predictors(header)
-
-    def _predictors(self, header: Header) -> list[dict[tuple[int, int], tuple[int, int]]]:
-        given = iter(header.predictors)
-        channels = []
-        for _ in range(header.channels):
-            fitted = {}
-            for level in range(self.last):
-                for axis in (0, 1):
-                    step = self.steps[level + 1][axis]
-                    if step is not None and step.midpoints and step.run >= 24:
-                        fitted[level + 1, axis] = next(given)
-            channels.append(fitted)
-        if next(given, None) is not None:
-            raise ValueError("more predictors than fitted steps")
-        return channels
-
-
-def cut(nodes: int, details: int, size: int) -> list[tuple[range, range]]:
-    """The pieces of an axis of a level: their nodes and their details."""
-    count = max(1, (nodes + size // 2 - 1) // size)
-    edges = [size * piece for piece in range(count)]
-    node_edges, detail_edges = [*edges, nodes], [*(min(edge, details) for edge in edges), details]
-    return [
-        (range(node_edges[k], node_edges[k + 1]), range(detail_edges[k], detail_edges[k + 1])) for k in range(count)
-    ]
-
-
-def units_of(header: Header, levels: Levels) -> list[Unit]:
-    """Section 5: all units, in the order of their numbers."""
-    channels = range(header.channels)
-    height, width = levels.shape[0]
-    units = [Unit(0, [Band(0, (0, 0), height, width, (0, 0))]) for _ in channels]
-    coarser: list[list[list[Unit]]] = []  # the units of level - 1, by row and column of tiles
-    for level in range(1, levels.last + 1):
-        (h, w), (nodes0, nodes1) = levels.shape[level], levels.shape[level - 1]
-        down = cut(nodes0, h - nodes0, 2 ** header.tile[0])
-        along = cut(nodes1, w - nodes1, 2 ** header.tile[1])
-        shift = (int(levels.steps[level - 1][0] is not None), int(levels.steps[level - 1][1] is not None))
-        grid: list[list[list[Unit]]] = []
-        for i, rows in enumerate(down):
-            grid.append([])
-            for j, columns in enumerate(along):
-                parents: list[Unit] = []
-                if coarser:
-                    parents = coarser[min(i >> shift[0], len(coarser) - 1)][min(j >> shift[1], len(coarser[0]) - 1)]
-                grid[-1].append([])
-                for channel in channels:
-                    bands = []
-                    for axis0, axis1 in ((0, 1), (1, 0), (1, 1)):
-                        r, c = rows[axis0], columns[axis1]
-                        if not len(r) or not len(c):
-                            continue
-                        kind = axis1 + 2 * axis0
-                        place = (r.start + axis0 * nodes0, c.start + axis1 * nodes1)
-                        inherited = parents[channel].bands if parents else []
-                        parent = next((band for band in inherited if band.kind == kind), None)
-                        bands.append(Band(kind, (r.start, c.start), len(r), len(c), place, parent, shift))
-                    grid[-1][-1].append(Unit(level, bands))
-                units += grid[-1][-1]
-        coarser = grid
-    return units
+Values = NDArray[Any]
+Lines = list[list[int]]
 
 
 def known_part(magnitude: int, born: int, remaining: int) -> int:
-    """Section 8: the magnitude that is shown when so many passes of the unit remain."""
+    """The magnitude that is shown when so many passes of the unit remain."""
     p = (remaining + 1) >> 1
     if magnitude >> p:
         return ((magnitude >> p) << p) + ((7 << p) >> 4)
@@ -139,66 +27,103 @@ def known_part(magnitude: int, born: int, remaining: int) -> int:
     return 0
 
 
-def _details(line: list[int], step: Step, a: int, b: int) -> list[int]:
-    run, count = step.run, step.midpoints
-    e = line[step.nodes :]
-    if run < 3 or (a, b) == (0, 0):
-        return [clamp(number, -(2**28), 2**28) for number in e]
-    c = {k: line[k] for k in range(run)}
-    if step.periodic:
-        for k in (-2, -1, run, run + 1, run + 2):
-            c[k] = line[k % run]
-    else:
-        for k in (-1, -2):
-            c[k] = 3 * c[k + 1] - 3 * c[k + 2] + c[k + 3]
-        for k in (run, run + 1):
-            c[k] = 3 * c[k - 1] - 3 * c[k - 2] + c[k - 3]
-    d = []
-    for k in range(count):
-        v = a * (-c[k + 2] + c[k + 1] + c[k] - c[k - 1]) + b * (-c[k + 3] + c[k + 1] + c[k] - c[k - 2])
-        d.append(clamp(e[k] + (v + 128) // 256, -(2**28), 2**28))
-    return d
+class Arrays:
+    """The coefficients of one channel, which become its picture: an array for each grid."""
+
+    def __init__(self, header: Header, levels: Levels, channel: int, level: int) -> None:
+        self.levels = levels
+        self.channel = channel
+        self.level = level
+        self.is_coordinate = channel < header.coordinates
+        self.fraction = header.fraction
+        self.grids = [grid for grid in levels.grids if grid.part >= 0 or self.is_coordinate]
+        self.numbers: dict[int, Lines] = {}  # by the number of the grid among all
+        for number, grid in enumerate(levels.grids):
+            rows, columns = grid.shape[level]
+            self.numbers[number] = [[0] * columns for _ in range(rows)]
+
+    def put(self, unit: Unit, remaining: int, factor: int) -> None:
+        """The known part of a unit's coefficients."""
+        for band in unit.bands:
+            numbers = self.numbers[band.grid]
+            for r in range(band.rows):
+                for c in range(band.columns):
+                    shown = known_part(band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c], remaining)
+                    numbers[band.place[0] + r][band.place[1] + c] = band.sign[r + MARGIN][c + MARGIN] * shown * factor
+
+    def to_points(self, whole: int) -> None:
+        """Undoes all steps, where the levels up to `whole` are known."""
+        if self.is_coordinate:
+            self._take_common_ends()
+            for number, grid in enumerate(self.levels.grids):
+                self._take_sides(self.numbers[number], grid)
+        for level in range(1, self.level + 1):
+            for number, grid in enumerate(self.levels.grids):
+                if grid.part >= 0 or self.is_coordinate:
+                    self._refine(self.numbers[number], grid, level, level == whole + 1)
+
+    def _take_common_ends(self) -> None:
+        for (curve, end), (holder, held) in sorted(self.levels.held.items()):
+            self.numbers[curve][end * (self.levels.grids[curve].shape[0][0] - 1)][0] = self.numbers[holder][
+                held * (self.levels.grids[holder].shape[0][0] - 1)
+            ][0]
+
+    def _curve(self, grid: Grid, side: int, level: int, count: int) -> list[int] | None:
+        """The points of a level of the curve of a side, in the order of the side; None if there is no curve."""
+        taken = grid.sides[side]
+        if taken is None:
+            return None
+        points = [row[0] for row in self.numbers[taken.curve][: self.levels.grids[taken.curve].shape[level][0]]]
+        if self.levels.grids[taken.curve].axes[0].samples == 1:
+            return points * count
+        return points[::-1] if taken.reversed else points
+
+    def _take_sides(self, numbers: Lines, grid: Grid) -> None:
+        shape = grid.shape[0]
+        for side in range(4):
+            points = self._curve(grid, side, 0, shape[1 - side // 2])
+            if points is not None:
+                _set_line(numbers, side // 2, (side % 2) * (shape[side // 2] - 1), 0, points)
+
+    def _make_side_details(self, numbers: Lines, grid: Grid, level: int) -> None:
+        nodes = grid.shape[level - 1]
+        for side in range(4):
+            along = 1 - side // 2
+            step = grid.steps[level][along]
+            points = self._curve(grid, side, level, grid.shape[level][along])
+            if step is None or points is None:
+                continue
+            found = details(points, step, self.levels.predictor(self.channel, grid, level, along))
+            _set_line(numbers, side // 2, (side % 2) * (nodes[side // 2] - 1), nodes[along], found)
+
+    def _refine(self, numbers: Lines, grid: Grid, level: int, scaled: bool) -> None:
+        if scaled:
+            limit, scale = 2 ** (27 - self.fraction), 2**self.fraction
+            rows, columns = grid.shape[level - 1]
+            for row in numbers[:rows]:
+                row[:columns] = [clamp(number, -limit, limit) * scale for number in row[:columns]]
+        if self.is_coordinate:
+            self._make_side_details(numbers, grid, level)
+        rows, columns = grid.shape[level]
+        step = grid.steps[level][1]
+        if step is not None:
+            predictor = self.levels.predictor(self.channel, grid, level, 1)
+            for row in numbers[:rows]:
+                row[:columns] = undo(row[:columns], step, predictor)
+        step = grid.steps[level][0]
+        if step is not None:
+            predictor = self.levels.predictor(self.channel, grid, level, 0)
+            for column in range(columns):
+                _set_line(numbers, 1, column, 0, undo([row[column] for row in numbers[:rows]], step, predictor))
 
 
-def _beyond(d: list[int], step: Step, index: int) -> int:
-    if step.periodic:
-        return d[index % len(d)]
-    index = (index + 1) % (2 * len(d) + 2)  # the midpoint -1, which is 0, counted as 0; the other one as len(d) + 1
-    if index in (0, len(d) + 1):
-        return 0
-    return d[index - 1] if index <= len(d) else -d[2 * len(d) + 1 - index]
-
-
-def undo(line: list[int], step: Step, a: int, b: int) -> list[int]:
-    """Undoes a step on one line of nodes and then details."""
-    d = _details(line, step, a, b)
-    wide = [_beyond(d, step, index) for index in range(-10, step.run + 9)]  # wide[10 + k] is d_k
-    nodes = []
-    for k in range(step.run):
-        s = sum(tap * (wide[10 + k + j] + wide[9 + k - j]) for j, tap in enumerate(TAPS))
-        nodes.append(line[k] - ((s + 3 * 2**21) >> 24))
-    samples = [0] * step.samples
-    samples[0 : 2 * step.run : 2] = nodes
-    for k in range(step.midpoints):
-        samples[2 * k + 1] = d[k] + ((nodes[k] + nodes[(k + 1) % step.run]) >> 1)
-    if step.nodes > step.run:
-        samples[-1] = line[step.run]
-    return [clamp(number, -(2**27), 2**27) for number in samples]
-
-
-def undo_level(grid: Grid, levels: Levels, level: int, fitted: dict[tuple[int, int], tuple[int, int]]) -> None:
-    """Undoes the step from a level to the next coarser one: axis 1 on all rows, then axis 0 on all columns."""
-    rows, columns = levels.shape[level]
-    step = levels.steps[level][1]
-    if step is not None:
-        for row in range(rows):
-            grid[row][:columns] = undo(grid[row][:columns], step, *fitted.get((level, 1), (16, 0)))
-    step = levels.steps[level][0]
-    if step is not None:
-        for column in range(columns):
-            line = [grid[row][column] for row in range(rows)]
-            for row, number in enumerate(undo(line, step, *fitted.get((level, 0), (16, 0)))):
-                grid[row][column] = number
+def _set_line(numbers: Lines, axis: int, index: int, first: int, values: Iterable[int]) -> None:
+    """Sets a row (axis 0) or column (axis 1), from a place on."""
+    for place, number in enumerate(values, first):
+        if axis == 0:
+            numbers[index][place] = number
+        else:
+            numbers[place][index] = number
 
 
 def value(lattice: Lattice, q: float) -> float:
@@ -206,8 +131,8 @@ def value(lattice: Lattice, q: float) -> float:
     return (lattice.origin + q) / lattice.step if lattice.decimal else lattice.origin + lattice.step * q
 
 
-def rounded(numbers: list[float], kind: str) -> Points:
-    """Values of the type."""
+def rounded(numbers: list[float], kind: str) -> Values:
+    """Values of the type, on one axis."""
     dtype = np.dtype(kind).newbyteorder("<")
     if dtype.kind == "f":
         greatest = float(np.finfo(dtype).max)
@@ -216,23 +141,64 @@ def rounded(numbers: list[float], kind: str) -> Points:
     return np.array([clamp(round(number), least, most) for number in numbers], dtype)
 
 
-def exact(payload: bytes, points: Points) -> Points:
-    """Section 9: the values themselves, from the picture with all layers known and the exactness section."""
-    size = points.dtype.itemsize
-    bits, count = 8 * size, points.size
-    planes = zlib.decompress(payload)
-    if len(planes) != count * size:
-        raise ValueError("the exactness section is too short or too long")
-    whole, sign = 2**bits - 1, 2 ** (bits - 1)
-    patterns = [int(number) for number in points.reshape(-1).view(f"<u{size}")]
-    is_float = points.dtype.kind == "f"
-    found = []
-    for place, pattern in enumerate(patterns):
-        z = sum(planes[plane * count + place] << 8 * plane for plane in range(size))
-        t = (z >> 1) ^ -(z & 1)
-        if not is_float:
-            found.append((pattern + t) & whole)
+def block_places(header: Header, levels: Levels, block: int, level: int) -> tuple[list[int], list[int]]:
+    """The rows and columns of a block at which the nodes of a level stand."""
+    rows: set[int] = set()
+    columns: set[int] = set()
+    for number, part in enumerate(header.parts):
+        if part.block == block:
+            down, along = part_places(header, levels, number, level)
+            rows.update(down)
+            columns.update(along)
+    return sorted(rows), sorted(columns)
+
+
+def part_places(header: Header, levels: Levels, number: int, level: int) -> tuple[list[int], list[int]]:
+    """The rows and columns of its block at which the nodes of a part stand, in the order of its grid."""
+    part = header.parts[number]
+    grid = levels.grids[len(header.curves) + number]
+    block = header.blocks[part.block]
+    return (
+        _in_block(part, grid.places[level][0], 0, block.rows),
+        _in_block(part, grid.places[level][1], 1, block.columns),
+    )
+
+
+def _in_block(part: Part, places: list[int], axis: int, size: int) -> list[int]:
+    count = part.shape[axis]
+    turned = [count - 1 - place for place in places] if part.backwards[axis] else places
+    return [(part.first[axis] + place) % size for place in turned]
+
+
+def put_together(header: Header, levels: Levels, block: int, level: int, grids: dict[int, Lines]) -> Lines:
+    """The grid of a block, from those of its parts."""
+    rows, columns = block_places(header, levels, block, level)
+    found: list[list[int | None]] = [[None] * len(columns) for _ in rows]
+    row_of, column_of = ({place: index for index, place in enumerate(places)} for places in (rows, columns))
+    for number, part in enumerate(header.parts):
+        if part.block != block:
             continue
-        order = (pattern ^ whole if pattern & sign else pattern | sign) + t & whole
-        found.append(order ^ sign if order & sign else order ^ whole)
-    return np.array(found, f"<u{size}").view(points.dtype).reshape(points.shape)
+        down, along = part_places(header, levels, number, level)
+        for r, row in enumerate(down):
+            for c, column in enumerate(along):
+                found[row_of[row]][column_of[column]] = grids[len(header.curves) + number][r][c]
+    together = [[number for number in row if number is not None] for row in found]
+    if any(len(row) != len(columns) for row in together):
+        raise ValueError("the parts of a block do not cover it")
+    return together
+
+
+def plane_value(rule: list[Any], axis: int, place: tuple[int, int], size: tuple[int, int]) -> float:
+    """x (axis 1) or y (axis 0) of heights that came with them, at a row and a column of a grid of such a size."""
+    p, n = place[axis], size[axis]
+    if rule[-1] == "values":
+        return float(rule[p])
+    numbers = [float(number) for number in rule]
+    if len(rule) == 4:
+        origin, across, down, shift = numbers
+        return across * (place[1] + shift) + down * (place[0] + shift) + origin
+    if len(rule) == 2:
+        return numbers[0] + numbers[1] * p
+    if rule[2] is True:
+        return numbers[1] if p == n - 1 else numbers[0] + p * ((numbers[1] - numbers[0]) / (n - 1))
+    return (numbers[0] + numbers[1] * p) / numbers[2]

@@ -1,0 +1,202 @@
+"""Section 9 of the page: from the values of the complete layers to the values that were written."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.stranger.coder import Model, RangeDecoder, clamp, new_contexts
+from tests.stranger.fields import Fields
+
+Values = NDArray[Any]
+
+MEMORY = 16384
+SPREAD = 0x9E3779B97F4A7C15
+SAFE = 2**53
+
+
+def signed(number: int) -> int:
+    """A whole number modulo 2^64, as a signed one."""
+    return (number + 2**63) % 2**64 - 2**63
+
+
+class Line:
+    """The line of whole numbers on which values have places, by a rule of a piece and its argument."""
+
+    def __init__(self, dtype: np.dtype[Any], rule: int, t: int) -> None:
+        self.dtype = dtype
+        self.rule = rule
+        self.t = t
+        self.bits = 8 * dtype.itemsize
+        self.is_float = dtype.kind == "f"
+        self.fraction = {32: 23, 64: 52}[self.bits] if self.is_float else 0
+        self.mantissa = self.fraction - t if self.is_float and rule == 1 else 64
+
+    def _pattern(self, value: Any) -> int:
+        return int(value.view(f"<u{self.dtype.itemsize}"))
+
+    def place(self, value: Any) -> int:
+        """Where a value is on the line."""
+        if self.rule == 2:
+            return round(clamp_float(float(value) * 10.0**self.t))
+        if not self.is_float:
+            return signed(int(value)) >> self.t
+        pattern = self._pattern(value)
+        m = (pattern & (1 << self.bits - 1) - 1) >> self.t
+        return -1 - m if pattern >> self.bits - 1 else m
+
+    def exponent(self, value: Any) -> int:
+        """The exponent field of a value's pattern, where it plays a part."""
+        if self.rule == 2 or not self.is_float:
+            return 0
+        return self._pattern(value) >> self.fraction & (1 << self.bits - 1 - self.fraction) - 1
+
+    def back(self, place: int) -> bytes:
+        """The value at a place, as it is in memory."""
+        if self.rule == 2:
+            return np.array(clamp(place, -SAFE, SAFE) / 10.0**self.t).astype(self.dtype).tobytes()
+        size = self.dtype.itemsize
+        if not self.is_float:
+            return ((place << self.t) % (1 << self.bits)).to_bytes(size, "little")
+        m = (-1 - place if place < 0 else place) << self.t
+        return (m % (1 << self.bits - 1) | (place < 0) << self.bits - 1).to_bytes(size, "little")
+
+
+def clamp_float(value: float) -> float:
+    """A float within the whole numbers that floats hold exactly."""
+    return min(max(value, -float(SAFE)), float(SAFE))
+
+
+class Stored:
+    """A string of bits, the lowest bit of each byte first."""
+
+    def __init__(self, data: bytes) -> None:
+        self._number = int.from_bytes(data, "little")
+        self._length = len(data)
+        self._taken = 0
+
+    def take(self, count: int) -> int:
+        """The next bits as a number, its lowest bit first."""
+        found = self._number >> self._taken & (1 << count) - 1
+        self._taken += count
+        return found
+
+    def finish(self) -> None:
+        """The bytes end with the one in which the last bit lies."""
+        if (self._taken + 7) // 8 != self._length:
+            raise ValueError("the stored bits of a piece are too many or too few")
+
+
+class Contexts:
+    """The contexts of a piece by their names, made where they are first asked for."""
+
+    def __init__(self) -> None:
+        self._models: dict[tuple[str, int], Model] = {}
+
+    def bit(self, coder: RangeDecoder, name: str, number: int) -> int:
+        """A bit in a context alone."""
+        model = self._models.setdefault((name, number), new_contexts(1))
+        return model.alone(coder, 0)
+
+
+@dataclass
+class Piece:
+    """The state of a piece while its values are decoded one after another."""
+
+    line: Line
+    most: int
+    specials: list[bytes]
+    coder: RangeDecoder
+    stored: Stored
+    contexts: Contexts = field(default_factory=Contexts)
+    last: dict[str, int] = field(default_factory=dict)  # the last two bits of a sort, as one number
+    memory: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # entry -> place, difference, sureness
+
+    def _bit(self, name: str, number: int) -> int:
+        return self.contexts.bit(self.coder, name, number)
+
+    def _remembered_bit(self, name: str, base: int = 0) -> int:
+        before = self.last.get(name, 0)
+        bit = self._bit(name, base + before)
+        self.last[name] = 2 * (before & 1) + bit
+        return bit
+
+    def value(self, x: Any) -> bytes:
+        """The value sought where the layers gave x."""
+        if self.specials and self._remembered_bit("special"):
+            k = 1
+            while k < len(self.specials) and self._bit("which", k):
+                k += 1
+            return self.specials[k - 1]
+        place = self.line.place(x)
+        entry = (place * SPREAD % 2**64 >> 40) & (MEMORY - 1)
+        found = self.memory.get(entry)
+        if found is not None and found[0] == place:
+            _, y, g = found
+            if self._remembered_bit("same", 4 * (g - 1)):
+                self.memory[entry] = (place, y, min(g + 1, 4))
+                return self.line.back(signed(place + y))
+            if self._remembered_bit("close"):
+                v = 1
+                for _ in range(4):
+                    v = 2 * v + self._bit("beside", v)
+                z = y - 8 + (v - 16)
+                self.memory[entry] = (place, z, 1)
+                return self.line.back(signed(place + z))
+        z = self._difference(x)
+        self.memory[entry] = (place, z, 1)
+        return self.line.back(signed(place + z))
+
+    def _difference(self, x: Any) -> int:
+        limit = clamp(self.most - self.line.exponent(x), 0, 63)
+        near_zero = limit > self.line.mantissa
+        c, u = limit, 0
+        while c > 0:
+            if not (self._bit("near", c) if near_zero else self._bit("short", 16 * min(limit, 15) + min(u, 15))):
+                break
+            c, u = c - 1, u + 1
+        m, r = int(c > 0), max(c - 1, 0)
+        negative = None
+        if near_zero or u == 0 or limit <= 4:
+            negative = self._bit("sign", 4 * (4 if near_zero else min(limit, 3)) + min(c, 3))
+            j = 4 if near_zero else min(u, 3)
+            for _ in range(min(r, 4)):
+                m = 2 * m + self._bit("highest", 16 * j + m)
+                r -= 1
+        while r > 32:
+            m = m << 32 | self.stored.take(32)
+            r -= 32
+        if negative is None:
+            rest = self.stored.take(r + 1)
+            m, negative = m << r | rest >> 1, rest & 1
+        else:
+            m = m << r | self.stored.take(r)
+        return -1 - m if negative else m
+
+
+def restore(piece: bytes, values: Values) -> Values:
+    """The values sought, from those that the complete layers give; one axis."""
+    if not piece:
+        return values
+    dtype = values.dtype
+    fields = Fields(piece)
+    first = fields.number("B")
+    rule, t = first & 3, first >> 2
+    if rule == 0:
+        found = fields.rest()
+        if len(found) != values.size * dtype.itemsize or t:
+            raise ValueError("a piece of values themselves has too many or too few")
+        return np.frombuffer(found, dtype)
+    if rule == 3 or (rule == 2 and dtype.kind != "f"):
+        raise ValueError("a piece has a rule that does not exist")
+    (most,) = struct.unpack("<H", fields.take(2))
+    specials = [fields.take(dtype.itemsize) for _ in range(most >> 12)]
+    coder = RangeDecoder(fields.take(fields.varint()))
+    state = Piece(Line(dtype, rule, t), most & 4095, specials, coder, Stored(fields.rest()))
+    restored = b"".join(state.value(x) for x in values)
+    state.stored.finish()
+    return np.frombuffer(restored, dtype)
