@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .decoder import Decoder, View, decode
+    from .decoder import Decoder, decode
     from .encoder import encode
     from .errors import (
         CorruptStreamError,
@@ -33,11 +33,12 @@ if TYPE_CHECKING:
     from .levels import coarsen, hierarchy
     from .surface import Block, Surface
     from .target import Target, Tolerance
+    from .view import View
 
 _HOMES = {
     "Block": "surface",
     "Decoder": "decoder",
-    "View": "decoder",
+    "View": "view",
     "decode": "decoder",
     "encode": "encoder",
     "CorruptStreamError": "errors",

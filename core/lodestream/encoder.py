@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from . import exactness
 from .allocation import TileCurve, assign_layers
 from .bitplanes import code_passes, new_model, pass_count, pass_gains
+from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.pieces import Window, windows
-from .container.sections import MOST_FRACTION
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
 from .errors import OptionError

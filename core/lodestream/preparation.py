@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrangement import VertexCounter, grids_of
+from .container.headers import TILE_BITS
 from .container.model import AttributeKind
 from .heights import to_heights
 from .lattice import Lattice, find_lattice, offset_lattice
@@ -197,7 +198,6 @@ class Preparation:
         return originals
 
 
-TILE_BITS = 14
 #: Numbers of the rules of x and y that a header may hold.
 _LONGEST_RULES = 16
 

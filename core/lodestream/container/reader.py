@@ -8,7 +8,7 @@ from typing import Any
 
 from ..digest import DIGEST
 from ..errors import CorruptStreamError, TruncatedStreamError
-from . import sections
+from . import headers, sections
 from .frames import FrameReader, whole_section
 from .model import ByteRange, Header, Index
 
@@ -56,9 +56,9 @@ def _read_header(read: Callable[[int, int], bytes], size: int) -> Header:
         chunk = read(position, min(wanted, size - position))
         for frame in reader.feed(chunk):
             if header is None:
-                header = sections.parse_header(frame.payload, frame.payload_offset, frame.end)
+                header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
             elif frame.kind == sections.MASKS:
-                return sections.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
+                return headers.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
             else:
                 raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
             if not header.masked:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from . import sections
+from . import headers, sections
 from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Piece, Segment
 
 __all__ = ["CodedLayer", "CodedSegment", "write_container"]
@@ -59,7 +59,7 @@ def write_container(
         The complete stream restores every value bit for bit.
     """
     header = replace(header, exact=exact, corrected=any(pieces), layer_count=len(layers))
-    out = bytearray(sections.serialize_header(header))
+    out = bytearray(headers.serialize_header(header))
     header = replace(header, length=len(out))
     records, segments, finest = [], [], 0
     for number, layer in enumerate(layers):

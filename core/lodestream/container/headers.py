@@ -1,0 +1,164 @@
+"""The bytes of the header section, and of the masks that may follow it. `docs/format.md` specifies them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrangement import grids_of
+from ..errors import CorruptStreamError
+from ..lattice import Lattice
+from ..layout import Layout
+from ..predictors import CURVES, default_predictors, fitted_steps
+from .fields import FieldReader, FieldWriter
+from .model import Header
+from .sections import HEADER, MAGIC, MASKS, VERSION, section
+from .shape import (
+    DTYPES,
+    LARGEST_SURFACE,
+    parse_arrangement,
+    parse_extras,
+    serialize_arrangement,
+    serialize_extras,
+)
+
+__all__ = ["MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
+
+#: Rows of a tile times columns, as an exponent of two.
+TILE_BITS = 14
+#: Most binary places between lattice steps.
+MOST_FRACTION = 6
+_RULES = ("affine", "decimal")
+
+
+def serialize_header(header: Header) -> bytes:
+    """Magic, version, header section and, where there are holes, the section of masks."""
+    out = FieldWriter()
+    extras = serialize_extras(header.attributes, header.plane)
+    marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
+    out.byte(sum(1 << place for place, flag in enumerate((*header.closed, *marks)) if flag))
+    out.byte(DTYPES.index(header.dtype))
+    out.varint(header.point_channels)
+    out.varint(header.layer_count)
+    out.byte(header.tile[0] | header.tile[1] << 4)
+    out.byte(header.fraction)
+    out.pack("d", header.extent)
+    if header.arrangement is None:
+        out.varint(header.shape[0])
+        out.varint(header.shape[1])
+    else:
+        serialize_arrangement(out, header.blocks, header.arrangement)
+    if extras:
+        out.varint(len(extras))
+        out.data += extras
+    for lattice in header.lattices:
+        out.byte(_RULES.index(lattice.rule))
+        out.pack("dd", lattice.origin, lattice.step)
+    for levels in header.empty:
+        out.varint(levels)
+    fitted = fitted_steps(header.layout)
+    for channel, predictors in enumerate(header.predictors):
+        for level, axis in fitted:
+            if axis < CURVES or channel < header.geometric:
+                out.pack("bb", *(int(x) for x in predictors[level, axis]))
+    data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+    return data + section(MASKS, _serialize_masks(header)) if header.masked else data
+
+
+def _serialize_masks(header: Header) -> bytes:
+    out = FieldWriter()
+    out.pack("q", header.hole)
+    for holes, data in zip(header.holes, header.mask_data, strict=True):
+        out.varint(holes)
+        if holes:
+            out.varint(len(data))
+            out.data += data
+    return bytes(out.data)
+
+
+def parse_masks(header: Header, payload: memoryview, offset: int, length: int) -> Header:
+    """The header with the masks of their section, which stands at ``offset`` and ends at ``length``."""
+    fields = FieldReader(payload, offset)
+    (hole,) = fields.unpack("q")
+    holes, coded = [], []
+    for shape, _ in header.blocks:
+        holes.append(fields.varint(shape[0] * shape[1]))
+        coded.append(bytes(fields.take(fields.varint(len(payload)))) if holes[-1] else b"")
+    fields.end()
+    if header.dtype.kind != "f" and not np.iinfo(header.dtype).min <= hole <= np.iinfo(header.dtype).max:
+        raise CorruptStreamError(f"expected holes as a value of {header.dtype}, got {hole}", offset)
+    return replace(header, hole=int(hole), holes=tuple(holes), mask_data=tuple(coded), length=length)
+
+
+def parse_header(payload: memoryview, offset: int, length: int) -> Header:
+    """Header section's payload, which stands at ``offset``; the header ends at ``length``."""
+    fields = FieldReader(payload, offset)
+    flags, code = fields.byte(), fields.byte()
+    if code >= len(DTYPES):
+        raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
+    point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
+    exponents, fraction = fields.byte(), fields.byte()
+    tile = exponents & 15, exponents >> 4
+    (extent,) = fields.unpack("d")
+    arrangement = None
+    if flags & 64:
+        blocks, arrangement = parse_arrangement(fields)
+    else:
+        shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+        blocks = ((shape, (bool(flags & 1), bool(flags & 2))),)
+    attributes, plane = parse_extras(fields.take(fields.varint(len(payload))), offset) if flags & 128 else ((), None)
+    channels = point_channels + sum(kind.channels for kind in attributes)
+    points = sum(rows * columns for (rows, columns), _ in blocks)
+    few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
+    if few or points * channels > LARGEST_SURFACE:
+        raise CorruptStreamError(
+            f"expected points, channels and layers, got {points} x {channels}, {layer_count} layers", offset
+        )
+    # Tiles across a narrow surface would be many, and nearly empty.
+    count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
+        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
+    if fraction > MOST_FRACTION:
+        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
+    if not (math.isfinite(extent) and extent >= 0):
+        raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
+    lattices = []
+    for _ in range(channels):
+        start, rule = fields.at, fields.byte()
+        origin, step = fields.unpack("dd")
+        if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
+            raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
+        lattices.append(Lattice(_RULES[rule], origin, step))
+    grids = Layout.single(*blocks[0], tile) if arrangement is None else Layout(grids_of(arrangement), tile)
+    empty = tuple(fields.varint((2 << grids.levels) - 1) for _ in range(channels))
+    predictors = np.stack([default_predictors(grids)] * channels)
+    fitted = fitted_steps(grids)
+    for channel in range(channels):
+        for level, axis in fitted:
+            if axis < CURVES or channel < min(point_channels, 3):
+                predictors[channel, level, axis] = fields.unpack("bb")
+    if (predictors == -128).any():
+        raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
+    fields.end()
+    return Header(
+        dtype=DTYPES[code],
+        blocks=blocks,
+        arrangement=arrangement,
+        point_channels=point_channels,
+        flat=bool(flags & 4),
+        attributes=attributes,
+        lattices=tuple(lattices),
+        predictors=predictors,
+        extent=extent,
+        fraction=fraction,
+        empty=empty,
+        tile=tile,
+        exact=bool(flags & 8),
+        corrected=bool(flags & 16),
+        layer_count=layer_count,
+        plane=plane,
+        masked=bool(flags & 32),
+        length=length,
+    )

@@ -1,0 +1,159 @@
+"""A state of a surface that is being received, and the surface that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .container.model import Header
+from .digest import DIGEST, values_digest
+from .errors import CorruptStreamError, InputError, OptionError
+from .heights import level_metadata, to_xyz
+from .parts import level_masks
+from .reconstruction import Reconstruction
+from .selection import Wish
+from .surface import Block, Surface
+from .windows import window_of
+
+__all__ = ["View"]
+
+
+@dataclass(frozen=True)
+class View:
+    """A state of the surface; its points are decoded when they are asked for, also when finer states have come since.
+
+    Attributes
+    ----------
+    number : int
+        Of the layer (of the level, where levels come one after another); the exact end has the next number.
+    level : int
+        Finest level with a decoded segment.
+    bytes : int
+        Bytes held of header, layers and exactness.
+    rms, max_error : float
+        Measured errors of the full-resolution picture, in the surface's unit.
+    complete : bool
+        Nothing more comes.
+    """
+
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+    complete: bool
+    _reconstruction: Reconstruction = field(repr=False, compare=False)
+    _length: int = field(repr=False, compare=False)
+    _state: NDArray[np.int8] = field(repr=False, compare=False)
+    _corrected: bool = field(repr=False, compare=False)
+    _metadata: dict[str, Any] = field(repr=False, compare=False)
+    _digest: dict[str, Any] = field(repr=False, compare=False)
+    _wish: Wish = field(repr=False, compare=False)
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """The full-resolution picture of the only block, with the dtype and axes of the original.
+
+        Raises
+        ------
+        InputError
+            When there are several blocks: `surface` has them.
+        """
+        return self.surface().points
+
+    def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
+        """The grid of a coarser level, of that level's shape.
+
+        Parameters
+        ----------
+        level : int
+        block : int, optional
+            Of a surface of several blocks.
+
+        Raises
+        ------
+        OptionError
+            When there is no such level or block.
+        InputError
+            When there are several blocks, and none was named.
+        """
+        surface = self.surface(level)
+        if block is None:
+            return surface.points
+        if not 0 <= block < len(surface.blocks):
+            raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
+        return surface.blocks[block].points
+
+    def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
+        """The full-resolution picture as a surface, or the grids of a coarser level.
+
+        Parameters
+        ----------
+        level : int, optional
+            Of a coarser level of heights the geotransform spans what the surface spans.
+        metadata : mapping, optional
+            In place of the container's own, which are there only as far as they have come.
+
+        Raises
+        ------
+        OptionError
+            When there is no such level.
+        CorruptStreamError
+            When the complete surface is not the one that was encoded.
+        """
+        header = self._reconstruction.header
+        asked, finest = level is not None, level is None or level == header.levels
+        level = header.levels if level is None else level
+        if not 0 <= level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
+        values = dict(self._metadata if metadata is None else metadata)
+        if asked:  # the grid of that level, without what a seam repeats
+            values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
+        digest = self._digest.get(DIGEST)
+        if not finest and self._wish.region is not None:
+            raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")
+        chosen = self._wish.channels(header)
+        grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
+        masks = level_masks(header.parts, header.layout, level, header.masks)
+        blocks = []
+        for grid, mask, (_, closed) in zip(grids, masks, header.blocks, strict=True):
+            points, *attributes = grid.arrays
+            named = {
+                kind.name: array if kind.components else array[..., 0]
+                for kind, array in zip(header.attributes, attributes, strict=True)
+                if self._wish.attributes is None or kind.name in self._wish.attributes
+            }
+            if mask is not None and not mask.any():
+                mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
+            blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=mask, attributes=named))
+        surface = Surface(blocks=blocks)
+        if not finest and len(blocks) == 1 and header.point_channels == 1:
+            coarse = level_metadata(
+                {**values, **_plane(header)}, header.shape, surface.shape, header.closed, header.levels - level
+            )
+            surface.metadata.update({key: coarse.pop(key) for key in _plane(header)})
+            values = coarse
+        else:
+            surface.metadata.update(_plane(header))
+        if header.plane is not None:
+            try:
+                surface = to_xyz(surface)
+            except InputError as error:
+                raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
+        if self._wish.region is not None:
+            surface, values = window_of(surface, values, self._wish.region)
+        elif self.complete and finest and header.exact and digest is not None and chosen.all():
+            found = values_digest(surface.blocks)
+            if digest != found:
+                raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
+        surface.metadata = values
+        return surface
+
+
+def _plane(header: Header) -> dict[str, Any]:
+    """The metadata by which heights that came with x and y get them back, see `lodestream.heights`."""
+    return {} if header.plane is None else {"grid": header.plane["grid"]}
