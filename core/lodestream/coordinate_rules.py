@@ -4,7 +4,8 @@ A *rule* is a list of plain numbers, evaluated in float64 in the order shown and
 
     [origin, step]                          origin + step k           k: the column for x, the row for y
     [origin, step, scale]                   (origin + step k) / scale
-    [origin, last, n, true]                 origin + (last - origin) / (n - 1) k; last for k = n - 1 (numpy.linspace)
+    [origin, step, false]                   step (k + 0.5) + origin
+    [origin, last, true]                    origin + (last - origin) / (n - 1) k; at the end, last (numpy.linspace)
     [origin, across, down, shift]           across (column + shift) + down (row + shift) + origin
     [v0, v1, v2, ..., "values"]             the numbers themselves, of each column for x, of each row for y
 """
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["VALUES", "Rule", "along_rows", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
+__all__ = ["VALUES", "Rule", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
 
 Rule = list[Any]
 
@@ -30,7 +31,7 @@ _SAMPLE = 64
 def evaluate(
     rule: Sequence[Any], row: NDArray[np.float64], column: NDArray[np.float64], down: bool
 ) -> NDArray[np.float64]:
-    """Float64 values that broadcast to (H, W), at rows (H, 1) and columns (1, W)."""
+    """Float64 values that broadcast to (H, W), at rows (H, 1) and columns (1, W); all of them, where `last` matters."""
     place = row if down else column
     if rule[-1] == VALUES:
         values = np.asarray(rule[:-1], np.float64)
@@ -38,9 +39,12 @@ def evaluate(
     if len(rule) == 2:
         return np.asarray(place * float(rule[1]) + float(rule[0]))
     if rule[-1] is True:
-        origin, last, count, _ = map(float, rule)
-        values = place * ((last - origin) / (count - 1)) + origin
-        return np.where(place == count - 1, last, values)
+        origin, last, _ = map(float, rule)
+        values = place * ((last - origin) / (place.size - 1)) + origin
+        values.reshape(-1)[-1] = last
+        return np.asarray(values)
+    if rule[-1] is False:
+        return np.asarray((place + 0.5) * float(rule[1]) + float(rule[0]))
     if len(rule) == 3:
         return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
     origin, across, by_row, shift = map(float, rule)
@@ -70,35 +74,31 @@ def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule
     Returns
     -------
     list or None
-        One of the first four kinds of rules of the module, the fourth running along the columns; None where there is
-        none, also where all are the same.
+        A rule of two or three numbers; None where there is none, also where all are the same.
     """
     index = np.arange(len(line)) if known is None else np.flatnonzero(known)
     values = line[index]
     if len(values) < 2 or not np.isfinite(values).all() or not _nearly_even(index, values):
         return None
     sample = np.unique(np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).round().astype(int))
-    for rule in _candidates(index, values, len(line)):
-        if all(_makes(rule, index[part], values[part]) for part in (sample, slice(None))):
+    for rule in _candidates(index, values):
+        if all(_makes(rule, len(line), index[part], values[part]) for part in (sample, slice(None))):
             return [plain(number) for number in rule]
     return None
 
 
-def along_rows(rule: Rule) -> Rule:
-    """A rule of `fit_axis` for a coordinate that runs along the rows."""
-    general = len(rule) == 4 and rule[-1] is not True
-    return [rule[0], rule[2], rule[1], rule[3]] if general else rule
-
-
-def _makes(rule: Rule, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
-    made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
+def _makes(rule: Rule, length: int, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
+    if rule[-1] is True:  # depends on the number of places
+        made = evaluate(rule, np.zeros((1, 1)), np.arange(length, dtype=np.float64)[None, :], False)[0, index]
+    else:
+        made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
     return np.array_equal(bits(rounded(made, values.dtype)), bits(values))
 
 
 def plain(number: Any) -> Any:
     """Whole numbers as integers, which take fewer bytes; -0.0 is none."""
-    whole = number is not True and abs(number) < 2**53 and number == int(number) and str(number) != "-0.0"
-    return int(number) if whole else number
+    whole = not isinstance(number, bool) and abs(number) < 2**53 and number == int(number) and str(number) != "-0.0"
+    return int(number) if whole else number if isinstance(number, bool) else float(number)
 
 
 def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
@@ -111,21 +111,19 @@ def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
     return bool(step) and bool(away <= min(allowed, abs(step) / 4)) and float(np.abs(exact).max()) < 2**53
 
 
-def _candidates(index: NDArray[np.int64], values: NDArray[Any], length: int) -> Iterator[Rule]:
+def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule]:
     """Rules that may have made these values, the likely ones first."""
     ends = [float(values[0]), float(values[-1])]
     steps = _steps(index, values)
     firsts = [ends[0], float(str(values[0]))] if values.dtype.kind == "f" else ends[:1]
     if index[0] == 0:
         yield from ([first, step] for first in dict.fromkeys(firsts) for step in steps)
-        yield from (
-            [first, last, length, True] for first, last in (ends, [float(str(values[0])), float(str(values[-1]))])
-        )
+        yield from ([first, last, True] for first, last in (ends, [float(str(values[0])), float(str(values[-1]))]))
     if values.dtype == np.float32:
         yield from _stabbed(index, values, steps[0])
     for step in steps:
         for origin in neighbours(ends[0] - (index[0] + 0.5) * step):
-            yield [origin, step, 0, 0.5]
+            yield [origin, step, False]
         if index[0] > 0:
             yield from ([origin, step] for origin in neighbours(ends[0] - index[0] * step))
     for scale in (*(10.0**places for places in range(1, 10)), float(np.rint(1 / steps[0]))):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .coordinate_rules import VALUES, Rule, along_rows, bits, evaluate, fit_axis, neighbours, plain, rounded
+from .coordinate_rules import VALUES, Rule, bits, evaluate, fit_axis, neighbours, plain, rounded
 from .errors import InputError
 from .georeference import has_gap, level_coordinates, level_geotransform
 from .seams import wrapped
@@ -137,14 +137,12 @@ def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rul
         rule = fit_axis(line, known)
         if rule is None:
             continue
-        if axis == 0:
-            rule = along_rows(rule)
         if axis == (0 if down else 1):
             return rule
-        if len(rule) == 2:
-            rule = [rule[0], rule[1], 0, 0] if axis == 1 else [rule[0], 0, rule[1], 0]
-        elif len(rule) != 4 or rule[-1] is True:
+        shift = 0.5 if rule[-1] is False else 0
+        if len(rule) == 3 and not shift:
             continue
+        rule = [rule[0], rule[1], 0, shift] if axis == 1 else [rule[0], 0, rule[1], shift]
         return rule if _holds(rule, plane, mask, down) else None
     return _fit_plane(plane, mask, down)
 

@@ -201,4 +201,6 @@ def plane_value(rule: list[Any], axis: int, place: tuple[int, int], size: tuple[
         return numbers[0] + numbers[1] * p
     if rule[2] is True:
         return numbers[1] if p == n - 1 else numbers[0] + p * ((numbers[1] - numbers[0]) / (n - 1))
+    if rule[2] is False:
+        return numbers[1] * (p + 0.5) + numbers[0]
     return (numbers[0] + numbers[1] * p) / numbers[2]

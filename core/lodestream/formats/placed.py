@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coordinate_rules import VALUES, along_rows, fit_axis
+from ..coordinate_rules import VALUES, fit_axis
 from ..errors import FormatError
 from ..heights import coordinates
 from ..seams import merge, unwrap, wrapped
@@ -122,8 +122,8 @@ def _georeference(x: Coordinate, y: Coordinate, across: _Even, down: _Even) -> d
     for name, even, axis in (("x", across, x.axis), ("y", down, y.axis)):
         values = even.values.astype(dtype)
         rule = fit_axis(values)
-        if rule and axis == 0:
-            rule = along_rows(rule)
+        if rule and rule[-1] is True:
+            rule = None  # it depends on the number of places, which changes where a seam is merged
         rules[name] = rule or [*values.tolist(), VALUES]
         origin, step = map(float, rule) if rule and len(rule) == 2 else (even.origin, even.step)
         transform += [origin - step / 2, step, 0.0] if axis == 1 else [origin - step / 2, 0.0, step]
