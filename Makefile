@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 
 # Compiled kernels are kept beside the environment, under a name that changes with the sources: numba itself looks only
 # at the file of a kernel, not at the files of the kernels that it calls.
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/*.py 2>/dev/null | cksum | cut -d ' ' -f 1)
+export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/*.py core/lodestream/*/*.py 2>/dev/null | cksum | cut -d ' ' -f 1)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
