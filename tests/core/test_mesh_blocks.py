@@ -45,7 +45,7 @@ def test_patches_round_a_vertex(arms: int, size: int, seed: int) -> None:
     surface = recognise(mesh_of(faces, vertices, rng)).surface()
     assert [block.shape for block in surface.blocks] == [(size + 1, size + 1)] * arms
     assert surface.metadata["recognised"].startswith(
-        f"{arms} blocks, {size + 1} x {size + 1} each; {vertices} vertices; cut at 1 irregular vertices"
+        f"{arms} blocks, {size + 1} x {size + 1} each; {vertices} vertices; cut at 1 irregular vertex"
     )
     assert_same_faces(surface, faces)
 
@@ -222,3 +222,21 @@ def test_a_pole_on_a_block_of_many() -> None:
     assert len(surface.blocks) == 6
     assert surface.metadata["poles"] == [{"block": 5, "side": "first_row", "kind": "fan"}]
     assert_same_faces(surface, faces)
+
+
+def test_a_window_of_a_sphere_has_no_pole() -> None:
+    faces = collapse(grid_faces(6, 8, (False, True)), range(8), 0)
+    numbers = {vertex: index for index, vertex in enumerate(sorted({corner for face in faces for corner in face}))}
+    surface = recognise(mesh_of([[numbers[corner] for corner in face] for face in faces], 41)).surface()
+    window = Surface(surface.points[2:, :5], metadata=surface.metadata)
+    mesh = faces_of(window)
+    assert (len(mesh.vertices), len(mesh.quads), len(mesh.triangles)) == (20, 12, 0)
+
+
+def test_faces_of_many_corners_are_no_mesh() -> None:
+    with pytest.raises(ValueError, match="faces of 3 or 4 corners, got others"):
+        Mesh.of(np.zeros((5, 3)), [[0, 1, 2, 3, 4]])
+    with pytest.raises(ValueError, match="outside 0 to 4"):
+        Mesh.of(np.zeros((5, 3)), [[0, 1, 2, 5]])
+    with pytest.raises(ValueError, match="vertices of shape"):
+        Mesh.of(np.zeros(5), [[0, 1, 2, 3]])

@@ -148,7 +148,7 @@ def test_holes_and_single_faces_that_are_missing_in_a_grid() -> None:
     assert surface.shape in ((9, 11), (11, 9))
     assert surface.mask is not None
     assert int((~surface.mask).sum()) == 1
-    assert "98 vertices; 1 holes" in surface.metadata["recognised"]
+    assert "98 vertices; 1 hole" in surface.metadata["recognised"]
     assert len(faces_of(surface).quads) == len(faces) == 75
 
 

@@ -78,6 +78,8 @@ class Mesh:
         points = np.asarray(vertices)
         rows = [list(face) for face in faces] if isinstance(faces, list | tuple) else np.asarray(faces)
         if isinstance(rows, list):
+            if any(len(row) not in (3, 4) for row in rows):
+                raise InputError("expected faces of 3 or 4 corners, got others")
             rows = np.array([row + [-1] * (4 - len(row)) for row in rows], np.int64).reshape(-1, 4)
         if rows.ndim != 2 or rows.shape[1] not in (3, 4) or points.ndim != 2 or points.shape[1] not in (2, 3):
             raise InputError(

@@ -310,23 +310,28 @@ class _Recognition:
     def _notes(self, blocks: list[RecognisedBlock], merged: int) -> list[str]:
         used = np.zeros(len(self.mesh.vertices), np.bool_)
         used[self.vertex] = True
-        notes = [f"{int(used.sum())} vertices"]
+        notes = [_counted(int(used.sum()), "vertex", "vertices")]
         holes = sum(int((block.vertices < 0).sum()) for block in blocks)
-        notes += [f"{holes} holes"] * (holes > 0)
+        notes += [_counted(holes, "hole")] * (holes > 0)
         poles = len(np.unique(self.quads.pole_of))
         poles += sum(pole["kind"] == "repeated" for block in blocks for pole in block.poles)
-        notes += [f"{poles} pole{'s' if poles > 1 else ''}"] * (poles > 0)
+        notes += [_counted(poles, "pole")] * (poles > 0)
         notes += [f"seam in {' and '.join(self.seams)}"] * (len(self.seams) > 0)
         if self.cuts:
             count = int(irregular(self.valence).sum())
-            notes.append(f"cut at {count} irregular vertices" if count else "cut open")
+            notes.append(f"cut at {_counted(count, 'irregular vertex', 'irregular vertices')}" if count else "cut open")
         notes += dict.fromkeys(self.quads.choices)
-        notes += [f"{self.polygons.turned} faces turned round"] * (self.polygons.turned > 0)
-        notes += [f"{merged} vertices at the place of others joined to them"] * (merged > 0)
+        turned = self.polygons.turned
+        notes += [f"{_counted(turned, 'face')} turned round"] * (turned > 0)
+        notes += [f"{_counted(merged, 'vertex', 'vertices')} at the place of others joined to them"] * (merged > 0)
         notes += [f"{name} left out: {why}" for name, why in self.left_out.items()]
         alone = len(used) - int(used.sum())
-        notes += [f"{alone} vertices without a face left out"] * (alone > 0)
+        notes += [f"{_counted(alone, 'vertex', 'vertices')} without a face left out"] * (alone > 0)
         return [*notes, *self.mesh.notes]
+
+
+def _counted(count: int, one: str, many: str = "") -> str:
+    return f"{count} {one if count == 1 else many or one + 's'}"
 
 
 def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:

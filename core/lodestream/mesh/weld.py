@@ -194,11 +194,17 @@ def _poles(surface: Surface) -> list[tuple[int, str, str]]:
             number, side, kind = int(entry["block"]), str(entry["side"]), str(entry["kind"])
             if not 0 <= number < len(surface.blocks) or side not in SIDES:
                 raise KeyError(side)
-            if kind in ("fan", "degenerate"):
+            if kind in ("fan", "degenerate") and _is_point(surface.blocks[number], side):
                 result.append((number, side, kind))
     except (TypeError, KeyError, ValueError):
         raise InputError(f"expected poles with block, side and kind in the metadata, got {entries!r}") from None
     return result
+
+
+def _is_point(block: Block, side: str) -> bool:
+    """Whether a side lies at one place still, as that of a window of the surface need not."""
+    points = block.points[SIDES[side]]
+    return points.ndim == 2 and bool((points[:, :3] == points[0, :3]).all())
 
 
 def _join_borders(parts: list[_Part], joined: NDArray[np.int64]) -> None:
@@ -259,12 +265,14 @@ def _faces(part: _Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[ND
     below, right = (r + 1) % rows, (c + 1) % width
     points, faces = part.points, part.faces
     corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
-    ends = joined[corners]
-    collapsed = (ends == np.roll(ends, -1, axis=1)).any(axis=1)
-    quads, fans = corners[~collapsed], np.empty((0, 3), np.int64)
+    collapsed = np.zeros(len(corners), np.bool_)
+    for k in range(4):
+        collapsed |= joined[corners[:, k]] == joined[corners[:, k - 1]]
+    quads, fans = corners, np.empty((0, 3), np.int64)
     folded = quads[:0]
     if collapsed.any():
-        fans, folded = _fans(corners[collapsed], ends[collapsed])
+        quads = corners[~collapsed]
+        fans, folded = _fans(corners[collapsed], joined[corners[collapsed]])
         fans, folded = (fans[:0], folded) if degenerate else (fans, folded[:0])
     diagonal = faces.get("diagonal")
     if diagonal is not None:
@@ -273,7 +281,7 @@ def _faces(part: _Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[ND
         if crossed is not None:
             main ^= crossed[part.cells][~collapsed]
         quads, fans = quads[:0], np.concatenate([_halves(quads, main), fans])
-    quads = np.concatenate([quads, folded])
+    quads = np.concatenate([quads, folded]) if len(folded) else quads
     if faces.get("reversed"):
         quads, fans = quads[:, (0, 3, 2, 1)], fans[:, (0, 2, 1)]
     return quads, fans
