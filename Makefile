@@ -11,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-lowest lint format bench bench-peers bench-server wheel clean
+.PHONY: help demo test test-lowest lint format bench bench-peers bench-server bench-stream wheel clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -43,6 +43,9 @@ bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other c
 
 bench-server: $(STAMP) ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
 	@$(BIN)/python -m benchmarks.server $(ARGS)
+
+bench-stream: $(STAMP) ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
+	@$(BIN)/python -m benchmarks.stream
 
 wheel: $(STAMP) ## build dist/*.whl
 	@$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .

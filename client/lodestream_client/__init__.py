@@ -11,20 +11,23 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .aio import Stream, connect, delete, describe, fetch_range, list_surfaces, upload
+    from .aio import Stream, connect, delete, describe, describe_file, fetch_range, identify, list_surfaces, upload
     from .aio import list_surfaces as list
     from .errors import SilenceError, UnreachableError
-    from .requests import Description
+    from .requests import Description, Identity
 
 _HOMES = {
     "Description": ("requests", "Description"),
+    "Identity": ("requests", "Identity"),
     "SilenceError": ("errors", "SilenceError"),
     "Stream": ("aio", "Stream"),
     "UnreachableError": ("errors", "UnreachableError"),
     "connect": ("aio", "connect"),
     "delete": ("aio", "delete"),
     "describe": ("aio", "describe"),
+    "describe_file": ("aio", "describe_file"),
     "fetch_range": ("aio", "fetch_range"),
+    "identify": ("aio", "identify"),
     "list": ("aio", "list_surfaces"),
     "list_surfaces": ("aio", "list_surfaces"),
     "upload": ("aio", "upload"),
@@ -32,13 +35,16 @@ _HOMES = {
 
 __all__ = [
     "Description",
+    "Identity",
     "SilenceError",
     "Stream",
     "UnreachableError",
     "connect",
     "delete",
     "describe",
+    "describe_file",
     "fetch_range",
+    "identify",
     "list",
     "list_surfaces",
     "upload",

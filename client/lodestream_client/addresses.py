@@ -1,4 +1,4 @@
-"""Addresses of servers and surfaces, and what is asked at them."""
+"""Addresses of servers, surfaces and container files, and what is asked at them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from urllib.parse import urlsplit, urlunsplit
 
 from lodestream.errors import OptionError
 
-__all__ = ["is_loopback", "is_url", "stream_url", "surface_url", "surfaces_url"]
+__all__ = [
+    "container_url",
+    "is_loopback",
+    "is_surface",
+    "is_url",
+    "same_origin",
+    "source_url",
+    "stream_url",
+    "surface_url",
+    "surfaces_url",
+]
 
 _SURFACES = "/v1/surfaces"
 
@@ -44,9 +54,43 @@ def surface_url(url: str) -> str:
     return base
 
 
+def source_url(url: str) -> str:
+    """The address of what can be pulled: a surface on a server, or a container file that any web server holds.
+
+    Raises
+    ------
+    OptionError
+        When this is neither.
+    """
+    base = _clean(url)
+    path = urlsplit(base).path
+    if not path or path.endswith(_SURFACES):
+        raise OptionError(
+            f"expected a surface's address such as http://HOST/v1/surfaces/ID, or a container's such as "
+            f"http://HOST/NAME.lode, got {url}"
+        )
+    # The query may be what allows reading a file.
+    return base if is_surface(base) else urlunsplit(urlsplit(url)._replace(fragment=""))
+
+
+def is_surface(url: str) -> bool:
+    """Whether this is a surface's address, not that of a file."""
+    return _clean(url).rpartition("/")[0].endswith(_SURFACES)
+
+
 def stream_url(url: str) -> str:
     """Where the stream of the surface at this address is."""
     return "ws" + surface_url(url).removeprefix("http") + "/stream"
+
+
+def container_url(url: str) -> str:
+    """Where the container of a surface, or at a file's own address, can be fetched."""
+    return f"{surface_url(url)}/container" if is_surface(url) else url
+
+
+def same_origin(one: str, other: str) -> bool:
+    """Whether two addresses are of one server."""
+    return urlsplit(one)[:2] == urlsplit(other)[:2]
 
 
 def is_loopback(url: str) -> bool:

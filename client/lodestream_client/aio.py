@@ -15,24 +15,37 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import LodestreamError
 from lodestream.target import Target, Tolerance
 
-from . import addresses, problems, requests
+from . import problems, requests
 from .bodies import Body, Closure, Source, opened, surface_parameters
-from .requests import Description, Flow, Progress
-from .stream import BaseStream
+from .requests import Description, Flow, Identity, Progress
+from .roads import Transport
+from .stream import LONGEST_PROBLEM, PARTS, BaseStream, Received
 
 if TYPE_CHECKING:
+    import httpx
     from websockets.asyncio.client import ClientConnection
 
     from lodestream.decoder import View
+    from lodestream.reception import Store
 
-__all__ = ["Stream", "connect", "delete", "describe", "fetch_range", "list_surfaces", "upload"]
+__all__ = [
+    "Stream",
+    "connect",
+    "delete",
+    "describe",
+    "describe_file",
+    "fetch_range",
+    "identify",
+    "list_surfaces",
+    "upload",
+]
 
 T = TypeVar("T")
 
@@ -44,31 +57,26 @@ class Stream(BaseStream):
     wanted. `connect` makes it.
     """
 
-    _socket: ClientConnection
+    _socket: ClientConnection | None = None
+    _client: httpx.AsyncClient | None = None
+    _response: httpx.Response | None = None
+    _body: AsyncIterator[bytes] | None = None
 
     async def _open(self) -> None:
-        from websockets.asyncio.client import connect as connect_socket
-        from websockets.exceptions import WebSocketException
-
+        self._wake = asyncio.Event()
         try:
-            # Awaited, not iterated: a connection that fails is not tried again behind the caller's back.
-            self._socket = await connect_socket(addresses.stream_url(self.url), **self._options())
-        except (OSError, WebSocketException) as error:
-            raise problems.from_connection(error, self.url) from error
-        try:
-            self._agree(self._socket.subprotocol)
-            self._tick()
-            await self._send()
+            while not self._roads.met and await self._step():
+                pass
         except BaseException:
-            await self._socket.close()
+            await self._abandon()
             raise
 
     def __aiter__(self) -> AsyncIterator[View]:
         return self
 
     async def __anext__(self) -> View:
-        while not self._views and self.ended is None:
-            await self._exchange(self.silence)
+        while not self._views and await self._step():
+            pass
         if not self._views:
             raise StopAsyncIteration
         return self._views.popleft()
@@ -91,93 +99,171 @@ class Stream(BaseStream):
         May be called from another task than the one that iterates.
         """
         self._stop()
-        await self._send()
+        self._wake.set()
+        await self._flush()
 
     async def close(self) -> None:
         """Stop, take leave and close the connection, within the time allowed for it."""
         try:
             if self.ended is None:
                 await self.stop()
-            until = time.monotonic() + self._close_timeout
-            while self.ended is None:
-                await self._exchange(max(until - time.monotonic(), 0.0))
+            self._close_by = time.monotonic() + self._close_timeout
+            while await self._step():
+                pass
         except LodestreamError:
             # Whoever closes has what they want; how the other side takes it is no concern of theirs.
-            await self._abandon()
+            pass
+        await self._abandon()
 
     async def _abandon(self) -> None:
         self._abandoned = True
-        await self._socket.close()
+        await self._hang_up()
+        if self._client is not None:
+            await self._client.aclose()
 
-    async def _exchange(self, patience: float) -> None:
-        message = await self._receive(patience)
-        if message is None:
-            return
-        await self._sleep(self._delay(message))
-        last = self._take(message)
-        await self._send()
-        if last:
-            await self._leave()
+    async def _step(self) -> bool:
+        # Whether there may be another.
+        try:
+            pending = self._way.send(self._answer)
+            while True:
+                try:
+                    self._answer = await pending
+                except Exception as error:
+                    pending = self._way.throw(error)
+                else:
+                    return True
+        except StopIteration:
+            return False
 
-    async def _receive(self, patience: float) -> bytes | None:
-        # None when it was time to stop before a message came.
+    async def _dial(self, url: str) -> str | None:
+        from websockets.asyncio.client import connect as connect_socket
+        from websockets.exceptions import WebSocketException
+
+        try:
+            # Awaited, not iterated: whether and when a connection is tried again is decided in one place.
+            self._socket = await connect_socket(url, **self._socket_options())
+        except (OSError, WebSocketException) as error:
+            raise problems.from_connection(error, self.url) from error
+        return self._socket.subprotocol
+
+    async def _hear(self, seconds: float) -> bytes | None:
         from websockets.exceptions import ConnectionClosed
 
-        left = self._tick()
-        await self._send()
+        assert self._socket is not None, "a message is expected of an open connection"
         try:
-            async with asyncio.timeout(patience if left is None else min(patience, left)):
+            async with asyncio.timeout(seconds):
                 return await self._socket.recv(decode=False)
         except TimeoutError:
-            if left is not None and left <= patience:
-                return None
-            raise self._silent() from None
+            return None
         except ConnectionClosed as error:
             self._lost(error)
-            raise problems.from_connection(error, self.url) from error
 
-    async def _sleep(self, delay: float) -> None:
-        until = time.monotonic() + delay
-        while (wait := until - time.monotonic()) > 0:
-            left = self._tick()
-            await self._send()
-            await asyncio.sleep(wait if left is None else min(wait, left))
-
-    async def _send(self) -> None:
+    async def _say(self, message: bytes) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        for message in self._download.data_to_send():
-            try:
+        try:
+            if self._socket is not None:
                 await self._socket.send(message)
-            except ConnectionClosed:
-                # What the server said before it closed is still to be received, and tells more than this.
-                return
+        except ConnectionClosed:
+            # What the server said before it closed is still to be received, and tells more than this.
+            return
+
+    async def _flush(self) -> None:
+        for message in self._messages():
+            await self._say(message)
 
     async def _leave(self) -> None:
         # The server closes after our bye. Closing first would cut its last messages off on some stacks.
         try:
-            async with asyncio.timeout(self._close_timeout):
-                await self._socket.wait_closed()
+            if self._socket is not None:
+                async with asyncio.timeout(self._close_timeout):
+                    await self._socket.wait_closed()
         except TimeoutError:
-            await self._socket.close()
+            pass
+        await self._hang_up()
+
+    async def _hang_up(self) -> None:
+        socket, self._socket = self._socket, None
+        response, self._response, self._body = self._response, None, None
+        if socket is not None:
+            await socket.close()
+        if response is not None:
+            await response.aclose()
+
+    async def _get(self, url: str, headers: dict[str, str], seconds: float) -> tuple[int, dict[str, str], str]:
+        import httpx
+
+        if self._client is None:
+            self._client = httpx.AsyncClient(**self._client_options())
+        await self._hang_up()
+        request = self._client.build_request("GET", url, headers=self._part_headers(url, headers), timeout=seconds)
+        try:
+            answer = self._response = await self._client.send(request, stream=True)
+            if answer.status_code not in PARTS:
+                body = bytearray()
+                async for piece in answer.aiter_bytes():
+                    body += piece
+                    if len(body) > LONGEST_PROBLEM:
+                        break
+                raise self._refused(answer, bytes(body))
+        except httpx.HTTPError as error:
+            raise problems.from_connection(error, self.url) from error
+        self._body = answer.aiter_raw()
+        return answer.status_code, dict(answer.headers), str(answer.url)
+
+    async def _read(self) -> bytes:
+        import httpx
+
+        assert self._body is not None, "a body is read of an open answer"
+        try:
+            return await anext(self._body, b"")
+        except httpx.HTTPError as error:
+            raise self._broke(error) from error
+
+    async def _wait(self, seconds: float) -> None:
+        try:
+            async with asyncio.timeout(seconds):
+                await self._wake.wait()
+        except TimeoutError:
+            return
 
 
 def connect(
-    url: str,
+    url: str | Sequence[str],
     *,
     target: Target | None = None,
     token: str | None = None,
+    transport: Transport = "auto",
     silence: float = 30.0,
+    deadline: float = 60.0,
     close_timeout: float = 5.0,
     limit_rate: float | None = None,
     window: int | None = None,
+    store: Store | None = None,
+    container: str | None = None,
+    size: int | None = None,
+    progress: Received | None = None,
 ) -> Stream:
     """The stream of a surface, to be entered with ``async with``.
 
     Parameters and errors are those of `lodestream_client.sync.connect`; the connection is opened, and its errors are
     raised, on entering.
     """
-    return Stream(url, target, token, silence, close_timeout, limit_rate, window)
+    return Stream(
+        url,
+        target,
+        token=token,
+        transport=transport,
+        silence=silence,
+        deadline=deadline,
+        close_timeout=close_timeout,
+        limit_rate=limit_rate,
+        window=window,
+        store=store,
+        container=container,
+        size=size,
+        progress=progress,
+    )
 
 
 async def upload(
@@ -208,6 +294,16 @@ async def describe(url: str, *, token: str | None = None) -> Description:
     return await _run(requests.describe(url), url, token)
 
 
+async def describe_file(url: str, *, token: str | None = None) -> Mapping[str, Any]:
+    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints."""
+    return await _run(requests.describe_file(url), url, token)
+
+
+async def identify(url: str, *, token: str | None = None) -> Identity:
+    """What a surface's container, or a container's file, is known by."""
+    return await _run(requests.identify(url), url, token)
+
+
 async def delete(url: str, *, token: str | None = None) -> None:
     """Remove a surface from its server."""
     await _run(requests.delete(url), url, token)
@@ -235,7 +331,9 @@ async def _run(flow: Flow[T], url: str, token: str | None) -> T:
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
-                answer = await client.request(content=content, **requests.request_options(step, url, token))
+                async with client.stream(content=content, **requests.request_options(step, url, token)) as answer:
+                    if not (step.partial and answer.status_code == 200):
+                        await answer.aread()
             except httpx.HTTPError as error:
                 raise problems.from_connection(error, url) from error
 

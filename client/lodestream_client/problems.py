@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lodestream.errors import (
+    CorruptStreamError,
     FormatError,
     InputError,
     LodestreamError,
@@ -16,11 +17,13 @@ from lodestream.errors import (
     RemoteError,
     RemoteProtocolError,
     TooLargeError,
+    TruncatedStreamError,
+    UnsupportedVersionError,
 )
 
-from .errors import UnreachableError
+from .errors import SilenceError, UnreachableError
 
-__all__ = ["from_code", "from_connection", "from_response"]
+__all__ = ["NoStreamError", "blocks_sockets", "elsewhere", "from_code", "from_connection", "from_response", "passes"]
 
 _LONGEST = 1000
 
@@ -40,6 +43,15 @@ _BY_STATUS: Mapping[int, type[LodestreamError]] = {
     415: InputError,
     422: InputError,
 }
+
+
+# What a server says when it may be otherwise a little later.
+_PASSING = {"restarting", "idle", "busy", "too-many", "internal"}
+_PASSING |= {f"http-{status}" for status in (408, 425, 429, 500, 502, 503, 504)}
+
+
+class NoStreamError(RemoteProtocolError):
+    """What answers is a WebSocket that carries no streams."""
 
 
 def from_code(code: str, message: str) -> LodestreamError:
@@ -67,6 +79,45 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
     if isinstance(code, str):
         return from_code(code, message)
     return _BY_STATUS[status](message) if status in _BY_STATUS else RemoteError(f"http-{status}", message)
+
+
+def passes(error: LodestreamError) -> bool:
+    """Whether the same attempt may go well a little later."""
+    if isinstance(error, RemoteError):
+        return error.code in _PASSING
+    return isinstance(error, UnreachableError | SilenceError | TruncatedStreamError) or _broke_off(error)
+
+
+def elsewhere(error: LodestreamError) -> bool:
+    """Whether the same attempt may go well at another address."""
+    return not isinstance(error, OptionError | CorruptStreamError | UnsupportedVersionError)
+
+
+def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
+    """Whether it is the WebSocket that something between does not let through, so that plain HTTP may do.
+
+    A connection that broke in its handshake tells this only if there has been none (`met`) that did not.
+    """
+    from websockets import exceptions as ws
+
+    cause = error.__cause__
+    if isinstance(cause, ws.InvalidStatus):
+        return "code" not in _document(bytes(cause.response.body or b""))
+    if _broke_off(error):
+        return not met
+    return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake)
+
+
+def _broke_off(error: BaseException) -> bool:
+    """Whether a connection ended in the middle of an answer."""
+    import httpx
+
+    cause = error.__cause__
+    while cause is not None:
+        if isinstance(cause, EOFError | ConnectionError | httpx.RemoteProtocolError | httpx.NetworkError):
+            return True
+        cause = cause.__cause__
+    return False
 
 
 def _document(body: bytes) -> Mapping[str, Any]:

@@ -6,7 +6,10 @@ it; what it returns is the result. `lodestream_client.sync` and `lodestream_clie
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import itertools
+import ssl
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -24,12 +27,15 @@ __all__ = [
     "Call",
     "Description",
     "Flow",
+    "Identity",
     "Pause",
     "Progress",
     "client_options",
     "delete",
     "describe",
+    "describe_file",
     "fetch_range",
+    "identify",
     "list_surfaces",
     "request_options",
     "upload",
@@ -50,13 +56,17 @@ _TIMEOUT = 30.0
 
 @dataclass(frozen=True)
 class Call:
-    """Ask this of a server; the answer, read whole, is sent back."""
+    """Ask this of a server; the answer, read whole, is sent back.
+
+    With ``partial``, an answer that is the whole of a file is sent back without having been read.
+    """
 
     method: str
     url: str
     parameters: Mapping[str, str] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: Body | None = None
+    partial: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,25 @@ class Pause:
 
 
 Flow: TypeAlias = "Generator[Call | Pause, httpx.Response | None, T]"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a container is known by, so that what is kept of it can be found again.
+
+    Attributes
+    ----------
+    name : str or None
+        Of its own, in hexadecimal digits; None where nothing tells this version of a file from another.
+    container : str or None
+        SHA-256 of the container, where the server tells it.
+    size : int or None
+        Bytes of the container.
+    """
+
+    name: str | None
+    container: str | None
+    size: int | None
 
 
 @dataclass(frozen=True)
@@ -101,9 +130,18 @@ def client_options(url: str) -> dict[str, Any]:
     return {
         "follow_redirects": True,
         "timeout": _TIMEOUT,
+        "verify": _trusted(),
         # No proxy of the environment comes between two programs on one machine.
         "trust_env": not addresses.is_loopback(url),
     }
+
+
+@functools.cache
+def _trusted() -> ssl.SSLContext:
+    # Reading all the certificates takes longer than many a request.
+    import httpx
+
+    return httpx.create_ssl_context()
 
 
 def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
@@ -175,6 +213,41 @@ def describe(url: str) -> Flow[Description]:
     return _described(_checked(answer, address), address)
 
 
+def describe_file(url: str) -> Flow[Mapping[str, Any]]:
+    """The figures of a container that some web server holds as a file."""
+    from lodestream.container import describe
+    from lodestream.range_download import RangeDownload
+    from lodestream.reception import Reception
+
+    reception = Reception()
+    download = RangeDownload(reception)
+    while reception.index is None:
+        request, _ = download.request()
+        if request is not None and reception.index is None:
+            answer = _refuse((yield Call("GET", url, headers=request.headers, partial=True)), url)
+            download.answer(answer.status_code, answer.headers)
+            download.receive(answer.content)
+            download.finish()
+    return describe(reception.index)
+
+
+def identify(url: str) -> Flow[Identity]:
+    """What a surface's container, or a file, is known by."""
+    if addresses.is_surface(url):
+        surface = yield from describe(url)
+        container, size = surface.details.get("container"), surface.details.get("bytes")
+        if not surface.ready or not isinstance(container, str) or not isinstance(size, int):
+            raise RemoteError("not-ready", f"expected {url} to be ready, got {surface.state}")
+        return Identity(container, container, size)
+    answer = _refuse((yield Call("HEAD", url, headers={"Accept-Encoding": "identity"})), url)
+    version = answer.headers.get("etag") or answer.headers.get("last-modified")
+    length = answer.headers.get("content-length", "")
+    if version is None or not length.isdecimal():
+        return Identity(None, None, None)
+    name = hashlib.sha256(f"{url}\n{version}\n{length}".encode()).hexdigest()
+    return Identity(name, None, int(length))
+
+
 def delete(url: str) -> Flow[None]:
     """Remove one surface from its server."""
     address = addresses.surface_url(url)
@@ -183,10 +256,10 @@ def delete(url: str) -> Flow[None]:
 
 
 def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
-    """The bytes ``offset`` to ``offset + length`` of a surface's container."""
-    address = f"{addresses.surface_url(url)}/container"
-    answer = yield Call("GET", address, headers={"Range": f"bytes={offset}-{offset + length - 1}"})
-    response = _refuse(answer, address)
+    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container's file."""
+    address = addresses.container_url(url)
+    headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
+    response = _refuse((yield Call("GET", address, headers=headers, partial=True)), address)
     if response.status_code != 206:
         raise RemoteProtocolError(
             f"expected part of the container from {address}, got all of it: Range is not supported"

@@ -1,29 +1,57 @@
-"""What the synchronous and the asynchronous stream share: everything but the waiting."""
+"""What the synchronous and the asynchronous stream share: everything but the waiting.
+
+The way of a stream is one generator. What it yields is what one of the stream's own primitives gives (`_dial`, `_hear`
+and so on); it is resumed with the result. For plain code a primitive has done its work by then; for asyncio it gives
+something to await first. Errors come back into the generator either way.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Generator, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from lodestream.download import Download, Ended
-from lodestream.errors import RemoteError, RemoteProtocolError
-from lodestream.messages import MAX_CREDIT, MAX_MESSAGE, SUBPROTOCOL
+from lodestream.errors import LodestreamError, RemoteError, RemoteProtocolError, TruncatedStreamError
+from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL
+from lodestream.range_download import RangeDownload
+from lodestream.reception import Reception, Store
 from lodestream.target import Target
 
-from . import addresses, problems
+from . import addresses, problems, requests
 from .errors import SilenceError
 from .pacing import Link, window_for
+from .roads import Roads, Transport
 
 if TYPE_CHECKING:
+    import httpx
+
     from lodestream.decoder import Decoder, View
     from lodestream.messages import Header
+    from lodestream.reception import DownloadEvent
 
-__all__ = ["BaseStream"]
+__all__ = ["LONGEST_PROBLEM", "PARTS", "BaseStream", "Received"]
+
+#: Statuses of answers that say something of the file asked for; with others, the body says what is wrong.
+PARTS = {200, 206, 416}
+
+#: The most of such a body that is read.
+LONGEST_PROBLEM = 64 * 1024
+
+#: Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is None
+#: until it is known.
+Received: TypeAlias = Callable[[int, "int | None"], None]
+
+Way: TypeAlias = Generator[Any, Any, None]
 
 # Enough for a whole window of the smallest messages: while frames wait unread beyond this, nobody answers pings, and a
 # reader who thinks for a minute over a view would be cut off. Credit, not this, bounds what is under way.
 _MAX_QUEUE = 256
+
+# Close codes that a WebSocket library gives a peer that breaks the rules.
+_OFFENCES = {1002, 1003, 1007, 1009}
 
 
 class BaseStream:
@@ -31,38 +59,56 @@ class BaseStream:
 
     Attributes
     ----------
-    url : str
-        The surface's address.
     target : Target
         Where it stops, and the order on the way there.
     """
 
     def __init__(
         self,
-        url: str,
+        url: str | Sequence[str],
         target: Target | None,
+        *,
         token: str | None,
         silence: float,
+        deadline: float,
         close_timeout: float,
         limit_rate: float | None,
         window: int | None,
+        transport: Transport,
+        store: Store | None,
+        container: str | None,
+        size: int | None,
+        progress: Received | None,
     ) -> None:
-        self.url = addresses.surface_url(url)
-        self.target = Target() if target is None else target
+        self._roads = Roads([url] if isinstance(url, str) else url, transport, deadline)
         self.silence = silence
         self._token = token
         self._close_timeout = close_timeout
         self._link = Link(limit_rate) if limit_rate is not None else None
-        if window is None:
-            window = window_for(limit_rate) if limit_rate is not None else MAX_CREDIT
-        self._download = Download(self.target, window=window)
+        self._window = window_for(limit_rate) if window is None and limit_rate is not None else window
+        self._reception = Reception(target, store=store, container=container, size=size)
+        self.target = self._reception.target
+        self._progress = progress
+        self._download: Download | None = None
+        self._parts: dict[str, RangeDownload] = {}
         self._views: deque[View] = deque()
+        # The download is told things by whoever iterates and by whoever stops, which may be two threads.
+        self._lock = threading.RLock()
         self._stopped = False
         self._abandoned = False
+        self._close_by: float | None = None
+        self._connections = 0
+        self._way: Way = self._travel()
+        self._answer: Any = None
+
+    @property
+    def url(self) -> str:
+        """The address that it comes from: of several the one in use."""
+        return self._roads.place.url
 
     @property
     def silence(self) -> float:
-        """Seconds without a word from the server after which `SilenceError` is raised; may be set at any time."""
+        """Seconds without a word after which a connection is given up; may be set at any time."""
         return self._silence
 
     @silence.setter
@@ -74,32 +120,253 @@ class BaseStream:
     @property
     def decoder(self) -> Decoder:
         """What has come so far; after `stop` it may hold more than the last view."""
-        return self._download.decoder
+        return self._reception.decoder
 
     @property
     def header(self) -> Header | None:
-        """What the server said first: the container's hash and size, and how much of it is planned."""
-        return self._download.header
+        """What the server said first over the WebSocket: the container's hash and size, and how much is planned."""
+        return self._download.header if self._download is not None else None
+
+    @property
+    def planned(self) -> int | None:
+        """Bytes of the surface that the target needs; None until that is known."""
+        return self._reception.planned
+
+    @property
+    def received(self) -> int:
+        """Bytes of the surface that are held."""
+        return self._reception.received
 
     @property
     def wire_bytes(self) -> int:
-        """Bytes of all messages received."""
-        return self._download.wire_bytes
+        """Bytes of all messages and answers received."""
+        return self._reception.wire_bytes
+
+    @property
+    def data_bytes(self) -> int:
+        """Bytes of the container received."""
+        return self._reception.data_bytes
+
+    @property
+    def transport(self) -> str:
+        """The road in use: ``ws`` or ``http``."""
+        return self._roads.place.road
+
+    @property
+    def connections(self) -> int:
+        """How many connections it took so far; over HTTP, how many requests."""
+        return self._connections
+
+    @property
+    def metadata_place(self) -> tuple[int, int] | None:
+        """Offset and length of the container's metadata, once they are known."""
+        return self._reception.metadata_place
 
     @property
     def ended(self) -> str | None:
         """Why nothing more comes: complete, level, rms, max, bytes, seconds or stopped; None while more may come."""
-        if self._download.ended is None and self._abandoned:
+        if self._reception.ended is None and self._abandoned:
             return "stopped"
-        return self._download.ended
+        return self._reception.ended
 
-    def _options(self) -> dict[str, Any]:
+    # The primitives, of which either kind of stream has its own.
+
+    def _dial(self, url: str) -> Any:
+        """Open a WebSocket; the subprotocol agreed on."""
+        raise NotImplementedError
+
+    def _hear(self, seconds: float) -> Any:
+        """The next message; None when none came in time."""
+        raise NotImplementedError
+
+    def _flush(self) -> Any:
+        """Send what the download has to send."""
+        raise NotImplementedError
+
+    def _leave(self) -> Any:
+        """Wait until the other side has closed."""
+        raise NotImplementedError
+
+    def _hang_up(self) -> Any:
+        """Close whatever is open, whoever is at the other end."""
+        raise NotImplementedError
+
+    def _get(self, url: str, headers: dict[str, str], seconds: float) -> Any:
+        """Ask for something over HTTP; status, headers and final address of the answer."""
+        raise NotImplementedError
+
+    def _read(self) -> Any:
+        """The next piece of the answer's body, empty at its end."""
+        raise NotImplementedError
+
+    def _wait(self, seconds: float) -> Any:
+        """Wait so long, or until `stop` is called."""
+        raise NotImplementedError
+
+    # The way.
+
+    def _travel(self) -> Way:
+        self._roads.progress(time.monotonic())
+        while True:
+            before = self._reception.held.total
+            try:
+                yield from self._by_socket() if self._roads.place.road == "ws" else self._by_parts()
+                return
+            except LodestreamError as error:
+                yield self._hang_up()
+                if self._over():
+                    return
+                progressed = self._reception.held.total > before
+                pause = self._roads.failed(error, time.monotonic(), progressed=progressed)
+            left = self._reception.tick(time.monotonic())
+            yield self._wait(pause if left is None else min(pause, left))
+            if self._over():
+                return
+
+    def _by_socket(self) -> Way:
+        with self._lock:
+            self._download = download = Download(window=self._window, reception=self._reception)
+        subprotocol = yield self._dial(addresses.stream_url(self.url))
+        self._connections += 1
+        if subprotocol != SUBPROTOCOL:
+            raise problems.NoStreamError(
+                f"expected {self.url} to speak {SUBPROTOCOL}, got {subprotocol or 'no subprotocol'}"
+            )
+        self._roads.met = True
+        while self.ended is None:
+            left = self._tick()
+            yield self._flush()
+            patience = self._patience()
+            message = yield self._hear(patience if left is None else min(patience, left))
+            if message is None:
+                if left is not None and left <= patience:
+                    continue
+                raise self._silent()
+            yield from self._pace(len(message))
+            self._take(lambda message=message: download.receive(message, time.monotonic()))  # type: ignore[misc]
+        yield self._flush()
+        yield self._leave()
+
+    def _by_parts(self) -> Way:
+        url = self.url
+        download = self._parts.setdefault(url, RangeDownload(self._reception))
+        address = addresses.container_url(url)
+        while True:
+            request = self._next_part(download)
+            if request is None:
+                break
+            left = self._tick_parts(download)
+            if self.ended is not None:
+                break
+            patience = self._patience() if left is None else min(self._patience(), left)
+            try:
+                status, headers, address = yield self._get(address, dict(request.headers), patience)
+                self._connections += 1
+                download.answer(status, headers, time.monotonic())
+                self._roads.met = True
+                while piece := (yield self._read()):
+                    yield from self._pace(len(piece))
+                    self._take(lambda piece=piece: download.receive(piece))  # type: ignore[misc]
+                    self._tick_parts(download)
+                    if self.ended is not None:
+                        break
+            except SilenceError:
+                self._tick_parts(download)
+                if self.ended is None:
+                    raise
+            if self.ended is not None:
+                break
+            download.finish(time.monotonic())
+        yield self._hang_up()
+
+    def _next_part(self, download: RangeDownload) -> Any:
+        made: list[Any] = []
+
+        def ask() -> list[DownloadEvent]:
+            request, events = download.request(time.monotonic())
+            made.append(request)
+            return events
+
+        self._take(ask)
+        return made[0]
+
+    def _tick_parts(self, download: RangeDownload) -> float | None:
+        with self._lock:
+            left = self._reception.tick(time.monotonic())
+            if self._stopped:
+                download.stop()
+            elif left == 0:
+                download.stop("seconds")
+            return left
+
+    def _pace(self, size: int) -> Way:
+        """Wait as long as so many bytes take at the rate allowed."""
+        if self._link is None:
+            return
+        until = time.monotonic() + self._link.delay(size, time.monotonic())
+        while not self._stopped and (wait := until - time.monotonic()) > 0:
+            left = self._tick()
+            yield self._flush()
+            if left == 0:
+                return
+            yield self._wait(wait if left is None else min(wait, left))
+
+    def _take(self, receive: Callable[[], list[DownloadEvent]]) -> None:
+        before = self._reception.held.total
+        with self._lock:
+            try:
+                events = receive()
+            except RemoteError as error:
+                raise problems.from_code(error.code, str(error)) from error
+            finally:
+                if self._reception.held.total > before:
+                    self._roads.progress(time.monotonic())
+            if not self._stopped:
+                self._views.extend(event for event in events if not isinstance(event, Ended))
+        if self._progress is not None:
+            self._progress(self._reception.received, self._reception.planned)
+
+    # What may happen at any time.
+
+    def _stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            self._views.clear()
+            if self._download is not None:
+                self._download.stop()
+
+    def _over(self) -> bool:
+        """Whether a connection that broke is not to be replaced, since nothing more is wanted."""
+        reception = self._reception
+        if not self._stopped and self._close_by is None and reception.stopped_for is None:
+            if reception.tick(time.monotonic()) != 0:
+                return False
+            reception.stopped_for = "seconds"
+        if reception.ended is None:
+            reception.end("stopped")
+        return True
+
+    def _tick(self) -> float | None:
+        with self._lock:
+            if self._download is None or self.transport == "http":
+                return self._reception.tick(time.monotonic())
+            return self._download.tick(time.monotonic())
+
+    def _patience(self) -> float:
+        if self._close_by is None:
+            return self.silence
+        return max(min(self.silence, self._close_by - time.monotonic()), 0.001)
+
+    def _messages(self) -> list[bytes]:
+        return self._download.data_to_send() if self._download is not None else []
+
+    def _socket_options(self) -> dict[str, Any]:
         options: dict[str, Any] = {
             "subprotocols": [SUBPROTOCOL],
             "compression": None,  # what travels is coded already
             "max_size": MAX_MESSAGE,
             "max_queue": _MAX_QUEUE,
-            "open_timeout": self.silence,
+            "open_timeout": self._patience(),
             "close_timeout": self._close_timeout,
         }
         if self._token is not None:
@@ -108,51 +375,44 @@ class BaseStream:
             options["proxy"] = None
         return options
 
-    def _agree(self, subprotocol: str | None) -> None:
-        if subprotocol != SUBPROTOCOL:
-            raise RemoteProtocolError(
-                f"expected {self.url} to speak {SUBPROTOCOL}, got {subprotocol or 'no subprotocol'}"
-            )
+    def _client_options(self) -> dict[str, Any]:
+        return requests.client_options(self.url)
 
-    def _tick(self) -> float | None:
-        return self._download.tick(time.monotonic())
-
-    def _delay(self, message: bytes) -> float:
-        return self._link.delay(len(message), time.monotonic()) if self._link is not None else 0.0
-
-    def _take(self, message: bytes) -> bool:
-        # True when this was the last message.
-        try:
-            events = self._download.receive(message)
-        except RemoteError as error:
-            raise problems.from_code(error.code, str(error)) from error
-        for event in events:
-            if isinstance(event, Ended):
-                return True
-            if not self._stopped:
-                self._views.append(event)
-        return False
-
-    def _stop(self) -> None:
-        self._stopped = True
-        self._views.clear()
-        self._download.stop()
+    def _part_headers(self, url: str, headers: dict[str, str]) -> dict[str, str]:
+        # The token is only for the server itself, wherever an answer may point.
+        if self._token is not None and addresses.same_origin(url, self.url):
+            return {**headers, "Authorization": f"Bearer {self._token}"}
+        return headers
 
     def _silent(self) -> SilenceError:
         return SilenceError(
             f"expected more of the stream, but {self.url} has sent nothing for {self.silence:g} seconds"
         )
 
-    def _lost(self, error: Any) -> None:
-        # Raises, unless the stream had ended.
-        if error.rcvd is None and error.sent is not None:
+    def _refused(self, answer: httpx.Response, body: bytes) -> LodestreamError:
+        """The error that an answer over HTTP stands for."""
+        return problems.from_response(answer.status_code, answer.reason_phrase, body, str(answer.url))
+
+    def _broke(self, error: Exception) -> LodestreamError:
+        """The error that a broken answer over HTTP stands for."""
+        import httpx
+
+        if isinstance(error, httpx.TimeoutException):
+            return self._silent()
+        return TruncatedStreamError(f"expected the rest of an answer of {self.url}, got none: {error}")
+
+    def _lost(self, error: Any) -> NoReturn:
+        """Raise what the end of a WebSocket stands for."""
+        if error.rcvd is None and error.sent is not None and error.sent.code in _OFFENCES:
             raise RemoteProtocolError(
                 f"{self.url} sent what is no WebSocket message of the stream: {error.sent.reason or error.sent.code}"
             )
-        try:
-            if error.rcvd is None:
-                self._download.connection_lost()
-            else:
-                self._download.connection_lost(error.rcvd.code, error.rcvd.reason)
-        except RemoteError as refusal:
-            raise problems.from_code(refusal.code, str(refusal)) from error
+        if self._download is not None:
+            try:
+                if error.rcvd is None:
+                    self._download.connection_lost()
+                else:
+                    self._download.connection_lost(error.rcvd.code, error.rcvd.reason)
+            except RemoteError as refusal:
+                raise problems.from_code(refusal.code, str(refusal)) from error
+        raise problems.from_connection(error, self.url) from error

@@ -14,25 +14,39 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import LodestreamError
 from lodestream.target import Target, Tolerance
 
-from . import addresses, problems, requests
+from . import problems, requests
 from .bodies import Closure, Source, opened, surface_parameters
-from .requests import Description, Flow, Progress
-from .stream import BaseStream
+from .requests import Description, Flow, Identity, Progress
+from .roads import Transport
+from .stream import LONGEST_PROBLEM, PARTS, BaseStream, Received
 
 if TYPE_CHECKING:
+    import httpx
     from websockets.sync.client import ClientConnection
 
     from lodestream.decoder import View
+    from lodestream.reception import Store
 
-__all__ = ["Stream", "connect", "delete", "describe", "fetch_range", "list", "list_surfaces", "upload"]
+__all__ = [
+    "Stream",
+    "connect",
+    "delete",
+    "describe",
+    "describe_file",
+    "fetch_range",
+    "identify",
+    "list",
+    "list_surfaces",
+    "upload",
+]
 
 T = TypeVar("T")
 
@@ -43,34 +57,26 @@ class Stream(BaseStream):
     It is a context manager: leaving it tells the server that no more is wanted. `connect` makes it.
     """
 
-    _socket: ClientConnection
+    _socket: ClientConnection | None = None
+    _client: httpx.Client | None = None
+    _body: Iterator[bytes] | None = None
 
     def _open(self) -> None:
-        from websockets.exceptions import WebSocketException
-        from websockets.sync.client import connect as connect_socket
-
-        # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
         self._held = ExitStack()
+        self._wake = threading.Event()
         try:
-            self._socket = self._held.enter_context(connect_socket(addresses.stream_url(self.url), **self._options()))
-        except (OSError, WebSocketException) as error:
-            raise problems.from_connection(error, self.url) from error
-        # The download is told things by whoever iterates and by whoever stops, which may be two threads.
-        self._lock = threading.Lock()
-        try:
-            self._agree(self._socket.subprotocol)
-            self._tick()
-            self._send()
+            while not self._roads.met and self._step():
+                pass
         except BaseException:
-            self._held.close()
+            self._abandon()
             raise
 
     def __iter__(self) -> Iterator[View]:
         return self
 
     def __next__(self) -> View:
-        while not self._views and self.ended is None:
-            self._exchange(self.silence)
+        while not self._views and self._step():
+            pass
         if not self._views:
             raise StopIteration
         return self._views.popleft()
@@ -91,114 +97,175 @@ class Stream(BaseStream):
 
         May be called from another thread than the one that iterates.
         """
-        with self._lock:
-            self._stop()
-        self._send()
+        self._stop()
+        self._wake.set()
+        self._flush()
 
     def close(self) -> None:
         """Stop, take leave and close the connection, within the time allowed for it."""
         try:
             if self.ended is None:
                 self.stop()
-            until = time.monotonic() + self._close_timeout
-            while self.ended is None:
-                self._exchange(max(until - time.monotonic(), 0.0))
+            self._close_by = time.monotonic() + self._close_timeout
+            while self._step():
+                pass
         except LodestreamError:
             # Whoever closes has what they want; how the other side takes it is no concern of theirs.
-            self._abandon()
+            pass
+        self._abandon()
 
     def _abandon(self) -> None:
         self._abandoned = True
-        self._held.close()
+        self._hang_up()
+        if self._client is not None:
+            self._client.close()
 
-    def _exchange(self, patience: float) -> None:
-        message = self._receive(patience)
-        if message is None:
-            return
-        self._sleep(self._delay(message))
-        with self._lock:
-            last = self._take(message)
-        self._send()
-        if last:
-            self._leave()
+    def _step(self) -> bool:
+        # Whether there may be another.
+        try:
+            self._answer = self._way.send(self._answer)
+        except StopIteration:
+            return False
+        return True
 
-    def _receive(self, patience: float) -> bytes | None:
-        # None when it was time to stop before a message came.
+    def _dial(self, url: str) -> str | None:
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect as connect_socket
+
+        # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
+        try:
+            self._socket = self._held.enter_context(connect_socket(url, **self._socket_options()))
+        except (OSError, WebSocketException) as error:
+            raise problems.from_connection(error, self.url) from error
+        return self._socket.subprotocol
+
+    def _hear(self, seconds: float) -> bytes | None:
         from websockets.exceptions import ConnectionClosed
 
-        with self._lock:
-            left = self._tick()
-        self._send()
+        assert self._socket is not None, "a message is expected of an open connection"
         try:
-            return self._socket.recv(patience if left is None else min(patience, left), decode=False)
+            return self._socket.recv(seconds, decode=False)
         except TimeoutError:
-            if left is not None and left <= patience:
-                return None
-            raise self._silent() from None
+            return None
         except ConnectionClosed as error:
             self._lost(error)
-            raise problems.from_connection(error, self.url) from error
 
-    def _sleep(self, delay: float) -> None:
-        until = time.monotonic() + delay
-        while (wait := until - time.monotonic()) > 0:
-            with self._lock:
-                left = self._tick()
-            self._send()
-            time.sleep(wait if left is None else min(wait, left))
-
-    def _send(self) -> None:
+    def _say(self, message: bytes) -> None:
         from websockets.exceptions import ConnectionClosed
 
+        try:
+            if self._socket is not None:
+                self._socket.send(message)
+        except ConnectionClosed:
+            # What the server said before it closed is still to be received, and tells more than this.
+            return
+
+    def _flush(self) -> None:
         with self._lock:
-            for message in self._download.data_to_send():
-                try:
-                    self._socket.send(message)
-                except ConnectionClosed:
-                    # What the server said before it closed is still to be received, and tells more than this.
-                    return
+            for message in self._messages():
+                self._say(message)
 
     def _leave(self) -> None:
         # The server closes after our bye. Closing first would cut its last messages off on some stacks.
         from websockets.exceptions import ConnectionClosed
 
         try:
-            self._socket.recv(self._close_timeout, decode=False)
+            if self._socket is not None:
+                self._socket.recv(self._close_timeout, decode=False)
         except (TimeoutError, ConnectionClosed):
             pass
         finally:
-            self._held.close()
+            self._hang_up()
+
+    def _hang_up(self) -> None:
+        self._socket = self._body = None
+        self._held.close()
+
+    def _get(self, url: str, headers: dict[str, str], seconds: float) -> tuple[int, dict[str, str], str]:
+        import httpx
+
+        if self._client is None:
+            self._client = httpx.Client(**self._client_options())
+        self._held.close()
+        try:
+            answer = self._held.enter_context(
+                self._client.stream("GET", url, headers=self._part_headers(url, headers), timeout=seconds)
+            )
+            if answer.status_code not in PARTS:
+                body = bytearray()
+                for piece in answer.iter_bytes():
+                    body += piece
+                    if len(body) > LONGEST_PROBLEM:
+                        break
+                raise self._refused(answer, bytes(body))
+        except httpx.HTTPError as error:
+            raise problems.from_connection(error, self.url) from error
+        self._body = answer.iter_raw()
+        return answer.status_code, dict(answer.headers), str(answer.url)
+
+    def _read(self) -> bytes:
+        import httpx
+
+        try:
+            return next(self._body or iter(()), b"")
+        except httpx.HTTPError as error:
+            raise self._broke(error) from error
+
+    def _wait(self, seconds: float) -> None:
+        self._wake.wait(seconds)
 
 
 def connect(
-    url: str,
+    url: str | Sequence[str],
     *,
     target: Target | None = None,
     token: str | None = None,
+    transport: Transport = "auto",
     silence: float = 30.0,
+    deadline: float = 60.0,
     close_timeout: float = 5.0,
     limit_rate: float | None = None,
     window: int | None = None,
+    store: Store | None = None,
+    container: str | None = None,
+    size: int | None = None,
+    progress: Received | None = None,
 ) -> Stream:
     """Open the stream of a surface.
 
+    A connection that breaks later is replaced by itself, and what has come is not sent again.
+
     Parameters
     ----------
-    url : str
-        The surface's address, ``http(s)://HOST/v1/surfaces/ID``.
+    url : str or sequence of str
+        The surface's address, ``http(s)://HOST/v1/surfaces/ID``, or that of a container's file on any web server. Of
+        several addresses of one surface, the next is taken when a connection fails.
     target : Target or None
         Where to stop, and the order on the way there; None for the whole surface.
     token : str or None
         What the server asks for, if it does.
+    transport : "auto", "ws" or "http"
+        Whether to use a WebSocket, or parts of the file by HTTP Range; ``auto`` takes the second where the first does
+        not come through.
     silence : float
-        Seconds without a word from the server after which `SilenceError` is raised.
+        Seconds without a word after which a connection is given up, with `SilenceError` if it is not replaced.
+    deadline : float
+        Seconds without a new byte after which a lost connection is not replaced any more and its error is raised; 0
+        for never replacing one.
     close_timeout : float
         Seconds that taking leave may last.
     limit_rate : float or None
         Receive at most so many bytes a second.
     window : int or None
-        Bytes that may be under way at once; None for what suits the rate. It is also what may still arrive after
-        `Stream.stop`.
+        Bytes that may be under way at once; None for what suits the rate allowed, or else for what is measured. It is
+        also what may still arrive after `Stream.stop`.
+    store : Store or None
+        Where what comes is kept; what is there is not asked for again.
+    container, size : str or None, int or None
+        SHA-256 and bytes of the container that the store has bytes of.
+    progress : callable or None
+        Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is
+        None until it is known.
 
     Returns
     -------
@@ -211,7 +278,21 @@ def connect(
     NotFoundError, RemoteError, RemoteProtocolError
         When the server refuses, or is none.
     """
-    stream = Stream(url, target, token, silence, close_timeout, limit_rate, window)
+    stream = Stream(
+        url,
+        target,
+        token=token,
+        transport=transport,
+        silence=silence,
+        deadline=deadline,
+        close_timeout=close_timeout,
+        limit_rate=limit_rate,
+        window=window,
+        store=store,
+        container=container,
+        size=size,
+        progress=progress,
+    )
     stream._open()
     return stream
 
@@ -280,6 +361,16 @@ def describe(url: str, *, token: str | None = None) -> Description:
     return _run(requests.describe(url), url, token)
 
 
+def describe_file(url: str, *, token: str | None = None) -> Mapping[str, Any]:
+    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints."""
+    return _run(requests.describe_file(url), url, token)
+
+
+def identify(url: str, *, token: str | None = None) -> Identity:
+    """What a surface's container, or a container's file, is known by."""
+    return _run(requests.identify(url), url, token)
+
+
 def delete(url: str, *, token: str | None = None) -> None:
     """Remove a surface from its server."""
     _run(requests.delete(url), url, token)
@@ -307,7 +398,9 @@ def _run(flow: Flow[T], url: str, token: str | None) -> T:
                 continue
             content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
             try:
-                answer = client.request(content=content, **requests.request_options(step, url, token))
+                with client.stream(content=content, **requests.request_options(step, url, token)) as answer:
+                    if not (step.partial and answer.status_code == 200):
+                        answer.read()
             except httpx.HTTPError as error:
                 raise problems.from_connection(error, url) from error
 

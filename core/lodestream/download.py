@@ -2,89 +2,107 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from .errors import OptionError, RemoteError, TruncatedStreamError
-from .messages import CODES, MAX_CREDIT, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
+from .errors import RemoteError, TruncatedStreamError
+from .messages import CODES, MAX_HELD, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
 from .protocol import Connection, Side, State
+from .reception import Ended, Reception
 from .target import Target
+from .window import Window
 
 if TYPE_CHECKING:
-    from .decoder import Decoder, View
+    from .decoder import Decoder
+    from .reception import DownloadEvent
 
-__all__ = ["Download", "DownloadEvent", "Ended"]
-
-
-@dataclass(frozen=True)
-class Ended:
-    """Nothing more will come.
-
-    ``why`` is complete, level, rms, max or bytes when the target was met or lies out of reach; seconds or stopped when
-    this side stopped.
-    """
-
-    why: str
-
-
-if TYPE_CHECKING:
-    DownloadEvent: TypeAlias = View | Ended
+__all__ = ["Download", "Ended"]
 
 
 class Download:
-    """One surface being received.
+    """One connection over which a surface is received.
 
     Whoever integrates it moves messages: each that comes goes into `receive`, and whatever `data_to_send` gives goes
     out, at the start and after every call. When `receive` gives an `Ended`, what `data_to_send` gives then is the last,
-    and the server closes the connection.
+    and the server closes the connection. When the connection breaks before, another `Download` of the same `reception`
+    goes on where this one was.
 
     Parameters
     ----------
     target : Target
         Where to stop, and the order on the way there.
-    window : int
+    window : int or None
         Bytes that may be under way at once, 1 to `MAX_CREDIT`. A full window is what still arrives after `stop`; less
-        than what the link holds in one round trip leaves it idle.
+        than what the link holds in one round trip leaves it idle. None lets a `Window` measure, which takes times.
+    reception : Reception or None
+        What has come over other connections; its target counts then.
 
     Attributes
     ----------
-    target : Target
-    decoder : Decoder
+    reception : Reception
         What has come so far.
     header : Header or None
         What the server said first.
     layer : Layer or None
         The figures that the server told last.
-    wire_bytes : int
-        Bytes of all messages received.
-    ended : str or None
-        Why nothing more will come, as in `Ended`.
+    window : Window
+        How much may be under way.
     """
 
-    def __init__(self, target: Target | None = None, *, window: int = MAX_CREDIT) -> None:
-        # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
-        from .decoder import Decoder
-
-        if not 0 < window <= MAX_CREDIT:
-            raise OptionError(f"expected a window of 1 to {MAX_CREDIT} bytes, got {window}")
-        self.target = Target() if target is None else target
-        self.window = window
-        self.decoder: Decoder = Decoder()
+    def __init__(
+        self, target: Target | None = None, *, window: int | None = None, reception: Reception | None = None
+    ) -> None:
+        self.reception = Reception(target) if reception is None else reception
+        self.window = Window(window)
         self.header: Header | None = None
         self.layer: Layer | None = None
-        self.wire_bytes = 0
-        self.ended: str | None = None
         self._connection = Connection(Side.CLIENT)
-        self._outbox = [self._connection.send(Open(self.target, window))]
-        self._data_bytes = 0
-        self._ungranted = 0
-        self._stopped_for: str | None = None
-        self._deadline: float | None = None
+        self._opened: float | None = None
+        # Of a container that is not known by name, nothing can be said to be held.
+        known = self.reception.container is not None
+        opening = Open(
+            self.reception.target,
+            self.window.size,
+            _largest(self.reception) if known else (),
+            self.reception.container,
+        )
+        self._outbox = [self._connection.send(opening)]
+        self.window.grant(self.window.size)
 
-    def receive(self, message: bytes) -> list[DownloadEvent]:
+    @property
+    def target(self) -> Target:
+        """Where to stop, and the order on the way there."""
+        return self.reception.target
+
+    @property
+    def decoder(self) -> Decoder:
+        """What has come so far, decoded."""
+        return self.reception.decoder
+
+    @property
+    def wire_bytes(self) -> int:
+        """Bytes of all messages received, over other connections too."""
+        return self.reception.wire_bytes
+
+    @property
+    def ended(self) -> str | None:
+        """Why nothing more will come, as in `Ended`."""
+        return self.reception.ended
+
+    @property
+    def credit(self) -> int:
+        """Bytes of the container that may still arrive unless more are granted."""
+        return self._connection.credit
+
+    def receive(self, message: bytes, now: float | None = None) -> list[DownloadEvent]:
         """Take one message; the views that it completes and, last, an `Ended` if it is the last.
 
         What still arrives after `stop` is kept in the decoder and gives no views.
+
+        Parameters
+        ----------
+        message : bytes
+        now : float or None
+            Seconds of the clock that `tick` is told; without it a window that is measured stays as it is.
 
         Raises
         ------
@@ -97,16 +115,17 @@ class Download:
         TruncatedStreamError
             When the server ends before it has sent what it promised.
         """
-        self.wire_bytes += len(message)
+        self.reception.wire_bytes += len(message)
         event = self._connection.receive(message)
         if isinstance(event, Segments):
-            return self._take(event)
+            return self._take(event, now)
         if isinstance(event, Header):
-            self.header = event
-        elif isinstance(event, Layer):
+            return self._begin(event, now)
+        if isinstance(event, Layer):
             self.layer = event
         elif isinstance(event, End):
-            return [self._end(event)]
+            self._outbox.append(self._connection.send(Bye()))
+            return [self.reception.end(event.why)]
         elif isinstance(event, Error):
             raise RemoteError(event.code, f"{event.title}: {event.detail}")
         return []
@@ -125,7 +144,7 @@ class Download:
             What `Ended` is to say when the server has obeyed.
         """
         if self._connection.state in (State.OPENED, State.STREAMING):
-            self._stopped_for = why
+            self.reception.stopped_for = why
             self._outbox.append(self._connection.send(Stop()))
 
     def tick(self, now: float) -> float | None:
@@ -138,14 +157,15 @@ class Download:
         float or None
             Seconds until the stop; None when no time is set, or it is over.
         """
-        if self.target.seconds is None or self._stopped_for is not None or self.ended is not None:
+        if self._opened is None:
+            self._opened = now
+        if self.reception.stopped_for is not None or self.ended is not None:
             return None
-        if self._deadline is None:
-            self._deadline = now + self.target.seconds
-        if now < self._deadline:
-            return self._deadline - now
-        self.stop("seconds")
-        return None
+        left = self.reception.tick(now)
+        if left == 0:
+            self.stop("seconds")
+            return None
+        return left
 
     def connection_lost(self, code: int | None = None, reason: str = "") -> None:
         """Tell that the connection is closed; nothing happens if the stream has ended.
@@ -166,33 +186,38 @@ class Download:
         """
         if self.ended is not None:
             return
-        for word, meaning in CODES.items():
-            if meaning.close == code:
-                raise RemoteError(word, reason or meaning.title)
+        words = [word for word, meaning in CODES.items() if meaning.close == code]
+        if words:
+            # Where words share a code, the reason begins with the one that is meant.
+            word = next((word for word in words if reason.startswith(word)), words[0])
+            raise RemoteError(word, reason or CODES[word].title)
         closed = "was lost" if code is None else f"was closed with code {code} {reason}".rstrip()
         raise TruncatedStreamError(
-            f"expected an end message, got {self._data_bytes} bytes before the connection {closed}"
+            f"expected an end message, got {self.reception.data_bytes} bytes before the connection {closed}"
         )
 
-    def _take(self, event: Segments) -> list[DownloadEvent]:
-        self._data_bytes += len(event.data)
-        self._ungranted += len(event.data)
+    def _begin(self, event: Header, now: float | None) -> list[DownloadEvent]:
+        self.header = event
+        if now is not None and self._opened is not None:
+            self.window.heard(now - self._opened)
+        self.reception.identify(event.container, event.size)
+        return [*self.reception.expect(event.planned, event.index, event.metadata, event.prefix)]
+
+    def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
         stopped = self._connection.state is State.STOPPING
+        views = self.reception.take(event.offset, event.data)
+        self.window.arrive(len(event.data), now)
+        grant = self.window.size - self._connection.credit
         # Four grants a window: fewer would leave the link idle between them, more would be chatter.
-        if not stopped and self._ungranted * 4 >= self.window:
-            self._outbox.append(self._connection.send(Credit(self._ungranted)))
-            self._ungranted = 0
-        views = self.decoder.feed_at(event.offset, event.data)
+        if not stopped and grant > 0 and grant * 4 >= self.window.size:
+            self._outbox.append(self._connection.send(Credit(grant)))
+            self.window.grant(grant, now)
         return [] if stopped else [*views]
 
-    def _end(self, event: End) -> Ended:
-        self._outbox.append(self._connection.send(Bye()))
-        if event.why == "stopped":
-            why = self._stopped_for or event.why
-        else:
-            why = event.why
-            planned = self.header.planned if self.header else 0
-            if self._data_bytes < planned or (why == "complete" and not self.decoder.complete):
-                raise TruncatedStreamError(f"expected {planned} bytes of the surface, got {self._data_bytes} in all")
-        self.ended = why
-        return Ended(why)
+
+def _largest(reception: Reception) -> tuple[tuple[int, int], ...]:
+    """What is held, the smallest ranges left out where there are more than a message may name."""
+    ranges = list(reception.held)
+    if len(ranges) > MAX_HELD:
+        ranges = sorted(sorted(ranges, key=lambda place: place[1], reverse=True)[:MAX_HELD])
+    return tuple(ranges)

@@ -17,7 +17,9 @@ __all__ = [
     "CODES",
     "MAX_CREDIT",
     "MAX_DATA",
+    "MAX_HELD",
     "MAX_MESSAGE",
+    "MIN_WINDOW",
     "SUBPROTOCOL",
     "VERSION",
     "Bye",
@@ -50,6 +52,12 @@ MAX_MESSAGE = MAX_DATA + 1024
 #: reader has in front of it, and what still arrives after a `stop`.
 MAX_CREDIT = 256 * 1024
 
+#: What a client has outstanding at least, however slow the link is: below it, messages and their framing cost too much.
+MIN_WINDOW = 16 * 1024
+
+#: The most ranges of `Open.held`: they fit into one message, and subtracting them is no work.
+MAX_HELD = 4096
+
 
 @dataclass(frozen=True)
 class Code:
@@ -69,6 +77,8 @@ CODES: Mapping[str, Code] = {
     "not-found": Code(4404, "No such surface"),
     "idle": Code(4408, "Nothing was heard or taken for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
+    "other-container": Code(4412, "The surface has another container than the one held"),
+    "bad-held": Code(4416, "A list of what is held that cannot be"),
     "failed": Code(4424, "The surface could not be built"),
     "bad-target": Code(4422, "A target that the surface cannot meet"),
     "unsupported-version": Code(4426, "Another version of the protocol"),
@@ -106,7 +116,9 @@ class Open:
     credit : int
         First credit, in bytes of `Segments.data`.
     held : tuple of (offset, length)
-        Slices of the container that the client holds already.
+        Slices of the container that the client holds already, at most `MAX_HELD`.
+    container : str or None
+        SHA-256 of the container that they are slices of.
     ticket : str or None
         What allows reading where a token does and the client cannot send a header, as in a browser.
     """
@@ -115,6 +127,7 @@ class Open:
     target: Target = field(default_factory=Target)
     credit: int = MAX_CREDIT
     held: tuple[tuple[int, int], ...] = ()
+    container: str | None = None
     ticket: str | None = field(default=None, repr=False)
 
 
@@ -151,9 +164,15 @@ class Header:
     size : int
         Bytes of the whole container.
     planned : int
-        Bytes of the surface (header, layers, exactness) that will be sent; index and metadata are not counted.
+        Bytes of the surface (header, layers, exactness) that the target needs, held ones included; index and metadata
+        are not counted.
     extent : float
         What a relative tolerance refers to: the range of the heights, or the diagonal of the box.
+    index, metadata : (offset, length)
+        Where these two sections stand.
+    prefix : bool
+        What is sent, and what was held of it, is the file from its first byte on, then the metadata; otherwise the
+        index comes first and slices follow.
     """
 
     type: ClassVar[str] = "header"
@@ -161,6 +180,9 @@ class Header:
     size: int
     planned: int
     extent: float
+    index: tuple[int, int]
+    metadata: tuple[int, int]
+    prefix: bool
 
 
 @dataclass(frozen=True)

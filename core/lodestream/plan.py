@@ -6,12 +6,13 @@ share this piece of logic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
 
 from .container.model import ByteRange, Index
 from .errors import OptionError
+from .ranges import RangeSet
 from .selection import select, wish_of
 from .target import Target
 
@@ -38,20 +39,22 @@ class Mark:
 
 @dataclass(frozen=True)
 class Plan:
-    """Slices of a container in sending order.
+    """Slices of a container in sending order, less what is held.
 
     Attributes
     ----------
     before : tuple of ByteRange
         Service slices that must come first: the index, where segments travel without the tables of their layers.
     ranges : tuple of ByteRange
-        The surface. Their sum is the state's ``bytes``.
+        The surface. Their sum and what is held of them make the state's ``bytes``.
     after : tuple of ByteRange
         The metadata.
     marks : tuple of Mark
-        States on the way, the last one being the state at the end.
+        States on the way, the last one being the state at the end; those with a ``sent`` of 0 are held.
     ended : str
         Why the plan ends where it does.
+    prefix : bool
+        The whole of ``ranges`` would be a prefix of the file, and needs no index.
     """
 
     before: tuple[ByteRange, ...]
@@ -59,10 +62,16 @@ class Plan:
     after: tuple[ByteRange, ...]
     marks: tuple[Mark, ...]
     ended: Ended
+    prefix: bool = False
+
+    @property
+    def slices(self) -> tuple[ByteRange, ...]:
+        """All slices, in order."""
+        return (*self.before, *self.ranges, *self.after)
 
     @property
     def bytes(self) -> int:
-        """Bytes of the surface's slices."""
+        """Bytes of the surface's slices, sent or held."""
         return self.marks[-1].bytes
 
     @property
@@ -81,14 +90,23 @@ class Plan:
         return self.marks[-1].max_error
 
 
-def plan(index: Index, target: Target = Target()) -> Plan:  # noqa: B008 - an immutable value
-    """Decide what a receiver with this target gets.
+def plan(
+    index: Index,
+    target: Target = Target(),  # noqa: B008 - an immutable value
+    held: RangeSet | None = None,
+) -> Plan:
+    """Decide what a receiver with this target, which holds these bytes of the container, gets.
 
     Raises
     ------
     OptionError
         When there is no such level, or not even the first layer fits into the bytes allowed.
     """
+    chosen = _whole(index, target)
+    return _less(chosen, held) if held else chosen
+
+
+def _whole(index: Index, target: Target) -> Plan:
     if target.region is not None or target.attributes is not None:
         return _selected(index, target)
     if target.level is not None:
@@ -110,7 +128,7 @@ def _prefix(index: Index, target: Target) -> Plan:
     if index.exactness:
         marks.append(_exact(index, len(marks), index.surface_end))
     marks, ended = _until(marks, target, index.header.extent)
-    return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended)
+    return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended, prefix=True)
 
 
 def _exact(index: Index, number: int, held: int) -> Mark:
@@ -246,3 +264,28 @@ def _cut(ranges: list[ByteRange], length: int) -> tuple[ByteRange, ...]:
             kept.append(ByteRange(place.offset, taken))
         length -= taken
     return tuple(kept)
+
+
+def _less(chosen: Plan, held: RangeSet) -> Plan:
+    """The plan without what is held; each mark stands where the last missing byte before it does."""
+    missing = [(place, _missing(place, held)) for place in chosen.ranges]
+    marks: list[Mark] = []
+    todo = iter(chosen.marks)
+    mark = next(todo, None)
+    planned = sent = 0
+    for place, gaps in missing:
+        while mark is not None and mark.sent <= planned + place.length:
+            end = place.offset + mark.sent - planned
+            marks.append(replace(mark, sent=sent + sum(max(min(gap.end, end) - gap.offset, 0) for gap in gaps)))
+            mark = next(todo, None)
+        planned += place.length
+        sent += sum(gap.length for gap in gaps)
+    before, after = (
+        tuple(gap for place in part for gap in _missing(place, held)) for part in (chosen.before, chosen.after)
+    )
+    ranges = tuple(gap for _, gaps in missing for gap in gaps)
+    return replace(chosen, before=before, ranges=ranges, after=after, marks=tuple(marks))
+
+
+def _missing(place: ByteRange, held: RangeSet) -> list[ByteRange]:
+    return [ByteRange(*gap) for gap in held.missing(place.offset, place.length)]

@@ -9,8 +9,13 @@ from .errors import CorruptStreamError, OptionError
 from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
 from .plan import Mark, plan
 from .protocol import Connection, Side, State
+from .ranges import RangeSet
 
 __all__ = ["Sender"]
+
+# A message takes a quarter of the credit that there is, but not so little that its framing counts.
+_SHARES = 4
+_LEAST = 4096
 
 
 class Sender:
@@ -54,8 +59,8 @@ class Sender:
         """Where the stream is; closed and failed are final once `next_message` gives None."""
         return self._connection.state
 
-    def receive(self, message: bytes) -> None:
-        """Take one message.
+    def receive(self, message: bytes) -> Event:
+        """Take one message; the event that it stands for.
 
         Raises
         ------
@@ -72,6 +77,7 @@ class Sender:
             self._outbox = deque([End("stopped")])
             self._slices.clear()
             self._marks.clear()
+        return event
 
     def fail(self, code: str, detail: str) -> None:
         """Refuse: an error, and nothing after it."""
@@ -100,8 +106,11 @@ class Sender:
             return None
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
         until_mark = self._marks[0][0] - self.sent if self._marks else MAX_DATA
+        # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
+        credit = self._connection.credit
+        share = min(credit, max(credit // _SHARES, _LEAST))
         slice_ = self._slices[0]
-        return ByteRange(slice_.offset, min(slice_.length, until_mark, self._connection.credit, MAX_DATA))
+        return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
         """Hand over the bytes of a slice that `wanted` has named; after a stop they are dropped.
@@ -123,18 +132,38 @@ class Sender:
         self._end_if_done()
 
     def _plan(self, event: Open) -> None:
+        index = self._index
         try:
-            chosen = plan(self._index, event.target)
+            chosen = plan(index, event.target, self._held(event))
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         first = sum(slice_.length for slice_ in chosen.before)
-        self._slices.extend(
-            slice_ for part in (chosen.before, chosen.ranges, chosen.after) for slice_ in part if slice_.length
-        )
-        self._marks.extend((first + mark.sent, mark) for mark in chosen.marks)
+        self._slices.extend(slice_ for slice_ in chosen.slices if slice_.length)
+        # Of the states that what is held makes already, there is nothing to say.
+        self._marks.extend((first + mark.sent, mark) for mark in chosen.marks if mark.sent)
         self._ended = chosen.ended
-        self._outbox.append(Header(self._container, self._index.size, chosen.bytes, self._index.header.extent))
+        self._outbox.append(
+            Header(
+                self._container,
+                index.size,
+                chosen.bytes,
+                index.header.extent,
+                (index.index.offset, index.index.length),
+                (index.metadata.offset, index.metadata.length),
+                chosen.prefix,
+            )
+        )
         self._end_if_done()
+
+    def _held(self, event: Open) -> RangeSet:
+        if event.held and event.container is None:
+            raise MessageError("bad-held", "expected open.container with open.held, got none")
+        if event.container not in (None, self._container):
+            raise MessageError("other-container", f"expected container {self._container}, got {event.container}")
+        held = RangeSet(event.held)
+        if held.end > self._index.size:
+            raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {held.end}")
+        return held
 
     def _mark(self, sent: int) -> None:
         while self._marks and self._marks[0][0] <= sent:

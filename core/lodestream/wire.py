@@ -17,6 +17,7 @@ import msgpack
 from .errors import OptionError, UnsupportedVersionError
 from .messages import (
     MAX_DATA,
+    MAX_HELD,
     MAX_MESSAGE,
     VERSION,
     Bye,
@@ -84,7 +85,21 @@ def _digest(value: Any) -> str:
 def _held(value: Any) -> tuple[tuple[int, int], ...]:
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         raise _MismatchError("a list of [offset, length]")
+    if len(value) > MAX_HELD:
+        raise MessageError("bad-held", f"expected open.held to be at most {MAX_HELD} ranges, got {len(value)}")
     return tuple((_integer(offset), _positive(length)) for offset, length in value)
+
+
+def _place(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _MismatchError("[offset, length]")
+    return _integer(value[0]), _positive(value[1])
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _MismatchError("true or false")
+    return value
 
 
 def _tolerance(value: Any) -> Tolerance:
@@ -115,11 +130,19 @@ def _target(value: Any) -> Target:
 
 
 _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
-    Open: {"target": _target, "credit": _integer, "held": _held, "ticket": _text},
+    Open: {"target": _target, "credit": _integer, "held": _held, "container": _digest, "ticket": _text},
     Credit: {"bytes": _positive},
     Stop: {},
     Bye: {},
-    Header: {"container": _digest, "size": _integer, "planned": _integer, "extent": _number},
+    Header: {
+        "container": _digest,
+        "size": _integer,
+        "planned": _integer,
+        "extent": _number,
+        "index": _place,
+        "metadata": _place,
+        "prefix": _flag,
+    },
     Segments: {"offset": _integer, "data": _data},
     Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _number, "max": _number},
     End: {"why": _text},
@@ -129,7 +152,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
-_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "ticket")}
+_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "ticket")}
 
 
 def serialize(event: Event) -> bytes:

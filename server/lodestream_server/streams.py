@@ -17,11 +17,11 @@ from fastapi.responses import JSONResponse
 from starlette.websockets import WebSocketDisconnect
 
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
-from lodestream.messages import CODES, SUBPROTOCOL, MessageError, Open
+from lodestream.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
-from lodestream.wire import parse
+from lodestream.wire import parse, serialize
 
 from .access import Caller, anybody
 from .containers import OpenContainer
@@ -270,9 +270,6 @@ def _code(error: Exception) -> str:
 
 
 async def _refuse(socket: WebSocket, code: str, detail: str) -> None:
-    from lodestream.messages import Error
-    from lodestream.wire import serialize
-
     try:
         async with asyncio.timeout(_CLOSE_SECONDS):
             await socket.send_bytes(serialize(Error(code, CODES[code].title, detail)))

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.sync.server import ServerConnection, serve
@@ -16,12 +17,16 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import ProtocolError, RemoteProtocolError
-from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL, End, Error, Header, Segments
+from lodestream.messages import MAX_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Header, Segments
 from lodestream.wire import serialize
 from lodestream_client import sync
 
 Behaviour = Callable[[ServerConnection], None]
-HEADER = serialize(Header("ab" * 32, 10_000, 5000, 1.0))
+HEADER = serialize(Header("ab" * 32, 10_000, 5000, 1.0, (6000, 100), (5000, 100), True))
+
+
+def header_of(data: bytes, planned: int) -> bytes:
+    return serialize(Header("ab" * 32, len(data), planned, 1.0, (len(data) - 2, 2), (len(data) - 3, 1), True))
 
 
 @contextmanager
@@ -60,15 +65,16 @@ def tcp_server(answer: bytes) -> Iterator[str]:
             thread.join()
 
 
-def follow(url: str, asynchronous: bool, silence: float = 30.0) -> None:
+def follow(url: str, asynchronous: bool, **chosen: Any) -> None:
+    options: dict[str, Any] = {"close_timeout": 0.2, "deadline": 0, "transport": "ws", **chosen}
     if not asynchronous:
-        with sync.connect(url, silence=silence, close_timeout=0.2) as stream:
+        with sync.connect(url, **options) as stream:
             for _ in stream:
                 pass
         return
 
     async def loop() -> None:
-        async with client.connect(url, silence=silence, close_timeout=0.2) as stream:
+        async with client.connect(url, **options) as stream:
             async for _ in stream:
                 pass
 
@@ -154,7 +160,7 @@ def test_bytes_that_are_no_container(asynchronous: bool) -> None:
 @pytest.mark.parametrize("size", [0, 100, 1500])
 def test_an_end_before_the_end(asynchronous: bool, container_file: Path, size: int) -> None:
     data = container_file.read_bytes()
-    messages = [serialize(Header("ab" * 32, len(data), 3000, 1.0))]
+    messages = [header_of(data, 3000)]
     messages += [serialize(Segments(0, data[:size]))] if size else []
     with (
         websocket_server(says(*messages, serialize(End("complete")))) as url,
@@ -210,10 +216,10 @@ def test_another_subprotocol(asynchronous: bool) -> None:
 
 def test_a_server_that_does_not_take_leave(asynchronous: bool, container_file: Path) -> None:
     data = container_file.read_bytes()
-    header = serialize(Header("ab" * 32, len(data), len(data), 1.0))
+    header = header_of(data, len(data))
     slices = [serialize(Segments(at, data[at : at + 60_000])) for at in range(0, len(data), 60_000)]
     with websocket_server(says(header, *slices, serialize(End("complete")))) as url:
-        follow(url, asynchronous)  # returns within the time for closing
+        follow(url, asynchronous, window=MAX_CREDIT)  # returns within the time for closing
 
 
 @pytest.mark.parametrize(

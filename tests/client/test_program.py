@@ -68,7 +68,12 @@ def test_all_names_are_there() -> None:
     for name in lodestream_client.__all__:
         assert getattr(lodestream_client, name) is not None
     assert list(lodestream_client.__all__) == sorted(lodestream_client.__all__, key=lambda name: (name.islower(), name))
-    assert set(sync.__all__) == set(lodestream_client.__all__) - {"Description", "SilenceError", "UnreachableError"}
+    assert set(sync.__all__) == set(lodestream_client.__all__) - {
+        "Description",
+        "Identity",
+        "SilenceError",
+        "UnreachableError",
+    }
     with pytest.raises(AttributeError, match="no attribute 'juggle'"):
         _ = lodestream_client.juggle
 

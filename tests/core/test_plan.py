@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import itertools
+from random import Random
 
 import pytest
 
 from lodestream import OptionError, Target, Tolerance
 from lodestream.container import Index
 from lodestream.plan import Plan, plan
+from lodestream.ranges import RangeSet
 from lodestream.target import Order
 
 from .surfaces import SAMPLES, contained
@@ -122,3 +124,33 @@ def test_levels_that_do_not_exist_are_refused_by_name() -> None:
     for order in ORDERS:
         with pytest.raises(OptionError, match=f"0 to {finest}, got {finest + 1}"):
             plan(index, Target(level=finest + 1, order=order))
+
+
+@pytest.mark.parametrize("name", ["heights", "attributes", "noise", "pair"])
+def test_what_is_held_is_not_sent_again(name: str) -> None:
+    _, index = contained(name)
+    random = Random(7)
+    for target in targets(index):
+        whole = plan(index, target)
+        for _ in range(3):
+            held = RangeSet(
+                (random.randrange(index.size), random.randrange(1, index.size)) for _ in range(random.randrange(4))
+            )
+            left = plan(index, target, held)
+            assert (left.bytes, left.ended, left.prefix) == (whole.bytes, whole.ended, whole.prefix)
+            assert len(left.marks) == len(whole.marks)
+            asked = [byte for place in whole.slices for byte in range(place.offset, place.end)]
+            missing = [byte for byte in asked if not held.covers(byte, 1)]
+            assert [byte for place in left.slices for byte in range(place.offset, place.end)] == missing
+            surface = [byte for place in whole.ranges for byte in range(place.offset, place.end)]
+            for before, after in zip(whole.marks, left.marks, strict=True):
+                assert after.sent == sum(not held.covers(byte, 1) for byte in surface[: before.sent])
+                assert after.bytes == before.bytes
+
+
+def test_what_is_held_whole_leaves_nothing() -> None:
+    _, index = contained("heights")
+    left = plan(index, Target(), RangeSet([(0, index.size)]))
+    assert left.slices == ()
+    assert {mark.sent for mark in left.marks} == {0}
+    assert plan(index, Target(), RangeSet()) == plan(index)

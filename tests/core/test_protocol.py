@@ -28,7 +28,7 @@ from lodestream.messages import (
 from lodestream.protocol import TRANSITIONS, Connection, Side, State
 from lodestream.wire import serialize
 
-HEADER = Header("0" * 64, 1000, 900, 1.0)
+HEADER = Header("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
 SAMPLES: dict[type[Event], Event] = {
     Open: Open(credit=100),
     Credit: Credit(50),

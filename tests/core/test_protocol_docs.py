@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
+from itertools import pairwise
 
-from lodestream import Target
-from lodestream.messages import CODES, MAX_CREDIT, MAX_DATA, MAX_MESSAGE, VERSION, Open
+from lodestream.messages import CODES, MAX_CREDIT, MAX_DATA, MAX_HELD, MAX_MESSAGE, MIN_WINDOW, VERSION, Segments
 from lodestream.protocol import TRANSITIONS
-from lodestream.wire import _FIELDS, serialize
+from lodestream.wire import _FIELDS, parse
 
-DOCS = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+from .exchange import CONTAINER, record, render
+from .exchange import DOCS as PAGE
+
+DOCS = PAGE.read_text()
 
 
 def table(*header: str) -> list[list[str]]:
@@ -49,12 +51,21 @@ def test_codes() -> None:
 
 
 def test_limits() -> None:
-    for number in (MAX_CREDIT, MAX_DATA, MAX_MESSAGE):
+    for number in (MAX_CREDIT, MAX_DATA, MAX_MESSAGE, MAX_HELD, MIN_WINDOW):
         assert f"{number:,}" in DOCS
     assert f"`version`, which is {VERSION};" in DOCS
 
 
-def test_the_first_message_byte_by_byte() -> None:
-    listing = DOCS.partition("## A first message, byte by byte")[2]
-    data = bytes.fromhex("".join(re.findall(r"^    ((?: *[0-9a-f]{2}\b)+)", listing, re.MULTILINE)))
-    assert data == serialize(Open(Target(level=2), 1000))
+def test_the_exchange_is_what_both_ends_say() -> None:
+    assert render(DOCS) == DOCS, "python -m tests.core.exchange writes it anew"
+
+
+def test_the_exchange_has_every_byte_of_the_surface_once() -> None:
+    listing = DOCS.partition("<!-- recorded -->")[2]
+    messages = [bytes.fromhex(block) for block in re.findall(r"(?m)^((?: {4}[0-9a-f ]+\n)+)", listing)]
+    assert messages == [message for _, message in record(CONTAINER.read_bytes()) if message]
+    slices = [event for event in map(parse, messages) if isinstance(event, Segments)]
+    container = CONTAINER.read_bytes()
+    assert all(container[event.offset :].startswith(event.data) for event in slices)
+    assert slices[0].offset == 0
+    assert all(one.offset + len(one.data) == other.offset for one, other in pairwise(slices))

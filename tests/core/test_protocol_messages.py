@@ -13,6 +13,7 @@ from lodestream import Target, Tolerance, UnsupportedVersionError
 from lodestream.messages import (
     CODES,
     MAX_DATA,
+    MAX_HELD,
     MAX_MESSAGE,
     VERSION,
     Bye,
@@ -33,13 +34,13 @@ DIGEST = "0123456789abcdef" * 4
 
 EVENTS: list[Event] = [
     Open(),
-    Open(Target(level=3), 1000, ((0, 96), (200, 1))),
+    Open(Target(level=3), 1000, ((0, 96), (200, 1)), DIGEST),
     Open(ticket="dGlja2V0"),
     Open(Target(until_rms=Tolerance(1e-3, True), until_max=Tolerance(2.5), max_bytes=20000, order="level"), 0),
     Credit(1),
     Stop(),
     Bye(),
-    Header(DIGEST, 2**40, 12345, 1e305),
+    Header(DIGEST, 2**40, 12345, 1e305, (2**39, 500), (13000, 1), True),
     Segments(7, bytes(range(256))),
     Segments(0, bytes(MAX_DATA)),
     Layer(0, 2, 96, 0.125, 3.5),
@@ -47,7 +48,10 @@ EVENTS: list[Event] = [
     Error("not-found", "No such surface", "expected one of ..., got é"),
 ]
 
+PLACED = {"type": "header", "container": DIGEST, "size": 9, "planned": 1, "extent": 1.0, "index": [6, 3]}
+
 integers = st.integers(0, 2**53)
+places = st.tuples(integers, st.integers(1, 2**53))
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 tolerances = st.none() | st.builds(Tolerance, st.floats(0, 1e300), st.booleans())
 targets = st.builds(Target, level=st.none() | integers) | st.builds(
@@ -58,9 +62,9 @@ targets = st.builds(Target, level=st.none() | integers) | st.builds(
     order=st.sampled_from(["quality", "level"]),
 )
 events = st.one_of(
-    st.builds(Open, targets, integers, st.lists(st.tuples(integers, st.integers(1, 2**53)), max_size=5).map(tuple)),
+    st.builds(Open, targets, integers, st.lists(places, max_size=5).map(tuple), st.none() | st.just(DIGEST)),
     st.builds(Credit, st.integers(1, 2**53)),
-    st.builds(Header, st.just(DIGEST), integers, integers, numbers),
+    st.builds(Header, st.just(DIGEST), integers, integers, numbers, places, places, st.booleans()),
     st.builds(Segments, integers, st.binary(min_size=1, max_size=300)),
     st.builds(Layer, integers, integers, integers, numbers, numbers),
     st.builds(End, st.text(max_size=20)),
@@ -152,6 +156,10 @@ def test_whole_numbers_are_taken_where_a_float_is_meant() -> None:
         (packed(type="open", version=1, credit=1, target={"until_max": [0.1, 1]}), r"target\.until_max"),
         (packed(type="header", container="../../etc/passwd", size=1, planned=1, extent=1.0), r"header\.container"),
         (packed(type="header", container=DIGEST, size=1, planned=1, extent=float("nan")), r"header\.extent"),
+        (packed(**PLACED, metadata=[5], prefix=True), r"header\.metadata"),
+        (packed(**PLACED, metadata=[5, 0], prefix=True), r"header\.metadata"),
+        (packed(**PLACED, metadata=[5, 1], prefix=1), r"header\.prefix"),
+        (packed(type="open", version=1, credit=1, container="ab"), r"open\.container"),
         (packed(type="segments", offset=0, data=b""), r"segments\.data"),
         (packed(type="segments", offset=0, data="text"), r"segments\.data"),
         (packed(type="segments", offset=0, data=bytes(MAX_DATA + 1)), r"segments\.data"),
@@ -178,6 +186,20 @@ def test_a_target_that_contradicts_itself_has_a_code_of_its_own(target: dict[str
     with pytest.raises(MessageError) as refused:
         parse(packed(type="open", version=1, credit=1, target=target))
     assert refused.value.code == "bad-target"
+
+
+def test_the_longest_list_of_what_is_held_fits_into_a_message() -> None:
+    held = tuple((2**50 + 2 * n, 2**20) for n in range(MAX_HELD))
+    message = serialize(Open(Target(until_rms=Tolerance(1e-300)), 1, held, DIGEST, "x" * 200))
+    assert len(message) <= MAX_MESSAGE
+    assert parse(message) == Open(Target(until_rms=Tolerance(1e-300)), 1, held, DIGEST, "x" * 200)
+
+
+def test_a_longer_list_is_refused_by_its_length() -> None:
+    held = tuple((2 * n, 1) for n in range(MAX_HELD + 1))
+    with pytest.raises(MessageError, match=f"at most {MAX_HELD} ranges, got {MAX_HELD + 1}") as refused:
+        parse(serialize(Open(held=held)))
+    assert refused.value.code == "bad-held"
 
 
 def test_a_message_above_the_limit_is_refused_before_it_is_read() -> None:

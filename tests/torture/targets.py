@@ -226,7 +226,7 @@ def _messages() -> tuple[bytes, ...]:
         Credit(2**40),
         Stop(),
         Bye(),
-        Header("ab" * 32, 1000, 900, 1.5),
+        Header("ab" * 32, 1000, 900, 1.5, (950, 40), (900, 50), True),
         Segments(7, bytes(range(50))),
         Layer(1, 2, 3, 0.5, 0.25),
         End("complete"),

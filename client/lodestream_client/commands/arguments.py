@@ -29,8 +29,10 @@ __all__ = [
     "add_token_option",
     "parse_pair",
     "parse_rate",
+    "parse_seconds",
     "parse_server",
     "parse_size",
+    "parse_source",
     "parse_surface",
     "parse_tolerance",
     "surface_options",
@@ -81,6 +83,17 @@ def parse_pair(text: str) -> tuple[str, str]:
     return key, value
 
 
+def parse_seconds(text: str) -> float:
+    """Read a number of seconds, 0 or more."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number of seconds, got {text!r}")
+    return value
+
+
 def _seconds(text: str) -> float:
     try:
         value = float(text)
@@ -111,6 +124,7 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
 parse_tolerance = _checked(Tolerance.parse)
 parse_server = _checked(addresses.surfaces_url)
 parse_surface = _checked(addresses.surface_url)
+parse_source = _checked(addresses.source_url)
 
 
 def add_command(

@@ -24,7 +24,11 @@ def register(subparsers: Subparsers) -> None:
         "Levels: what all levels up to one cost, and their error.\n"
         "Layers: what each prefix of the stream costs, and its error.",
     )
-    parser.add_argument("what", metavar="FILE|URL", help="container, - for standard input, or a surface's address")
+    parser.add_argument(
+        "what",
+        metavar="FILE|URL",
+        help="container, - for standard input, or the address of a surface or of a container on any web server",
+    )
     add_token_option(parser)
     add_json_option(parser)
 
@@ -42,7 +46,10 @@ def run(args: argparse.Namespace) -> int:
 def _of_url(args: argparse.Namespace) -> Mapping[str, Any]:
     from .. import sync
 
-    surface = sync.describe(args.what, token=token_of(args))
+    url = addresses.source_url(args.what)
+    if not addresses.is_surface(url):
+        return sync.describe_file(url, token=token_of(args))
+    surface = sync.describe(url, token=token_of(args))
     return {**surface.details, "url": surface.url}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import sys
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-__all__ = ["console", "human_size", "note", "print_json", "progress_bar", "replacing", "require_folder"]
+__all__ = ["console", "human_size", "human_time", "note", "print_json", "progress_bar", "replacing", "require_folder"]
 
 
 def note(text: str) -> None:
@@ -39,6 +40,15 @@ def human_size(size: float) -> str:
     return f"{size:.1f} GB"
 
 
+def human_time(seconds: float) -> str:
+    """How long is left, for reading."""
+    whole = math.ceil(seconds)
+    if whole < 60:
+        return f"{whole} s left"
+    minutes, whole = divmod(whole, 60)
+    return f"{minutes}:{whole:02} left" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02} h left"
+
+
 def console(*, stderr: bool = False) -> Console:
     """A console for tables; wide where no terminal limits it, so that nothing wraps in a file or pipe."""
     from rich.console import Console
@@ -49,14 +59,27 @@ def console(*, stderr: bool = False) -> Console:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error; nothing at all when that is not a terminal."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    """A progress bar on standard error; nothing at all when that is not a terminal.
+
+    A task's field ``limit``, if it has one, is the most seconds that it may last.
+    """
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.text import Text
+
+    class TimeLeft(ProgressColumn):
+        max_refresh = 0.5
+
+        def render(self, task: Task) -> Text:
+            left = [] if task.time_remaining is None else [task.time_remaining]
+            if task.fields.get("limit") is not None and task.elapsed is not None:
+                left.append(max(task.fields["limit"] - task.elapsed, 0.0))
+            return Text(human_time(min(left)) if left else "", style="progress.remaining")
 
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[figures]}"),
-        TimeRemainingColumn(),
+        TimeLeft(),
         console=console(stderr=True),
         transient=True,
     )

@@ -1,0 +1,179 @@
+"""Streams over slow and distant links: what comes after a stop, and how long the first and the good pictures take.
+
+The links are emulated by a proxy on this machine (`tests.links`): half the round trip either way, and so many bytes a
+second towards the client, in packets of 1,400 bytes, with 64 KiB of queue. Times run from the TCP connection on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import statistics
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+import lodestream as ls
+from lodestream.messages import MAX_CREDIT
+from lodestream_client import aio, sync
+from lodestream_server import running_server
+from tests.links import Fault, Link
+
+from .arrays import Array, fractal, load
+from .measure import note, table
+from .rate import layers_of
+
+ROUND_TRIP = 0.1
+RATES: dict[str, float | None] = {"64 kbit/s": 8e3, "256 kbit/s": 32e3, "10 Mbit/s": 1.25e6, "unlimited": None}
+REPEATS = 3
+DEMS: tuple[str, ...] = ("jacksboro", "bigtujunga")
+
+
+@dataclass(frozen=True)
+class Served:
+    """A surface on the server, and its container."""
+
+    url: str
+    container: bytes
+
+    @property
+    def file(self) -> str:
+        """The container as a plain file."""
+        details = sync.describe(self.url).details
+        return f"{self.url.partition('/v1/')[0]}/v1/containers/{details['container']}.lode"
+
+
+def main() -> None:
+    """Print the three tables."""
+    arrays: dict[str, Array] = {array.name: array for array in load()}
+    with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
+        large = serve(server, fractal(1537))
+        list(sync.connect(large.url, target=ls.Target(max_bytes=20_000)))  # compiles what decoding needs
+        stop_table(large)
+        dems = {name: serve(server, arrays[name].points) for name in DEMS if name in arrays}
+        first_table({"fractal": large, **dems})
+        for name, served in dems.items():
+            error_table(arrays[name], served)
+
+
+def serve(server: str, points: Any) -> Served:
+    surface = sync.upload(server, ls.Surface(points))
+    return Served(surface.url, sync.fetch_range(surface.url, 0, int(surface.details["bytes"])))
+
+
+def stop_table(served: Served) -> None:
+    """What comes after a stop, which is called when the stream has run for two seconds."""
+    rows = []
+    for name, rate in RATES.items():
+        for window in (None, MAX_CREDIT):
+            credit, after, seconds, before = asyncio.run(stopped(served, rate, window))
+            rows.append(
+                [
+                    name,
+                    "measured" if window is None else "256 KiB, fixed",
+                    f"{before:,}",
+                    f"{credit:,}",
+                    f"{after:,}",
+                    f"{seconds:.2f}",
+                ]
+            )
+    head = ["link", "window", "bytes before", "credit at the stop", "bytes after", "seconds until the end"]
+    table("After a stop, 100 ms round trip", head, rows)
+    note("Aim: at most the credit that was outstanding; at 256 kbit/s no more than 32,768 bytes.")
+
+
+async def stopped(served: Served, rate: float | None, window: int | None) -> tuple[int, int, float, int]:
+    """Credit and bytes received at the stop; bytes after it, and how long they took."""
+    fault = Fault(delay=ROUND_TRIP / 2, rate=rate)
+    async with Link(served.url, lambda _: fault) as link, aio.connect(link.url, window=window) as stream:
+        until = time.monotonic() + 2.0
+        async for _ in stream:
+            if time.monotonic() >= until or stream.received > 600_000:
+                break
+        assert stream._download is not None
+        credit, before, now = stream._download.credit, stream.data_bytes, time.monotonic()
+        await stream.stop()
+        async for _ in stream:
+            pass
+        return credit, stream.data_bytes - before, time.monotonic() - now, before
+
+
+def first_table(surfaces: dict[str, Served]) -> None:
+    """When the first layer is there, and at how many bytes."""
+    rows = []
+    for name, served in surfaces.items():
+        for road, url, transport in roads(served):
+            found = sorted(asyncio.run(first(url, transport)) for _ in range(REPEATS))
+            seconds, size = found[len(found) // 2]
+            rows.append([name, road, f"{seconds * 1000:.0f}", f"{seconds / ROUND_TRIP:.2f}", f"{size:,}"])
+    head = ["surface", "road", "ms", "round trips", "bytes received"]
+    table("First drawable surface, 100 ms round trip, rate unlimited, median of three", head, rows)
+    note("Aim by WebSocket: at most 2.5 round trips after the TCP connection, and 2,048 bytes.")
+
+
+async def first(url: str, transport: Any) -> tuple[float, int]:
+    async with Link(url, lambda _: Fault(delay=ROUND_TRIP / 2)) as link:
+        started = time.monotonic()
+        async with aio.connect(link.url, transport=transport) as stream:
+            await anext(stream)
+            return time.monotonic() - started, stream.wire_bytes
+
+
+def roads(served: Served) -> list[tuple[str, str, str]]:
+    return [
+        ("WebSocket", served.url, "ws"),
+        ("Range, of a server", served.url, "http"),
+        ("Range, of a plain file", served.file, "http"),
+    ]
+
+
+def error_table(array: Array, served: Served) -> None:
+    """Time to an error, beside the plain download of the same prefix."""
+    rows = []
+    for delay in (0.0, ROUND_TRIP / 2):
+        for share in (1e-2, 1e-3):
+            target = ls.Target(until_rms=ls.Tolerance(share, relative=True))
+            prefix = next(mark.bytes for mark in layers_of(served.container) if mark.rms <= share * array.extent)
+            plain = timed(partial(download, size=prefix), served.file, delay)
+            trip = f"{2 * delay * 1000:.0f} ms"
+            rows.append([trip, f"{share:.0e}", "plain download", f"{prefix:,}", f"{plain:.3f}", ""])
+            for road, url, transport in roads(served):
+                seconds = timed(partial(pull, target=target, transport=transport), url, delay)
+                rows.append(["", "", road, "", f"{seconds:.3f}", f"{seconds / plain:.2f}"])
+    head = ["round trip", "RMS / extent", "road", "bytes", "seconds", "ratio"]
+    table(f"{array.name} to an RMS error at 1 Mbit/s, median of three", head, rows)
+    note("Aim: at most 1.15 times the plain download of the same prefix with httpx.")
+
+
+def timed(get: Callable[[str], Awaitable[float]], url: str, delay: float) -> float:
+    async def once() -> float:
+        async with Link(url, lambda _: Fault(delay=delay, rate=125_000.0)) as link:
+            return await get(link.url)
+
+    return statistics.median(asyncio.run(once()) for _ in range(REPEATS))
+
+
+async def download(url: str, size: int) -> float:
+    async with httpx.AsyncClient(trust_env=False) as client:
+        started = time.monotonic()
+        answer = await client.get(url, headers={"Range": f"bytes=0-{size - 1}"})
+        assert len(answer.content) == size
+        return time.monotonic() - started
+
+
+async def pull(url: str, target: ls.Target, transport: Any) -> float:
+    started = time.monotonic()
+    async with aio.connect(url, target=target, transport=transport) as stream:
+        async for view in stream:
+            if view.rms <= 0 or stream.received >= (stream.planned or 0):
+                break
+        return time.monotonic() - started
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,294 @@
+"""A surface received in parts of its container's file, as HTTP Range gives them, without I/O.
+
+The same plan that a server follows over WebSocket is made here: the first bytes tell what the file is and how long, the
+last ones hold its index, and what the target needs of the rest is asked for in few requests.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from .errors import RemoteError, RemoteProtocolError, TruncatedStreamError
+from .messages import MAX_CREDIT, MIN_WINDOW
+from .reception import Reception
+
+if TYPE_CHECKING:
+    from .reception import DownloadEvent
+
+__all__ = ["RangeDownload", "RangeRequest"]
+
+# The first bytes hold the header and, of most surfaces, the first layers; the last ones, a share of the file, hold
+# index and metadata of most. Where they do not, one more request brings the rest.
+_HEAD = 4096
+_TAIL_SHARE = 512
+_TAIL_LEAST = 4096
+_TAIL_MOST = 64 * 1024
+
+_CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d{1,18})-(\d{1,18})/(\d{1,18})\s*")
+_CONTAINER_TAG = re.compile(r'"([0-9a-f]{64})"')
+
+
+@dataclass(frozen=True)
+class RangeRequest:
+    """Ask for these bytes of the file.
+
+    Attributes
+    ----------
+    offset, length : int
+        Of the file; it may end before.
+    headers : mapping
+        What the request says.
+    """
+
+    offset: int
+    length: int
+    headers: Mapping[str, str] = field(repr=False)
+
+
+class _MissingError(Exception):
+    """Bytes that are needed to read the index."""
+
+    def __init__(self, offset: int, length: int) -> None:
+        super().__init__(offset, length)
+        self.place = offset, length
+
+
+class RangeDownload:
+    """Requests out, parts of a file in.
+
+    Whoever integrates it asks for what `request` says, tells the first line and headers of the answer to `answer` and
+    its body, in any pieces, to `receive`, then calls `finish`; until `request` gives None. When a connection breaks it
+    goes on with the next `request`.
+
+    Parameters
+    ----------
+    reception : Reception
+        What has come, by this road or another.
+    etag : str or None
+        Strong entity tag that the file has, where it is known.
+
+    Attributes
+    ----------
+    requests : int
+        How many were made.
+    """
+
+    def __init__(self, reception: Reception, *, etag: str | None = None) -> None:
+        self.reception = reception
+        self.requests = 0
+        self._etag = etag
+        self._validator: str | None = None
+        self._needed: tuple[int, int] | None = None
+        self._gap = MIN_WINDOW
+        self._asked: RangeRequest | None = None
+        self._asked_at: float | None = None
+        self._answered_at: float | None = None
+        self._position = 0
+        reception.keep()
+
+    @property
+    def ended(self) -> str | None:
+        """Why nothing more will come, as in `Ended`."""
+        return self.reception.ended
+
+    def request(self, now: float | None = None) -> tuple[RangeRequest | None, list[DownloadEvent]]:
+        """What to ask for next, None when there is nothing; and what follows from what has come.
+
+        Parameters
+        ----------
+        now : float or None
+            Seconds of any clock that does not go back: what a round trip takes, and what comes in one, decides which
+            slices are asked for together.
+
+        Raises
+        ------
+        CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+            When the file is no container that can be read.
+        OptionError
+            When the container has nothing that meets the target.
+        """
+        events: list[DownloadEvent] = []
+        place = None
+        if self.reception.plan is None:
+            place = self._first()
+            if place is None:
+                events += self._read_index()
+                place = self._needed
+        if self.reception.plan is not None:
+            place = self._next_slices()
+            if place is None:
+                events.append(self.reception.end(self.reception.plan.ended))
+                return None, events
+        if place is None:
+            raise AssertionError("either the index is known or something of it is missing")
+        headers = {"Range": f"bytes={place[0]}-{place[0] + place[1] - 1}", "Accept-Encoding": "identity"}
+        if self._etag is not None:
+            headers["If-Range"] = self._etag
+        self._asked, self._position = RangeRequest(*place, headers), place[0]
+        self._asked_at, self._answered_at = now, None
+        self.requests += 1
+        return self._asked, events
+
+    def answer(self, status: int, headers: Mapping[str, str], now: float | None = None) -> None:
+        """Take the beginning of an answer.
+
+        Parameters
+        ----------
+        status : int
+            200, 206 or 416; the others say nothing of the file.
+        headers : mapping
+            By names in lower case.
+        now : float or None
+
+        Raises
+        ------
+        RemoteProtocolError
+            When Range is not supported, or the answer is not what was asked for.
+        RemoteError
+            With the code ``other-container``, when the file has changed.
+        """
+        asked = self._asked
+        if asked is None:
+            raise AssertionError("there is no request to answer")
+        self._answered_at = now
+        self._check_same(headers, status)
+        if status == 416:
+            raise TruncatedStreamError(f"expected a container of at least {asked.offset + 1} bytes, got a shorter file")
+        if status != 206:
+            raise RemoteProtocolError(
+                f"expected part of the file (status 206), got all of it (status {status}): "
+                "the server does not support Range, without which no surface can be received in steps"
+            )
+        if headers.get("content-encoding", "identity") != "identity":
+            raise RemoteProtocolError(
+                f"expected bytes of the file itself, got them encoded with {headers['content-encoding']}"
+            )
+        found = _CONTENT_RANGE.fullmatch(headers.get("content-range", ""))
+        if found is None or int(found[1]) != asked.offset:
+            raise RemoteProtocolError(
+                f"expected Content-Range to be bytes {asked.offset}-..., got {headers.get('content-range')!a}"
+            )
+        size = int(found[3])
+        if int(found[2]) != min(asked.offset + asked.length, size) - 1:
+            raise RemoteProtocolError(f"expected {asked.length} bytes from {asked.offset} on, got bytes {found[0]}")
+        tag = _CONTAINER_TAG.fullmatch(self._etag or "")
+        self.reception.identify(tag[1] if tag else None, size)
+
+    def receive(self, chunk: bytes) -> list[DownloadEvent]:
+        """Take a piece of an answer's body; the views that it completes.
+
+        Raises
+        ------
+        CorruptStreamError
+            When the bytes of the container are damaged.
+        RemoteProtocolError
+            When it is more than was asked for.
+        """
+        self.reception.wire_bytes += len(chunk)
+        asked, start = self._asked, self._position
+        self._position += len(chunk)
+        if asked is None or self._position > asked.offset + asked.length:
+            raise RemoteProtocolError(f"expected {asked.length if asked else 0} bytes of the file, got more")
+        events: list[DownloadEvent] = []
+        # Until the index is known everything may be of use; then what lies between two slices is not kept.
+        places = self.reception.wanted(start, len(chunk)) if self.reception.plan else [(start, len(chunk))]
+        for offset, length in list(places):
+            events += self.reception.take(offset, chunk[offset - start : offset - start + length])
+        return events
+
+    def finish(self, now: float | None = None) -> None:
+        """Tell that an answer's body has ended.
+
+        Raises
+        ------
+        TruncatedStreamError
+            When that was before it was whole; the next `request` asks for the rest.
+        """
+        asked, self._asked = self._asked, None
+        if asked is None:
+            return
+        expected = min(asked.length, (self.reception.size or 0) - asked.offset)
+        got = self._position - asked.offset
+        if got < expected:
+            raise TruncatedStreamError(f"expected {expected} bytes of the file from {asked.offset} on, got {got}")
+        self._measure(got, now)
+
+    def stop(self, why: str = "stopped") -> None:
+        """Want no more; whoever integrates this closes the connection.
+
+        Parameters
+        ----------
+        why : "stopped" or "seconds"
+            What `ended` is to say.
+        """
+        if self.ended is None:
+            self.reception.stopped_for = why
+            self.reception.end("stopped")
+
+    def _measure(self, got: int, now: float | None) -> None:
+        """Bytes that come in one round trip: skipping fewer would cost more than taking them."""
+        if now is None or self._asked_at is None or self._answered_at is None:
+            return
+        round_trip, seconds = self._answered_at - self._asked_at, now - self._answered_at
+        if got >= MIN_WINDOW and round_trip > 0:
+            rate = got / max(seconds, round_trip)
+            self._gap = round(min(max(rate * round_trip, MIN_WINDOW), MAX_CREDIT))
+
+    def _check_same(self, headers: Mapping[str, str], status: int) -> None:
+        etag = headers.get("etag", "")
+        strong = etag if etag.startswith('"') else None
+        changed = strong is not None and self._etag is not None and strong != self._etag
+        # Where there is no strong tag, the date or a weak one is compared, as far as that goes.
+        validator = etag or headers.get("last-modified")
+        changed = changed or (self._validator is not None and status != 416 and validator != self._validator)
+        if changed:
+            raise RemoteError("other-container", "expected the file as it was before, got another: it has changed")
+        self._etag, self._validator = strong or self._etag, validator or self._validator
+
+    def _first(self) -> tuple[int, int] | None:
+        """What to ask for before the index can be looked for."""
+        held, size = self.reception.held, self.reception.size
+        if size is None:
+            return 0, _HEAD
+        tail = min(max(size // _TAIL_SHARE, _TAIL_LEAST), _TAIL_MOST, size)
+        for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
+            gap = next(held.missing(start, length), None)
+            if gap is not None:
+                return gap
+        return None
+
+    def _read_index(self) -> list[DownloadEvent]:
+        from .container import read_index
+
+        store, size = self.reception.keep(), self.reception.size or 0
+
+        def read(offset: int, length: int) -> bytes:
+            for gap in store.ranges.missing(offset, min(length, size - offset)):
+                raise _MissingError(*gap)
+            return store.read(offset, min(length, size - offset))
+
+        self._needed = None
+        try:
+            index = read_index(read, size)
+        except _MissingError as missing:
+            self._needed = missing.place
+            return []
+        return [*self.reception.follow(index)]
+
+    def _next_slices(self) -> tuple[int, int] | None:
+        """The next slice that is missing, with those after it that are near and nothing between that is held."""
+        held = self.reception.held
+        missing = self.reception.missing()
+        first = next(missing, None)
+        if first is None:
+            return None
+        start, end = first[0], first[0] + first[1]
+        for offset, length in missing:
+            gap = offset - end
+            if not 0 <= gap <= self._gap or (gap and sum(size for _, size in held.missing(end, gap)) < gap):
+                break
+            end = offset + length
+        return start, end - start

@@ -1,0 +1,347 @@
+"""What has come of a surface, by whichever road and in however many connections.
+
+Bytes of the container go in; views come out. A `Download` or a `RangeDownload` is one connection and ends with it; the
+reception goes on: whoever starts the next one hands it over, and what is held is not asked for again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+from .errors import RemoteError, RemoteProtocolError, TruncatedStreamError
+from .messages import MAX_DATA
+from .ranges import RangeSet
+from .target import Target
+
+if TYPE_CHECKING:
+    from .container import Index
+    from .decoder import Decoder, View
+    from .plan import Plan
+
+__all__ = ["DownloadEvent", "Ended", "MemoryStore", "Reception", "Store"]
+
+
+# Whoever reads a container's index reads its first bytes too.
+_HEAD = 4096
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Nothing more will come.
+
+    ``why`` is complete, level, rms, max or bytes when the target was met or lies out of reach; seconds or stopped when
+    this side stopped.
+    """
+
+    why: str
+
+
+if TYPE_CHECKING:
+    DownloadEvent: TypeAlias = View | Ended
+
+
+class Store(Protocol):
+    """Where bytes of one container are kept, in memory or on disk."""
+
+    @property
+    def ranges(self) -> RangeSet:
+        """What is kept."""
+        ...
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Bytes that are kept."""
+        ...
+
+    def write(self, offset: int, data: bytes) -> None:
+        """Keep bytes that are not kept yet."""
+        ...
+
+    def used(self, offset: int, length: int) -> None:
+        """The decoder has been given these bytes: they are read no more."""
+        ...
+
+
+class MemoryStore:
+    """Bytes that came before their turn."""
+
+    def __init__(self) -> None:
+        self.ranges = RangeSet()
+        self._pieces: list[tuple[int, bytes]] = []
+        self._used = RangeSet()
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Bytes that are kept."""
+        found = bytearray(length)
+        for start, data in self._pieces:
+            first, last = max(start, offset), min(start + len(data), offset + length)
+            if first < last:
+                found[first - offset : last - offset] = data[first - start : last - start]
+        return bytes(found)
+
+    def write(self, offset: int, data: bytes) -> None:
+        """Keep bytes that are not kept yet."""
+        self.ranges.add(offset, len(data))
+        self._pieces.append((offset, data))
+
+    def used(self, offset: int, length: int) -> None:
+        """Forget what is read no more."""
+        self._used.add(offset, length)
+        self._pieces = [(at, data) for at, data in self._pieces if not self._used.covers(at, len(data))]
+
+
+class Reception:
+    """One surface being received.
+
+    Parameters
+    ----------
+    target : Target
+        Where to stop, and the order on the way there.
+    store : Store or None
+        Where everything that comes is kept too, and what is there already is not asked for again. The decoder is then
+        given everything in the order of the target's plan, whenever it came.
+    container, size : str or None, int or None
+        SHA-256 and bytes of the container, where they are known.
+
+    Attributes
+    ----------
+    target : Target
+    decoder : Decoder
+        What has come so far.
+    held : RangeSet
+        Bytes of the container that have come, or were in the store.
+    container : str or None
+        SHA-256 of the container, once it is known.
+    size : int or None
+        Its bytes, once they are known.
+    planned : int or None
+        Bytes of the surface that the target needs, once they are known.
+    index : Index or None
+        The container's, if the road or the order needs it and once it has come.
+    plan : Plan or None
+        What the target needs of the container, once the index is known.
+    received : int
+        How many bytes of the surface are held.
+    data_bytes : int
+        Bytes of the container received, those that were held already among them.
+    wire_bytes : int
+        Bytes of all messages and answers received.
+    ended : str or None
+        Why nothing more will come, as in `Ended`.
+    """
+
+    def __init__(
+        self,
+        target: Target | None = None,
+        *,
+        store: Store | None = None,
+        container: str | None = None,
+        size: int | None = None,
+    ) -> None:
+        # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
+        from .decoder import Decoder
+
+        self.target = Target() if target is None else target
+        self.decoder: Decoder = Decoder()
+        self.held = RangeSet() if store is None else store.ranges.copy()
+        self.container = container
+        self.size = size
+        self.planned: int | None = None
+        self.index: Index | None = None
+        self.plan: Plan | None = None
+        self.received = 0
+        self.data_bytes = 0
+        self.wire_bytes = 0
+        self.ended: str | None = None
+        self.stopped_for: str | None = None
+        self._store = store
+        self._aside = MemoryStore()
+        self._fed = RangeSet()
+        self._order: deque[tuple[int, int]] | None = None
+        self._surface: RangeSet | None = None
+        self._wanted: RangeSet | None = None
+        self._service: tuple[tuple[int, int], ...] = ()
+        self._deadline: float | None = None
+
+    def identify(self, container: str | None, size: int) -> None:
+        """Tell which container is being received, before its bytes are.
+
+        Raises
+        ------
+        RemoteError
+            With the code ``other-container``, when it is another one than before.
+        """
+        if (self.container or container) != (container or self.container) or self.size not in (None, size):
+            raise RemoteError(
+                "other-container",
+                f"expected container {self.container or ''} of {self.size} bytes as before, "
+                f"got {container or 'one'} of {size}: the surface has changed",
+            )
+        self.container, self.size = container or self.container, size
+
+    def expect(self, planned: int, index: tuple[int, int], metadata: tuple[int, int], prefix: bool) -> list[View]:
+        """Tell what the other side is about to send; the views that the store makes up for already."""
+        self.planned, self._service = planned, (index, metadata)
+        if prefix and self._order is None:
+            self._follow([(0, planned)], [], [metadata])
+        return self._advance()
+
+    def follow(self, index: Index) -> list[View]:
+        """Tell the container's index; the views that the store makes up for already.
+
+        Raises
+        ------
+        OptionError
+            When the container has nothing that meets the target.
+        """
+        from .plan import plan
+
+        chosen = plan(index, self.target)
+        self.index = index
+        self._service = tuple((place.offset, place.length) for place in (index.index, index.metadata))
+        self.planned, self.plan = chosen.bytes, chosen
+        parts = (chosen.ranges, chosen.before, chosen.after)
+        self._follow(*([(place.offset, place.length) for place in part] for part in parts))
+        return self._advance()
+
+    def take(self, offset: int, data: bytes) -> list[View]:
+        """Take bytes of the container; the views that they complete.
+
+        Raises
+        ------
+        CorruptStreamError, UnsupportedVersionError
+            From the decoder.
+        RemoteProtocolError
+            When they lie outside the container.
+        """
+        if self.size is not None and offset + len(data) > self.size:
+            raise RemoteProtocolError(f"expected bytes of {self.size}, got those to {offset + len(data)}")
+        self.data_bytes += len(data)
+        views = []
+        for start, length in list(self.held.missing(offset, len(data))):
+            piece = data[start - offset : start - offset + length]
+            self.held.add(start, length)
+            self._count(start, length)
+            if self._store is not None:
+                self._store.write(start, piece)
+            else:
+                self._copy(start, piece)
+                self._fed.add(start, length)
+                views += self.decoder.feed_at(start, piece)
+        return views + self._advance()
+
+    def missing(self) -> Iterator[tuple[int, int]]:
+        """What is still to come, as (offset, length) in order, once the index is known."""
+        for place in self._order or ():
+            yield from self.held.missing(*place)
+
+    def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
+        """What of a range the target needs, held or not, as (offset, length); before that is known, all of it."""
+        return iter([(offset, length)]) if self._wanted is None else self._wanted.overlap(offset, length)
+
+    def keep(self) -> Store:
+        """Keep from now on what comes before its turn, and in any case what tells where things stand."""
+        if self._store is None:
+            self._store = self._aside
+        return self._store
+
+    @property
+    def metadata_place(self) -> tuple[int, int] | None:
+        """Where the container's metadata stand, once that is known."""
+        return self._service[1] if self._service else None
+
+    def tick(self, now: float) -> float | None:
+        """Tell the time, in seconds of any clock that does not go back; the first call starts the clock.
+
+        Returns
+        -------
+        float or None
+            Seconds until the target's are over, 0 when they are; None when none are set.
+        """
+        if self.target.seconds is None:
+            return None
+        if self._deadline is None:
+            self._deadline = now + self.target.seconds
+        return max(self._deadline - now, 0.0)
+
+    def end(self, why: str) -> Ended:
+        """Tell that the other side has sent what it had to.
+
+        Raises
+        ------
+        TruncatedStreamError
+            When that is less than was promised.
+        """
+        if why == "stopped":
+            why = self.stopped_for or why
+        elif self.received < (self.planned or 0) or (why == "complete" and not self.decoder.complete):
+            raise TruncatedStreamError(f"expected {self.planned} bytes of the surface, got {self.received} at the end")
+        self.ended = why
+        return Ended(why)
+
+    def _follow(
+        self, surface: list[tuple[int, int]], before: list[tuple[int, int]], after: list[tuple[int, int]]
+    ) -> None:
+        self._surface = RangeSet(surface)
+        self.received = 0
+        for place in self.held:
+            self._count(*place)
+        self._wanted = RangeSet((*before, *surface, *after))
+        if self._store is not None:
+            self._order = deque(gap for place in (*before, *surface, *after) for gap in self._fed.missing(*place))
+
+    def _count(self, offset: int, length: int) -> None:
+        """Add to `received` what of a range belongs to the surface."""
+        if self._surface is not None:
+            belongs = self._surface.overlap(offset, length)
+        else:
+            belongs = RangeSet(self._service).missing(offset, length)
+        self.received += sum(size for _, size in belongs)
+
+    def _copy(self, offset: int, data: bytes) -> None:
+        """Keep of what the decoder is given at once the parts that tell where things stand."""
+        for start, length in ((0, _HEAD), *self._service):
+            first, last = max(start, offset), min(start + length, offset + len(data))
+            if first < last:
+                self._aside.write(first, data[first - offset : last - offset])
+
+    def _advance(self) -> list[View]:
+        """Feed the decoder with what is kept, as far as it goes on."""
+        if self._store is None:
+            return []
+        if self._order is None:
+            return self._learn()
+        views: list[View] = []
+        while self._order:
+            offset, length = self._order[0]
+            size = min(self._store.ranges.run(offset), length, MAX_DATA)
+            if not size:
+                break
+            self._order[0] = offset + size, length - size
+            if size == length:
+                self._order.popleft()
+            self._fed.add(offset, size)
+            views += self.decoder.feed_at(offset, self._store.read(offset, size))
+            if self.plan is not None:
+                self._store.used(offset, size)
+        return views
+
+    def _learn(self) -> list[View]:
+        """The order of slices stands in the index, which needs the header of the container to be read."""
+        from .container import ByteRange, index_from
+        from .decoder import Decoder
+
+        store = self._store
+        if store is None or not self._service or not store.ranges.covers(*self._service[0]):
+            return []
+        place = self._service[0]
+        header = self.decoder.header
+        if header is None:
+            scratch = Decoder()
+            scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
+            header = scratch.header
+        if header is None or (header.masked and not header.holes):
+            return []
+        return self.follow(index_from(store.read(*place), ByteRange(*place), header))

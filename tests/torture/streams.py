@@ -1,0 +1,184 @@
+"""Streams over links that break, by random schedules: bit-identical in the end, or a clear error.
+
+``python -m tests.torture.streams [COUNT] [SECONDS] [SEED]`` runs COUNT schedules, then more until SECONDS are over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import hashlib
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tenacity import wait_random_exponential
+
+import lodestream as ls
+from lodestream.errors import LodestreamError
+from lodestream_client import aio, roads, sync
+from lodestream_server import running_server
+from tests.links import Link, faults_of
+
+__all__ = ["Report", "run"]
+
+_TARGETS = (
+    ls.Target(),
+    ls.Target(),
+    ls.Target(order="level"),
+    ls.Target(level=3),
+    ls.Target(level=2, order="level"),
+    ls.Target(max_bytes=2500),
+    ls.Target(until_rms=ls.Tolerance(1e-2, relative=True)),
+)
+_TOGETHER = 16
+_SILENCE = 0.5
+
+
+@dataclass
+class Report:
+    """What came of some schedules.
+
+    Attributes
+    ----------
+    schedules : int
+        How many ran.
+    identical : int
+        How many ended with exactly the points of their target.
+    errors : Counter
+        How many ended with an error, by its class.
+    problems : list of str
+        What must not happen: other points, a byte that came twice, another exception; each with its seed.
+    connections : int
+        Connections and requests in all.
+    seconds : float
+    memory : list of (int, int)
+        Schedules that had run, and bytes of memory that the process then had.
+    """
+
+    schedules: int = 0
+    identical: int = 0
+    errors: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    connections: int = 0
+    seconds: float = 0.0
+    memory: list[tuple[int, int]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
+        memory = ", ".join(f"{size / 2**20:.0f} MiB after {number}" for number, size in self.memory)
+        return (
+            f"{self.schedules} schedules, {self.connections} connections in {self.seconds:.0f} s: "
+            f"{self.identical} bit-identical; errors: {errors}; problems: {len(self.problems)}; memory: {memory}"
+        )
+
+
+def terrain() -> NDArray[np.float32]:
+    """A surface of some 4 KB."""
+    rows, columns = np.mgrid[0:41, 0:37]
+    noise = np.random.default_rng(11).normal(size=rows.shape)
+    return np.asarray(90 * np.sin(rows / 9) * np.cos(columns / 13) + noise, np.float32)
+
+
+def run(count: int, seconds: float = 0.0, seed: int = 0) -> Report:
+    """Run `count` schedules, then more of them until `seconds` are over; a seed gives the same ones again."""
+    report = Report()
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
+        url = sync.upload(server, ls.Surface(terrain())).url
+        container = sync.fetch_range(url, 0, int(sync.describe(url).details["bytes"]))
+        with _hasty():
+            asyncio.run(_all(url, container, count, started + seconds, seed, report))
+    report.seconds = time.monotonic() - started
+    return report
+
+
+@contextmanager
+def _hasty() -> Iterator[None]:
+    """Waits between attempts that are in proportion to links of milliseconds."""
+    usual = roads._WAIT
+    roads._WAIT = wait_random_exponential(multiplier=0.002, max=0.1)
+    try:
+        yield
+    finally:
+        roads._WAIT = usual
+
+
+async def _all(url: str, container: bytes, count: int, until: float, seed: int, report: Report) -> None:
+    expected: dict[ls.Target, NDArray[Any]] = {}
+    for target in _TARGETS:
+        async with aio.connect(url, target=target) as stream:
+            async for _ in stream:
+                pass
+        expected[target] = stream.decoder.surface(target.level).points
+    assert np.array_equal(expected[_TARGETS[0]], terrain())
+
+    numbers = iter(range(seed, sys.maxsize))
+
+    async def some() -> None:
+        while report.schedules < count or time.monotonic() < until:
+            report.schedules += 1
+            await _one(url, container, next(numbers), expected, report)
+            if report.schedules % 1000 == 0:
+                report.memory.append((report.schedules, _memory()))
+
+    report.memory.append((0, _memory()))
+    await asyncio.gather(*(some() for _ in range(_TOGETHER)))
+    report.memory.append((report.schedules, _memory()))
+
+
+async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, NDArray[Any]], report: Report) -> None:
+    random = Random(seed)
+    target = random.choice(_TARGETS)
+    options: dict[str, Any] = {
+        "transport": random.choice(("ws", "ws", "ws", "http", "auto")),
+        "window": random.choice((None, None, 300, 1000, 5000)),
+    }
+    path = ""
+    if options["transport"] == "http" and random.random() < 0.5:
+        path = f"/v1/containers/{hashlib.sha256(container).hexdigest()}.lode"
+    async with Link(url, faults_of(random, len(container))) as link:
+        address = link.url if not path else link.url.partition("/v1/")[0] + path
+        stream = aio.connect(address, target=target, silence=_SILENCE, deadline=20.0, close_timeout=_SILENCE, **options)
+        try:
+            async with stream:
+                async for _ in stream:
+                    pass
+        except LodestreamError as error:
+            report.errors[type(error).__name__] += 1
+            if not str(error):
+                report.problems.append(f"seed {seed}: an error without a word, {error!r}")
+        except Exception as error:
+            report.problems.append(f"seed {seed}: {error!r}")
+        else:
+            points = stream.decoder.surface(target.level).points
+            if np.array_equal(points, expected[target]):
+                report.identical += 1
+            else:
+                report.problems.append(f"seed {seed}: other points")
+        reception = stream._reception
+        if reception.data_bytes != reception.held.total:
+            report.problems.append(f"seed {seed}: {reception.data_bytes} bytes for {reception.held.total}")
+        report.connections += stream.connections
+
+
+def _memory() -> int:
+    """Bytes that the process holds."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+if __name__ == "__main__":
+    chosen = [int(argument) for argument in sys.argv[1:4]] + [500, 0, 0][len(sys.argv) - 1 :]
+    made = run(chosen[0], chosen[1], chosen[2])
+    print(made, *made.problems[:20], sep="\n")
+    sys.exit(bool(made.problems))
