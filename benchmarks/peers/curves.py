@@ -10,10 +10,13 @@ from typing import Any
 from .registry import OURS, PEERS
 from .trial import TARGETS
 
-__all__ = ["SMALL", "Cell", "Results", "bytes_at", "envelope", "family", "geometric_mean"]
+__all__ = ["EACH", "SMALL", "Cell", "Results", "bytes_at", "envelope", "family", "geometric_mean"]
 
 #: Cells where the best peer needs fewer bytes do not enter means.
 SMALL = 4096
+
+#: The ends of our streams with a precision, one stream for each error: a curve of settings, like a peer's.
+EACH = "a precision"
 
 Row = dict[str, Any]
 
@@ -63,6 +66,11 @@ class Cell:
         return self.ours / self.peer_bytes
 
     @property
+    def exact_ratio(self) -> float:
+        """The same of the one exact stream."""
+        return self.exact / self.peer_bytes
+
+    @property
     def counts(self) -> bool:
         """Whether it enters means."""
         return self.peer_bytes >= SMALL
@@ -90,11 +98,12 @@ class Results:
         return found
 
     def streams(self, surface: str) -> dict[str, list[Row]]:
-        """Our rows, by stream."""
+        """Our rows, by stream, and the ends of the streams with a precision."""
         found: dict[str, list[Row]] = {}
         for row in self.rows(surface, OURS):
             found.setdefault(row["stream"], []).append(row)
-        return found
+        ends = [max(rows, key=lambda row: int(row["bytes"])) for name, rows in found.items() if name != "exact"]
+        return {**found, EACH: ends} if ends else found
 
     def cells(self, surfaces: Sequence[str], kind: str) -> list[Cell]:
         """Every error on every surface where both ours and a peer were measured."""

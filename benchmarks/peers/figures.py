@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
-from .curves import Results, envelope
+from .curves import EACH, Results, envelope
 from .registry import OURS, PEERS
 from .surfaces import GROUPS
 
@@ -22,6 +22,7 @@ __all__ = ["draw"]
 
 _LEAST, _MOST = 3e-6, 5e-2
 _COLUMNS = 3
+_EXACT, _EACH = f"{OURS}, one exact stream", f"{OURS}, a precision for each error"
 
 
 def draw(results: Results, folder: Path) -> dict[str, Path]:
@@ -49,7 +50,7 @@ def _figure(results: Results, names: list[str], path: Path) -> None:
     handles: dict[str, Artist] = {}
     for place in axes.flat:
         handles.update(dict(zip(*reversed(place.get_legend_handles_labels()), strict=True)))
-    order = [name for name in (OURS, f"{OURS}, with a precision", *PEERS) if name in handles]
+    order = [name for name in (_EXACT, _EACH, *PEERS) if name in handles]
     figure.legend([handles[name] for name in order], order, loc="outside right upper", fontsize=8, frameon=False)
     # Neither version nor date stands in the file: the same results draw the same bytes.
     figure.savefig(path, dpi=90, metadata={"Software": None})
@@ -60,10 +61,9 @@ def _surface(results: Results, name: str, axes: Axes) -> None:
     colours = plt.get_cmap("tab20")
     for number, peer in enumerate(PEERS):
         _curve(axes, envelope(results.rows(name, peer), "rms"), peer, colours(number), 1.1)
-    for stream, rows in results.streams(name).items():
-        if stream != "exact":
-            _curve(axes, envelope(rows, "rms"), f"{OURS}, with a precision", "dimgrey", 0.9, "dotted")
-    _curve(axes, envelope(results.streams(name)["exact"], "rms"), OURS, "black", 2.0)
+    streams = results.streams(name)
+    _curve(axes, envelope(streams.get(EACH, []), "rms"), _EACH, "dimgrey", 2.0, "dotted")
+    _curve(axes, envelope(streams["exact"], "rms"), _EXACT, "black", 2.0)
     shape = " x ".join(map(str, results.surfaces[name]["shape"]))
     axes.set(xscale="log", yscale="log", ylim=(_LEAST, _MOST), xlabel="bytes", ylabel="RMS error / extent")
     axes.set_title(f"{name}, {shape}", fontsize=10)

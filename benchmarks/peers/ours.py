@@ -1,4 +1,4 @@
-"""This project: the exact stream, and streams with a precision, each with all its layers."""
+"""This project: one exact stream with all its layers, and a stream for each error with the precision that meets it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import lodestream
 from lodestream.container import read_index
 from lodestream.plan import Mark, plan
 
-from .trial import Trial
+from .trial import TARGETS, Trial
 
-#: Precisions are the extent / 2^k.
-_POWERS = (8, 10, 12, 14, 16, 18, 20)
-_POWERS_LARGE = (12, 16)
+#: Of a stream with a precision, layers count whose error is at most this many times the one it is made for.
+_BESIDE = 10.0
+#: What large surfaces are tried at, as peers are tried at fewer settings there.
+_LARGE = (("rms", 1e-4), ("rms", 1e-5), ("max", 1e-4))
 
 
 def ours(trial: Trial) -> None:
@@ -28,29 +29,64 @@ def ours(trial: Trial) -> None:
     trial.peak = type(trial.peak)()
     surface = lodestream.Surface(trial.surface.points, trial.surface.closed)
     _stream(trial, surface, "exact", None)
-    for power in _POWERS_LARGE if trial.surface.large else _POWERS:
-        try:
-            _stream(trial, surface, f"precision extent / 2^{power}", trial.surface.extent / 2**power)
-        except lodestream.InputError as error:
-            trial.notes.append(f"extent / 2^{power}: {error}"[:160])
+    for kind in ("rms", "max"):
+        for target in TARGETS:
+            if trial.surface.large and (kind, target) not in _LARGE:
+                continue
+            precision = precision_for(trial, kind, target)
+            if precision is not None:
+                _stream(trial, surface, f"for {kind} {target:.0e}", precision, (kind, target))
 
 
-def _stream(trial: Trial, surface: lodestream.Surface, setting: str, precision: float | None) -> None:
+def precision_for(trial: Trial, kind: str, target: float) -> float | None:
+    """The precision that meets an error, as the peers' steps are chosen; None where the values are coarser already.
+
+    The error of a step spreads evenly: its RMS is the precision (half a step, or half the diagonal of a cube of steps)
+    over the root of 3. Whole heights that stay whole go in steps of odd size, whose RMS is that of the whole numbers up
+    to half a step.
+    """
+    error = target * trial.surface.extent
+    points = trial.surface.points
+    if points.dtype.kind in "iu" and points.ndim == 2:
+        step = math.sqrt(12 * error**2 + 1) if kind == "rms" else 2 * error + 1
+        half = int((step - 1) // 2)
+        return float(half) if half else None
+    precision = math.sqrt(3) * error if kind == "rms" else error
+    step = 2 * precision / math.sqrt(points.shape[2] if points.ndim == 3 else 1)
+    return precision if trial.lattice is None or step > trial.lattice.step else None
+
+
+def _stream(
+    trial: Trial,
+    surface: lodestream.Surface,
+    setting: str,
+    precision: float | None,
+    made_for: tuple[str, float] | None = None,
+) -> None:
     container, encode_seconds, encode_peak = trial.timed(lambda: lodestream.encode(surface, precision=precision))
     decoded, whole_seconds, decode_peak = trial.timed(lambda: lodestream.decode(container).points)
     marks = plan(read_index(lambda offset, length: container[offset : offset + length], len(container))).marks
     near = min(range(len(marks)), key=lambda number: abs(math.log(max(marks[number].rms, 1e-300) / _near(trial))))
     decoder, held = lodestream.Decoder(), 0
     for number, mark in enumerate(marks):
+        last = mark is marks[-1]
+        if not last and made_for is not None and (trial.surface.large or _far(mark, made_for, trial)):
+            continue
         decoder.feed(container[held : mark.bytes])
         held = mark.bytes
-        picture = decoder.view().points if mark is not marks[-1] else decoded
-        seconds = whole_seconds if mark is marks[-1] else math.nan
-        if number == near and mark is not marks[-1]:
+        picture = decoded if last else decoder.view().points
+        seconds = whole_seconds if last else math.nan
+        if number == near and not last and made_for is None:
             _, seconds, _ = trial.timed(lambda mark=mark: _prefix(container, mark))  # type: ignore[misc]
         times, peaks = (encode_seconds, seconds), (encode_peak, decode_peak)
         trial.add(f"{setting}, layer {number}", mark.bytes, picture, times, peaks, stream=setting, file=len(container))
         _check(trial, mark, picture)
+
+
+def _far(mark: Mark, made_for: tuple[str, float], trial: Trial) -> bool:
+    kind, target = made_for
+    told = mark.rms if kind == "rms" else mark.max_error
+    return told > _BESIDE * target * trial.surface.extent
 
 
 def _near(trial: Trial) -> float:
@@ -66,7 +102,7 @@ def _prefix(container: bytes, mark: Mark) -> NDArray[Any]:
 
 def _check(trial: Trial, mark: Mark, picture: NDArray[Any]) -> None:
     """A note where an error told is not the error measured, beyond what the rounding of float32 figures allows."""
-    rms, largest = (value * trial.surface.extent for value in trial.surface.errors(picture))
+    rms, largest = (value * trial.surface.extent for value in trial.surface.errors(picture, trial.surface.vertices))
     for name, told, measured in (("RMS", mark.rms, rms), ("maximum", mark.max_error, largest)):
         if abs(told - measured) > 1e-3 * measured + 1e-6 * trial.surface.extent:
             trial.notes.append(f"{name} told {told:.6g}, measured {measured:.6g}, at {mark.bytes} bytes")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-__all__ = ["LOSSLESS", "MEMORY", "RULES", "SPEED"]
+__all__ = ["GATES", "LOSSLESS", "MEMORY", "RULES", "SPEED"]
 
 RULES = """\
 - A cell is one error on one surface. Errors are relative to the range of heights or to the diagonal of the box, of
   distances in space for x, y, z, and measured on what was decoded, ours like the peers'.
-- A peer counts at the best of its settings and modes, and the best peer of each cell is compared. Ours counts at the
-  best of the exact stream and of streams with a precision; a stream counts with all its layers. The exact stream alone
-  stands beside it.
+- A peer counts at the best of its settings and modes, and the best peer of each cell is compared.
+- Ours stands there twice. *One exact stream* is made once, without naming an error, and stopped where its error is
+  small enough: what Lodestream is made for. *At its best setting* is the better of that and of streams made for one
+  error, whose precision meets it as the peers' steps do: sqrt(3) times the RMS error, or the maximum error itself;
+  whole heights of integer type go in steps of odd size instead. The aims are held against the best setting, since
+  that is what the peers have; the figures of one exact stream stand beside them everywhere. `a precision` among the
+  settings: interpolated between the ends of such streams, as a peer's settings are.
 - Bytes are interpolated between settings, or between the layers of one stream, in log-log on the lower envelope. An
   error below the last lossy one costs the lossless stream. A peer's stream that does not itself say shape, type and how
   its numbers become values counts 32 bytes more.
@@ -19,6 +23,11 @@ RULES = """\
 - Surfaces of more than four million samples are tried at fewer settings, ours too.
 - A ratio below 1 says that ours needs fewer bytes; **bold**: it loses. Means are geometric, over cells where the best
   peer needs 4 KB or more."""
+
+GATES = """\
+Means, worst ratios and the aims are of cells of 4 KB or more, and the aims are for the best setting. Bold here: worse
+than the aim, or than 1 where there is none (means), or than 1 (worst). No cell should lie above 1.03, and none below
+4 KB more than 600 bytes above the peer."""
 
 SPEED = """
 MB are those of the samples as float32, whatever their type; geometric means over the surfaces, without the tiny ones;

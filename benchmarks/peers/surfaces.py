@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +22,7 @@ BUILD = ROOT / "build" / "peers"
 DATA = ROOT.parent / "shared" / "data"
 GROUPS = ("rough terrain", "smooth", "xyz", "noise", "tiny")
 LARGE = 4_000_000
-TINY = 64
+TINY = 64 * 64
 
 
 @dataclass(frozen=True)
@@ -86,11 +87,26 @@ class Specimen:
         """Changes with the values: results of another surface of the same name are not taken for this one's."""
         return hashlib.sha256(np.ascontiguousarray(self.points).tobytes()).hexdigest()[:16]
 
-    def errors(self, decoded: NDArray[Any]) -> tuple[float, float]:
-        """RMS and largest distance, relative to the extent."""
+    @cached_property
+    def vertices(self) -> NDArray[np.bool_]:
+        """Rows, columns: one point of those at the same place on the outline, as at poles and seams; all others."""
+        counted = np.ones(self.shape, np.bool_)
+        if len(self.channels) == 3:
+            outline = np.zeros(self.shape, np.bool_)
+            outline[[0, -1]] = outline[:, [0, -1]] = True
+            places = np.rint((self.reference[outline] - self.low) * (1e6 / self.extent))
+            first = np.zeros(len(places), np.bool_)
+            first[np.unique(places, axis=0, return_index=True)[1]] = True
+            counted[outline] = first
+        return counted
+
+    def errors(self, decoded: NDArray[Any], counted: NDArray[np.bool_] | None = None) -> tuple[float, float]:
+        """RMS and largest distance, relative to the extent; of all points, or of those named."""
         difference = decoded.reshape(self.reference.shape).astype(np.float64)
         difference -= self.reference
         squares = np.einsum("ijk,ijk->ij", difference, difference)
+        if counted is not None:
+            squares = squares[counted]
         return float(np.sqrt(squares.mean())) / self.extent, float(np.sqrt(squares.max())) / self.extent
 
 
@@ -138,29 +154,40 @@ def _of_files(skipped: list[str]) -> Iterator[_Made]:
     if not DATA.is_dir():
         skipped.append("../shared/data: there is no such folder")
         return
-    refused = []
+    left: dict[str, list[str]] = defaultdict(list)
     for path in sorted(DATA.iterdir()):
         if path.name == "README.md":
             continue
         try:
             surface = lodestream.read(path)
         except lodestream.LodestreamError:
-            refused.append(path.name)
+            left["refused by `lodestream.read` without options, or without an extra"].append(path.name)
             continue
-        points = surface.points
-        if np.isnan(points).any() if points.dtype.kind == "f" else False:
-            skipped.append(f"{path.name}: it has holes, which no peer takes")
+        if len(surface.blocks) > 1:
+            left["several blocks, which no peer takes"].append(path.name)
             continue
+        if surface.mask is not None:
+            left["holes, which no peer takes"].append(path.name)
+            continue
+        points = _heights(surface.points)
         if points.ndim == 3 and points.shape[2] != 3:
-            skipped.append(f"{path.name}: it is neither a height field nor x, y, z")
+            left["neither heights nor x, y, z"].append(path.name)
             continue
         yield path.name, _group(points), f"../shared/data/{path.name}", surface.closed, points
-    if refused:
-        skipped.append("refused by `lodestream.read`: " + ", ".join(refused))
+    skipped += [f"{why}: {', '.join(names)}" for why, names in left.items()]
+
+
+def _heights(points: NDArray[Any]) -> NDArray[Any]:
+    """Heights alone where x depends on the column and y on the row only: no peer has to code the rest, nor have we."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        return points
+    x, y = points[..., 0], points[..., 1]
+    separable = bool((x == x[:1]).all() and (y == y[:, :1]).all())
+    return np.ascontiguousarray(points[..., 2]) if separable else points
 
 
 def _group(points: NDArray[Any]) -> str:
-    if max(points.shape[:2]) <= TINY:
+    if points.shape[0] * points.shape[1] <= TINY:
         return "tiny"
     return "xyz" if points.ndim == 3 else "rough terrain"
 
