@@ -11,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-lowest lint format bench bench-peers bench-server bench-stream wheel clean
+.PHONY: help demo test test-lowest torture lint format bench bench-peers bench-server bench-stream wheel clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -25,6 +25,10 @@ test: $(STAMP) ## run the tests; ARGS="-k name" for some of them
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
+
+torture: $(STAMP) ## what takes too long for every run, into docs/reliability.md; ARGS="--seconds 300" or "kills fuzz"
+	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --group torture || true
+	@$(BIN)/python -m tests.torture $(ARGS)
 
 lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
 	@status=0; \

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -126,13 +126,13 @@ def upload(server: Server, side: int) -> tuple[str, bytes]:
     return made.url, answer.content
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Print a table; 1 when anything was wrong."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.server", description=__doc__)
     parser.add_argument("--streams", type=int, default=500, help="connections at once (default: 500)")
     parser.add_argument("--side", type=int, default=1025, help="points of a side of the surface (default: 1025)")
     parser.add_argument("--rounds", type=int, default=3, help="of which the median counts (default: 3)")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     print(f"Lodestream {ls.__version__}, Python {platform.python_version()}, {packages}")
     print(f"{os.cpu_count()} x {processor()}, which server and reader share", flush=True)

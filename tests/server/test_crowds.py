@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 from pathlib import Path
 
-from lodestream.container import read_index
-from lodestream.plan import plan
 from tests.server.helpers import hills, npy, push
 from tests.server.programs import server
 from tests.torture import crowd
+from tests.torture.parts import sent
 
 COUNT = 20
-
-
-def sent(container: bytes) -> str:
-    """Hash of what a stream of the whole surface carries."""
-    chosen = plan(read_index(lambda offset, length: container[offset : offset + length], len(container)))
-    places = (*chosen.before, *chosen.ranges, *chosen.after)
-    return hashlib.sha256(b"".join(container[place.offset : place.end] for place in places)).hexdigest()
 
 
 def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: Path) -> None:

@@ -120,6 +120,9 @@ class _Torment:
 
     def _kill(self, server: Server) -> None:
         moment = self.random.uniform(0.02, self.random.choice((self.longest / 5, self.longest)))
+        if self.random.random() < 0.5:
+            # Later: when the processes that build are warm, and builds come to their end.
+            self._await_build()
         if self.random.random() < 0.4:
             time.sleep(moment / 2)
             for worker in descendants(server.pid):
@@ -133,6 +136,11 @@ class _Torment:
         server.kill()
         self.kills.servers += 1
         eventually(lambda: not any(map(_alive, children)), "the server's processes to end with it")
+
+    def _await_build(self) -> None:
+        seen, until = self.kills.builds, time.monotonic() + 5 * self.longest
+        while self.kills.builds == seen and time.monotonic() < until:
+            time.sleep(0.02)
 
     def _look(self) -> None:
         found = check(self.data)

@@ -1,0 +1,103 @@
+"""``make torture``: what takes too long for every run of the tests, and the page that says what it did.
+
+Without names every part runs, and docs/reliability.md is written. ``--seconds`` is the most that each part may take
+which can be cut short; it then says how far it came. ``--count`` makes each part that many times as large.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import lodestream
+
+from .parts import PARTS, Result
+
+PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
+
+_MARK = "## One run\n"
+
+
+def main() -> int:
+    """Run the parts; 1 when one of them failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.torture", description=__doc__)
+    parser.add_argument("part", nargs="*", help=f"of {', '.join(PARTS)}; all when none is named")
+    parser.add_argument("--seconds", type=float, help="the most that a part may take which can be cut short")
+    parser.add_argument("--count", type=float, default=1.0, help="how many times the usual counts (default: 1)")
+    parser.add_argument(
+        "--page", type=Path, help="where to write the page (default: docs/reliability.md, for all parts)"
+    )
+    args = parser.parse_args()
+    unknown = sorted(set(args.part) - PARTS.keys())
+    if unknown:
+        parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(unknown)}")
+    machine = _machine()
+    print("\n".join(machine), flush=True)
+    _warm()
+    results, started = [], time.monotonic()
+    for name, part in PARTS.items():
+        if not args.part or name in args.part:
+            result = part.run(max(1, int(part.count * args.count)), args.seconds)
+            results.append(result)
+            print("\n" + "\n".join(_lines(result)), flush=True)
+    total = f"All together: {_duration(time.monotonic() - started)}."
+    print(f"\n{total}")
+    page = args.page or (None if args.part else PAGE)
+    if page is not None:
+        lines = ["", *machine, "", total]
+        for result in results:
+            lines += ["", *_lines(result)]
+        before = page.read_text().partition(_MARK)[0] if page.exists() else ""
+        page.write_text(before + _MARK + "\n".join(lines) + "\n")
+    return 1 if any(result.failure for result in results) else 0
+
+
+def _warm() -> None:
+    # Compiled once, in a process of its own, so that no part waits for the compiler.
+    command = "from lodestream_server.worker import warm; from tests.torture.targets import TARGETS; warm();"
+    command += "[target.run(data) for target in TARGETS.values() for data in target.corpus()]"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    subprocess.run([sys.executable, "-c", command], env=environment, check=True)
+
+
+def _machine() -> list[str]:
+    from benchmarks.__main__ import processor
+
+    packages = []
+    for name in ("numpy", "numba", "fastapi", "starlette", "uvicorn", "websockets", "hypothesis", "atheris"):
+        try:
+            packages.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            packages.append(f"no {name}")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    system = f"{platform.system()} {platform.release().split('-')[0]}"
+    return [
+        f"- {os.cpu_count()} x {processor()}, {memory:.0f} GiB, {system}; load when it began: {os.getloadavg()[0]:.1f}",
+        f"- Lodestream {lodestream.__version__}, Python {platform.python_version()}, {', '.join(packages)}",
+        f"- begun {time.strftime('%Y-%m-%d %H:%M', time.gmtime())} UTC",
+    ]
+
+
+def _lines(result: Result) -> list[str]:
+    done = f"{result.cases:,} in {_duration(result.seconds)}" if not result.failure else "**failed**"
+    lines = [f"### {result.part.title}", "", f"`{result.part.name}` ({result.part.unit}): {done}.", ""]
+    if result.failure:
+        return [*lines, "```text", *result.failure.strip().splitlines()[-40:], "```"]
+    if any(fact.startswith("|") for fact in result.facts):
+        return [*lines, *(fact.replace("###", "####") for fact in result.facts)]
+    return [*lines, *(f"- {fact}" for fact in result.facts)]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
