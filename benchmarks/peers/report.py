@@ -14,7 +14,7 @@ from . import figures
 from .curves import Cell, Results, geometric_mean
 from .prose import GATES, LOSSLESS, MEMORY, RULES, SPEED
 from .registry import OURS, PEERS
-from .remarks import REMARKS
+from .remarks import REMARKS, remark_of
 from .speed import memory_table, speed_table
 from .surfaces import GROUPS
 from .trial import TARGETS
@@ -199,24 +199,27 @@ def _sixteen_bits(results: Results, surface: str) -> bool:
 
 
 def _losses(results: Results) -> Iterator[str]:
-    lost: dict[str, list[str]] = {}
+    yield "\n## Cells that lose\n"
+    yield "All cells above 1 of ours at its best setting, each under what was tried against it.\n"
+    lost: dict[str, dict[str, list[str]]] = {key: {} for key in REMARKS}
     for kind, title in KINDS.items():
         for cell in results.cells(list(results.surfaces), kind):
             if cell.ratio > 1:
-                text = (
-                    f"{title.lower()} {cell.target:.0e}: {cell.ratio:.3f} of {cell.peer} ({cell.peer_bytes:,.0f} bytes)"
-                )
-                lost.setdefault(cell.surface, []).append(text)
-    yield "\n## Cells that lose\n"
-    if not lost:
-        yield "None."
-    for surface, texts in lost.items():
-        remark = f" {REMARKS[surface]}" if surface in REMARKS else ""
-        yield f"- {surface}: {'; '.join(texts)}.{remark}"
+                key = remark_of(results.surfaces[cell.surface]["group"], kind, cell)
+                text = f"{title.split()[0]} {cell.target:.0e} {cell.ratio:.3f} of {cell.peer}"
+                lost[key].setdefault(cell.surface, []).append(text)
+    for key, surfaces in lost.items():
+        if surfaces:
+            yield f"### Lost: {key}\n\n{REMARKS[key]}\n"
+            for surface, texts in surfaces.items():
+                yield f"- {surface}: {'; '.join(texts)}."
+            yield ""
+    if not any(lost.values()):
+        yield "None.\n"
 
 
 def _left_out(results: Results) -> Iterator[str]:
-    yield "\n## Left out\n"
+    yield "## Left out\n"
     for note in results.data.get("skipped", []):
         yield f"- {note}"
     told: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
