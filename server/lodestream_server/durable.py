@@ -1,4 +1,4 @@
-"""Files that are on disk, whole, when these functions return: everything that the server writes goes through here.
+"""Files that are on disk, whole, when these functions return: everything that the server keeps goes through here.
 
 Every step that changes the disk is a method of `Disk`, and all of them are made on one object, `disk`: tests put
 another there, to fill the disk at any step or to lose what was never synchronised.

@@ -221,6 +221,7 @@ class Builder:
         try:
             result = await self._run(call)
             if isinstance(result, worker.Built):
+                self.ready = True  # as a build shows, whatever became of the process that was to warm them
                 await _on_disk(self._storage.ready, record.id, result.path, result.sha256, result.info)
                 return "ready"
             return await self._refuse(record, result.reason)
