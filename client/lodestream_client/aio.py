@@ -276,9 +276,10 @@ async def upload(
     wait: bool = True,
     progress: Progress | None = None,
     token: str | None = None,
+    attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`."""
-    parameters = surface_parameters(sources, precision, closed, name, options)
+    parameters = surface_parameters(sources, precision, closed, name, options, attribute_precision)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(sources, sent) as body:
         return await _run(requests.upload(url, parameters, body, wait, progress), url, token)

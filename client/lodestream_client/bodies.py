@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeAlias, TypeGuard, cast
 
-from lodestream.errors import OptionError
+from lodestream.errors import InputError, OptionError
 from lodestream.target import Tolerance
 
 if TYPE_CHECKING:
@@ -95,6 +95,8 @@ def opened(sources: Sequence[Source], sent: Callable[[float], None] | None = Non
     ------
     OptionError
         When there is nothing to send.
+    InputError
+        When a surface in memory is more than one array.
     OSError
         When a file cannot be opened.
     """
@@ -117,14 +119,22 @@ def opened(sources: Sequence[Source], sent: Callable[[float], None] | None = Non
 
 def _is_surface(source: Source) -> TypeGuard[Surface]:
     """Whether this is a surface in memory; known without importing what surfaces are made of."""
-    return hasattr(source, "points")
+    return hasattr(type(source), "attributes")
 
 
 def _as_npy(surface: Surface) -> BinaryIO:
     import numpy as np
 
+    points = surface.points  # refused where there are several blocks
+    if surface.attributes:
+        raise InputError("expected points alone, which can be sent from memory, got attributes; write them to a file")
+    if surface.mask is not None:
+        if points.dtype.kind != "f":
+            raise InputError(f"expected NaN for holes, got a mask of {points.dtype} points; write them to a file")
+        points = points.copy()
+        points[~surface.mask] = np.nan
     file = io.BytesIO()
-    np.save(file, surface.points, allow_pickle=False)
+    np.save(file, points, allow_pickle=False)
     file.seek(0)
     return file
 
@@ -135,7 +145,8 @@ def surface_parameters(
     closed: Closure,
     name: str | None,
     options: Mapping[str, str] | None,
-) -> dict[str, str]:
+    attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
+) -> dict[str, str | list[str]]:
     """The query of an upload.
 
     A surface in memory tells its own closure and name, unless others are given.
@@ -145,14 +156,15 @@ def surface_parameters(
     OptionError
         When the precision is not a tolerance, or an option of the format has the name of one of the query's own.
     """
-    parameters: dict[str, str] = {}
+    parameters: dict[str, str | list[str]] = {}
     for source in sources:
         if _is_surface(source):
             closed = _CLOSURES[source.closed] if closed == "auto" else closed
             name = name or source.metadata.get("name")
-    if precision is not None:
-        tolerance = Tolerance.parse(str(precision)) if not isinstance(precision, Tolerance) else precision
-        parameters["precision"] = f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
+    precisions = [] if precision is None else [_tolerance(precision)]
+    precisions += [f"{attribute}={_tolerance(value)}" for attribute, value in (attribute_precision or {}).items()]
+    if precisions:
+        parameters["precision"] = precisions
     if closed != "auto":
         parameters["closed"] = closed
     if name:
@@ -162,3 +174,8 @@ def surface_parameters(
             raise OptionError(f"{key} is not an option of a format")
         parameters[key] = value
     return parameters
+
+
+def _tolerance(precision: Tolerance | float | str) -> str:
+    tolerance = precision if isinstance(precision, Tolerance) else Tolerance.parse(str(precision))
+    return f"{tolerance.value!r}{'d' if tolerance.relative else ''}"

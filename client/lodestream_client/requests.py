@@ -63,7 +63,7 @@ class Call:
 
     method: str
     url: str
-    parameters: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: Body | None = None
     partial: bool = False
@@ -164,7 +164,7 @@ def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
 
 
 def upload(
-    url: str, parameters: Mapping[str, str], body: Body, wait: bool, progress: Progress | None
+    url: str, parameters: Mapping[str, str | list[str]], body: Body, wait: bool, progress: Progress | None
 ) -> Flow[Description]:
     """Send files, and wait until their surface is ready."""
     collection = addresses.surfaces_url(url)
@@ -182,7 +182,7 @@ def upload(
     return surface
 
 
-def _named(parameters: Mapping[str, str], body: Body) -> Mapping[str, str]:
+def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str, str | list[str]]:
     # A form names its files itself; a raw body has no other place for the name than the query.
     name = body.files[0][0] if len(body.files) == 1 else ""
     return {**parameters, "filename": name} if name else parameters

@@ -307,6 +307,7 @@ def upload(
     wait: bool = True,
     progress: Progress | None = None,
     token: str | None = None,
+    attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
 ) -> Description:
     """Upload a surface.
 
@@ -330,6 +331,8 @@ def upload(
         Called as ``progress(stage, fraction)``, with the stages ``sending`` and ``building``.
     token : str or None
         What the server asks for, if it does.
+    attribute_precision : mapping of str to Tolerance, float or str, or None
+        Greatest error of attributes, by their names; the others are lossless.
 
     Returns
     -------
@@ -345,7 +348,7 @@ def upload(
     UnreachableError
         When there is no connection.
     """
-    parameters = surface_parameters(sources, precision, closed, name, options)
+    parameters = surface_parameters(sources, precision, closed, name, options, attribute_precision)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(sources, sent) as body:
         return _run(requests.upload(url, parameters, body, wait, progress), url, token)

@@ -71,7 +71,8 @@ UPLOAD: dict[str, Any] = {
         for name, description, values, example in (
             (
                 "precision",
-                "largest step of the lattice: in the surface's unit, or <x>d for x times the extent",
+                "greatest error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P is for "
+                "the attribute NAME; may be repeated",
                 None,
                 "1e-4d",
             ),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from lodestream import Tolerance
 from lodestream.errors import FormatError, OptionError
 
-from .worker import CLOSED, UNNAMED
+from .worker import ATTRIBUTE, CLOSED, UNNAMED
 
 if TYPE_CHECKING:
     from lodestream.formats import Format
@@ -33,8 +33,8 @@ class SurfaceOptions:
     filename : str or None
         Name of the file, where the body does not tell it.
     chosen : mapping of str to str
-        ``precision`` in one spelling, ``closed`` unless it is auto, and options of the format as they came: what makes
-        another surface of the same bytes.
+        ``precision`` in one spelling, ``precision=NAME`` for attributes, ``closed`` unless it is auto, and options of
+        the format as they came: what makes another surface of the same bytes.
     """
 
     name: str | None
@@ -52,18 +52,23 @@ class SurfaceOptions:
         """
         values: dict[str, str] = {}
         for key, value in query:
+            if "=" in key:
+                raise OptionError(f"expected the name of an option, got {key[:80]!a}")
+            if key == "precision":
+                # A name may hold an equals sign, a tolerance does not.
+                attribute, equals, value = value.rpartition("=")
+                key += equals + attribute
+                tolerance = Tolerance.parse(value)
+                value = f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value
         name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
-        closed, precision = values.pop("closed", "auto"), values.pop("precision", None)
+        closed = values.pop("closed", "auto")
         if closed not in CLOSED:
             raise OptionError(f"expected closed to be one of {', '.join(CLOSED)}, got {closed[:80]!a}")
         if closed != "auto":
             values["closed"] = closed
-        if precision is not None:
-            tolerance = Tolerance.parse(precision)
-            values["precision"] = f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
         return cls(name, filename, values)
 
 
@@ -85,7 +90,7 @@ def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -
             readable = ", ".join(item.name for item in formats() if item.read)
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
     for key in options.chosen:
-        if key not in ("precision", "closed", *found[0].options):
+        if key not in ("precision", "closed", *found[0].options) and not key.startswith(ATTRIBUTE):
             known = ", ".join(("precision", "closed", "name", "filename", *found[0].options))
             raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
     return found[0]

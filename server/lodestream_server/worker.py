@@ -6,12 +6,13 @@ import hashlib
 import logging
 import resource
 import time
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import FormatWarning, LodestreamError
 
 from .durable import NewFile
 from .records import plain
@@ -21,12 +22,26 @@ if TYPE_CHECKING:
 
     from lodestream import Surface
 
-__all__ = ["CLOSED", "UNNAMED", "Built", "Job", "Refused", "build", "limit_memory", "read_progress", "warm"]
+__all__ = [
+    "ATTRIBUTE",
+    "CLOSED",
+    "UNNAMED",
+    "Built",
+    "Job",
+    "Refused",
+    "build",
+    "limit_memory",
+    "read_progress",
+    "warm",
+]
 
 _log = logging.getLogger(__name__)
 
 #: The values of ``closed``; `auto` leaves what the file says.
 CLOSED = ("auto", "none", "rows", "cols", "both")
+
+#: What stands before the name of an attribute in the key of its precision.
+ATTRIBUTE = "precision="
 
 #: What a file without a name is called in messages, which must not tell where it lies on the server.
 UNNAMED = "upload"
@@ -52,7 +67,7 @@ class Job:
     closed : str
         One of `CLOSED`.
     options : mapping of str to str
-        Options of the format.
+        Options of the format, and precisions of attributes: their keys begin with `ATTRIBUTE`.
     max_vertices : int
     folder : Path
         Where the build may write; empty at the start.
@@ -130,7 +145,12 @@ def _build(job: Job) -> Built:
 
     surface = _read(job)
     precision = None if job.precision is None else Tolerance.parse(job.precision)
-    container = encode(surface, precision, progress=_reporter(job.folder))
+    precisions = {
+        key.removeprefix(ATTRIBUTE): Tolerance.parse(value)
+        for key, value in job.options.items()
+        if key.startswith(ATTRIBUTE)
+    }
+    container = encode(surface, precision, attribute_precision=precisions, progress=_reporter(job.folder))
     path = job.folder / _CONTAINER
     with NewFile(path) as file:
         file.write(container)
@@ -141,13 +161,18 @@ def _build(job: Job) -> Built:
 def _read(job: Job) -> Surface:
     from lodestream.formats import read
 
-    surface = read(
-        *job.files,
-        closed=job.closed,
-        max_vertices=job.max_vertices,
-        filename=job.filename or UNNAMED,
-        **job.options,
-    )
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always", FormatWarning)
+        surface = read(
+            *job.files,
+            closed=job.closed,
+            max_vertices=job.max_vertices,
+            filename=job.filename or UNNAMED,
+            **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
+        )
+    notes = list(dict.fromkeys(str(warning.message) for warning in found if warning.category is FormatWarning))
+    if notes:
+        surface.metadata["notes"] = notes  # whoever uploaded it does not see what happens here
     if job.name is not None:
         surface.metadata["name"] = job.name
     elif job.filename is None:

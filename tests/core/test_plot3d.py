@@ -70,7 +70,7 @@ class Written:
             "dimensions": str(len(self.blocks[0])),
         }
         if not text:
-            result |= {"precision": {4: "single", 8: "double"}[self.precision]}
+            result |= {"reals": {4: "single", 8: "double"}[self.precision]}
             result |= {"endian": {"<": "little", ">": "big"}[self.endian], "records": "yes" if self.records else "no"}
         return result
 

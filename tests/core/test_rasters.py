@@ -140,7 +140,7 @@ def test_xyz_over_an_even_lattice_is_written_as_heights(tmp_path: Path) -> None:
     for surface, message in (
         (Surface(points), "heights over an even lattice for GeoTIFF, got x, y, z that are not"),
         (Surface(points[..., :2]), "got planar points that are not"),
-        (Surface(blocks=[Block(hills()), Block(hills())]), "one block for GeoTIFF, got 2"),
+        (Surface(blocks=[Block(hills()), Block(hills())]), "one block for geotiff, got 2"),
     ):
         with pytest.raises(FormatError, match=message):
             formats.write(surface, tmp_path / "b.tif")

@@ -28,6 +28,7 @@ __all__ = [
     "add_target_options",
     "add_token_option",
     "parse_pair",
+    "parse_precision",
     "parse_rate",
     "parse_seconds",
     "parse_server",
@@ -35,6 +36,7 @@ __all__ = [
     "parse_source",
     "parse_surface",
     "parse_tolerance",
+    "precisions",
     "surface_options",
     "target_of",
     "token_of",
@@ -121,7 +123,16 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     return checked
 
 
+def _precision(text: str) -> tuple[str | None, Tolerance]:
+    # A name may hold an equals sign, a tolerance does not.
+    name, equals, tolerance = text.rpartition("=")
+    if equals and not name:
+        raise OptionError(f"expected P or NAME=P, got {text!r}")
+    return name or None, Tolerance.parse(tolerance)
+
+
 parse_tolerance = _checked(Tolerance.parse)
+parse_precision = _checked(_precision)
 parse_server = _checked(addresses.surfaces_url)
 parse_surface = _checked(addresses.surface_url)
 parse_source = _checked(addresses.source_url)
@@ -173,9 +184,13 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("surface options")
     group.add_argument(
         "--precision",
-        type=parse_tolerance,
-        metavar="P",
-        help="greatest error of the complete surface, in its unit or as <x>d times its extent (default: lossless)",
+        dest="precisions",
+        action="append",
+        default=[],
+        type=parse_precision,
+        metavar="[NAME=]P",
+        help="greatest error of the complete surface, in its unit or as <x>d times its extent (default: lossless); "
+        "NAME=P is for the attribute NAME, which is lossless otherwise; may be repeated",
     )
     group.add_argument(
         "--closed",
@@ -206,6 +221,20 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
             args.parser.error(f"argument -o: {key} given twice")
         options[key] = value
     return options
+
+
+def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
+    """The precision of the points, and those of attributes by their names.
+
+    One that is given twice ends the program: the command line alone shows it to be wrong.
+    """
+    found: dict[str | None, Tolerance] = {}
+    for name, tolerance in args.precisions:
+        if name in found:
+            args.parser.error(f"argument --precision: {'P' if name is None else name} given twice")
+        found[name] = tolerance
+    points = found.pop(None, None)
+    return points, {str(name): tolerance for name, tolerance in found.items()}
 
 
 def add_target_options(parser: argparse.ArgumentParser) -> None:

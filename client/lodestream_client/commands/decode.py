@@ -17,7 +17,7 @@ from lodestream.target import Target
 
 from .arguments import Subparsers, add_command, add_json_option, add_target_options, target_of
 from .inputs import input_files
-from .outcome import Outcome, check_out, note_unmet
+from .outcome import Outcome, check_grid, check_out, note_unmet
 from .output import note, progress_bar
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     started = time.monotonic()
     with input_files(args.parser, [args.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
         task = bar.add_task("decoding", total=1.0, figures="")
-        job = _Job(file, target, started, lambda done: bar.update(task, completed=done))
+        job = _Job(file, args.out, target, started, lambda done: bar.update(task, completed=done))
         try:
             job.decode()
         except StreamError as error:
@@ -87,7 +87,9 @@ def run(args: argparse.Namespace) -> int:
 class _Job:
     """One container on its way through a decoder."""
 
-    def __init__(self, file: BinaryIO, target: Target, started: float, progress: Callable[[float], None]) -> None:
+    def __init__(
+        self, file: BinaryIO, out: str, target: Target, started: float, progress: Callable[[float], None]
+    ) -> None:
         from lodestream.decoder import Decoder
 
         self.decoder: Decoder = Decoder()
@@ -96,6 +98,7 @@ class _Job:
         self.read_bytes = 0
         self.metadata: dict[str, object] | None = None
         self._file = file
+        self._out = out
         self._size = file.seek(0, 2)
         self._target = target
         self._started = started
@@ -114,6 +117,7 @@ class _Job:
             self._decode_prefix()
         else:
             self.metadata = dict(index.metadata_values)
+            check_grid(self._out, index.header)
             self._decode_planned(index)
 
     def _read(self, offset: int, length: int) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from pathlib import Path
@@ -10,9 +11,9 @@ from typing import Any
 
 from lodestream.errors import OptionError
 
-from .arguments import Subparsers, add_command, add_json_option, add_surface_options, surface_options
+from .arguments import Subparsers, add_command, add_json_option, add_surface_options, precisions, surface_options
 from .inputs import input_files
-from .output import human_size, note, print_json, progress_bar, replacing, require_folder
+from .output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 
 __all__ = ["register", "run"]
 
@@ -39,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out == "-" and args.json:
         args.parser.error("argument --json: standard output is taken by the container")
     options = surface_options(args)
+    precision, attribute_precision = precisions(args)
     if args.out != "-":
         require_folder(Path(args.out))
 
@@ -53,7 +55,10 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar() as progress:
         task = progress.add_task("encoding", total=1.0, figures="")
         container = ls.encode(
-            surface, args.precision, progress=lambda fraction: progress.update(task, completed=fraction)
+            surface,
+            precision,
+            attribute_precision=attribute_precision,
+            progress=lambda fraction: progress.update(task, completed=fraction),
         )
     if args.out == "-":
         sys.stdout.buffer.write(container)
@@ -62,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
             temporary.write_bytes(container)
     seconds = time.monotonic() - started
     blocks = surface.blocks
+    note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks))
     raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
     if args.json:
         alone = blocks[0] if len(blocks) == 1 else None

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from .. import addresses
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
 from .inputs import input_files
-from .output import console, human_size, print_json
+from .output import console, human_size, point_words, print_json
 
 __all__ = ["register", "run"]
+
+_MOST_KINDS = 12  # sizes of blocks that are named
 
 
 def register(subparsers: Subparsers) -> None:
@@ -87,18 +90,46 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts: list[tuple[str, str]] = []
     if details.get("state") not in (None, "ready"):
         facts.append(("state", f"{details['state']} {details.get('reason') or ''}".strip()))
-    if isinstance(details.get("shape"), list):
-        facts.append(("shape", " x ".join(map(str, details["shape"]))))
-    closed = details.get("closed")
-    if isinstance(closed, list):
-        names = [name for name, wraps in zip(("rows", "columns"), closed, strict=True) if wraps]
-        facts.append(("closed", " and ".join(names) or "no"))
+    metadata = dict(details.get("metadata") or {})
+    if "recognised" in metadata:
+        facts.append(("recognised", str(metadata.pop("recognised"))))
+    if details.get("blocks"):
+        facts += _grids(details["blocks"])
+        facts.append(("points", point_words(details)))
+    if details.get("attributes"):
+        facts.append(("attributes", ", ".join(map(str, details["attributes"]))))
+    if "dtype" in details:
+        facts.append(("type", str(details["dtype"])))
     if "bytes" in details:
         facts.append(("size", f"{human_size(details['bytes'])} ({details['bytes']} bytes)"))
     if "exact" in details:
         facts.append(("exact", "yes, bit for bit" if details["exact"] else "no, to the precision asked for"))
-    facts += [(str(name), _short(value)) for name, value in (details.get("metadata") or {}).items()]
-    return facts
+    if details.get("sha256"):
+        facts.append(("sha256", str(details["sha256"])))
+    return facts + [(str(name), _short(value)) for name, value in metadata.items()]
+
+
+def _grids(blocks: list[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    if len(blocks) > 1:
+        kinds = Counter(map(_block, blocks))
+        return [("blocks", f"{f'{len(blocks)}: ' if len(kinds) > 1 else ''}{_counted(kinds)}")]
+    closed = [name for name, wraps in zip(("rows", "columns"), blocks[0]["closed"], strict=True) if wraps]
+    return [("shape", _size(blocks[0]["shape"])), ("closed", " and ".join(closed) or "no")]
+
+
+def _block(block: Mapping[str, Any]) -> str:
+    closed = [name for name, wraps in zip(("rows", "columns"), block["closed"], strict=True) if wraps]
+    return _size(block["shape"]) + (f" ({' and '.join(closed)} closed)" if closed else "")
+
+
+def _counted(kinds: Counter[str]) -> str:
+    counts = kinds.most_common()
+    named = ", ".join(f"{count} of {word}" if count > 1 else word for word, count in counts[:_MOST_KINDS])
+    return named if len(counts) <= _MOST_KINDS else f"{named}, and others of {len(counts) - _MOST_KINDS} sizes"
+
+
+def _size(shape: Iterable[int]) -> str:
+    return " x ".join(map(str, shape))
 
 
 def _short(value: object) -> str:
@@ -111,17 +142,15 @@ def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD if fancy else None, pad_edge=False)
-    table.add_column("level" if kind == "levels" else "layer", justify="right")
-    if kind == "levels":
-        table.add_column("grid", justify="right")
-    else:
-        table.add_column("level", justify="right")
-    for name in ("bytes", "RMS error", "maximum"):
+    # Of several blocks a level has no one grid.
+    grids = ["grid"] if kind == "levels" and all(state.get("shape") for state in states) else []
+    first = ["level", *grids] if kind == "levels" else ["layer", "level"]
+    for name in (*first, "bytes", "RMS error", "maximum"):
         table.add_column(name, justify="right")
     for number, state in enumerate(states):
-        second = " x ".join(map(str, state["shape"])) if kind == "levels" else str(state["level"])
+        place = [_size(state["shape"])] if grids else [str(state["level"])] if kind == "layers" else []
         figures = (f"{state['bytes']:,}", _figure(state["rms"]), _figure(state["max"]))
-        table.add_row(str(number), second, *figures)
+        table.add_row(str(number), *place, *figures)
     return table
 
 

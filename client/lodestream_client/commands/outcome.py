@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import OptionError
+from lodestream.errors import FormatError
 from lodestream.target import Target
 
 from .output import human_size, note, print_json, require_folder
 
 if TYPE_CHECKING:
+    from lodestream.container import Header
     from lodestream.surface import Surface
 
-__all__ = ["Outcome", "check_out", "note_unmet"]
+__all__ = ["Outcome", "check_grid", "check_out", "note_unmet"]
 
 
 def check_out(args: argparse.Namespace) -> None:
@@ -34,13 +35,27 @@ def check_out(args: argparse.Namespace) -> None:
     path = Path(args.out)
     require_folder(path)
 
-    from lodestream.formats import formats
+    from lodestream.formats import for_writing
 
-    known = [suffix for format_ in formats() if format_.write for suffix in format_.suffixes]
-    if path.suffix.lower() not in known:
-        raise OptionError(
-            f"{path}: expected a name that ends in one of {', '.join(known)}, got {path.suffix or 'none'!r}"
-        )
+    for_writing(path)
+
+
+def check_grid(out: str, header: Header) -> None:
+    """Refuse, before the rest comes, what a format cannot hold.
+
+    Raises
+    ------
+    FormatError
+        When there are several blocks, and the format of OUT has one.
+    """
+    from lodestream.formats import check_blocks, for_writing, formats
+
+    # Standard output gets NPY.
+    format_ = next(it for it in formats() if it.name == "npy") if out == "-" else for_writing(out)
+    try:
+        check_blocks(format_, len(header.blocks))
+    except FormatError as error:
+        raise FormatError(f"{'standard output' if out == '-' else out}: {error}") from None
 
 
 def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent: float) -> None:

@@ -18,12 +18,48 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-__all__ = ["console", "human_size", "human_time", "note", "print_json", "progress_bar", "replacing", "require_folder"]
+__all__ = [
+    "console",
+    "human_size",
+    "human_time",
+    "note",
+    "note_details",
+    "note_holes",
+    "point_words",
+    "print_json",
+    "progress_bar",
+    "replacing",
+    "require_folder",
+]
 
 
 def note(text: str) -> None:
     """Say something that is not the result."""
     print(f"lodestream: {text}", file=sys.stderr)
+
+
+def point_words(details: Mapping[str, Any]) -> str:
+    """How many points a surface has, and how many of them are holes, from the keys of ``info``."""
+    total, holes = _points(details), details.get("holes") or 0
+    return f"{total}, {holes} of them holes" if holes else str(total)
+
+
+def _points(details: Mapping[str, Any]) -> int:
+    return sum(math.prod(block["shape"]) for block in details["blocks"])
+
+
+def note_holes(holes: int, total: int) -> None:
+    """Say how many points have no value, if any."""
+    if holes:
+        note(f"{holes} of {total} points are holes")
+
+
+def note_details(details: Mapping[str, Any]) -> None:
+    """Say what a server noted when it read a surface: what it left out or chose, and holes."""
+    for text in (details.get("metadata") or {}).get("notes") or ():
+        note(" ".join(str(text).split()))
+    if details.get("blocks"):
+        note_holes(details.get("holes") or 0, _points(details))
 
 
 def print_json(value: Mapping[str, Any]) -> None:

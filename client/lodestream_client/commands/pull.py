@@ -24,7 +24,7 @@ from .arguments import (
     target_of,
     token_of,
 )
-from .outcome import Outcome, check_out, note_unmet
+from .outcome import Outcome, check_grid, check_out, note_unmet
 from .output import human_size, note, progress_bar
 
 if TYPE_CHECKING:
@@ -122,7 +122,9 @@ def _pull(
             progress=bar.received,
         )
         with stream:
-            for view in stream:
+            for number, view in enumerate(stream):
+                if number == 0 and stream.decoder.header is not None:
+                    check_grid(args.out, stream.decoder.header)
                 bar.figures = f"{human_size(view.bytes)}, level {view.level}, RMS error {view.rms:.4g}"
     seconds = time.monotonic() - started
     decoder = stream.decoder

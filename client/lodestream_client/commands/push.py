@@ -14,11 +14,12 @@ from .arguments import (
     add_surface_options,
     add_token_option,
     parse_server,
+    precisions,
     surface_options,
     token_of,
 )
 from .inputs import input_files
-from .output import human_size, print_json, progress_bar
+from .output import human_size, note_details, print_json, progress_bar
 
 if TYPE_CHECKING:
     from ..bodies import Source
@@ -46,6 +47,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Upload, wait, print the address."""
     options = surface_options(args)
+    precision, attribute_precision = precisions(args)
 
     from .. import sync
 
@@ -64,7 +66,8 @@ def run(args: argparse.Namespace) -> int:
         surface = sync.upload(
             args.url,
             *sources,
-            precision=args.precision,
+            precision=precision,
+            attribute_precision=attribute_precision,
             closed=args.closed,
             name=args.name,
             options=options,
@@ -72,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
             progress=progress,
             token=token_of(args),
         )
+    note_details(surface.details)
     if args.json:
         print_json({**surface.details, "url": surface.url})
     else:

@@ -44,7 +44,7 @@ def run_list(args: argparse.Namespace) -> int:
     table = Table(box=None, show_header=False, pad_edge=False)
     for surface in surfaces:
         details = surface.details
-        shape = " x ".join(map(str, details.get("shape") or ())) or "-"
+        shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
         size = human_size(details["bytes"]) if isinstance(details.get("bytes"), int) else "-"
         table.add_row(surface.url, surface.state, shape, size, str(details.get("name") or ""))
     if surfaces:

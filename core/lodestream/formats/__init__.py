@@ -44,7 +44,17 @@ from . import (
 )
 from .source import DEFAULT_MAX_VERTICES, Source
 
-__all__ = ["DEFAULT_MAX_VERTICES", "Format", "formats", "read", "sniff", "write", "write_stream"]
+__all__ = [
+    "DEFAULT_MAX_VERTICES",
+    "Format",
+    "check_blocks",
+    "for_writing",
+    "formats",
+    "read",
+    "sniff",
+    "write",
+    "write_stream",
+]
 
 #: Bytes at the start of a file that decide about its format.
 _HEAD = 4096
@@ -67,6 +77,8 @@ class Format:
         Takes a `Source`, gives a `Surface`; None where the format is only written.
     write : callable or None
         Takes a `Surface` and a binary file that need not be seekable; None where the format is only read.
+    blocks : bool
+        Whether several blocks can be written.
     options : mapping of str to str
         Options for reading, each with a line of help.
     more : str
@@ -83,6 +95,7 @@ class Format:
     sniff: Callable[[bytes, str], bool]
     read: Callable[[Source], Surface] | None = None
     write: Callable[[Surface, BinaryIO], None] | None = None
+    blocks: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
     more: str = ""
     named: Callable[[str], Mapping[str, str]] | None = None
@@ -106,21 +119,30 @@ _FORMATS = (
         geotiff.sniff,
         geotiff.read,
         geotiff.write,
-        geotiff.READ_OPTIONS,
+        options=geotiff.READ_OPTIONS,
         media_type="image/tiff",
     ),
     Format("netcdf", (".nc", ".nc4", ".cdf"), netcdf.sniff, netcdf.read, options=netcdf.READ_OPTIONS),
-    Format("png", (".png",), png.sniff, png.read, png.write, png.READ_OPTIONS, named=png.named, media_type="image/png"),
+    Format(
+        "png",
+        (".png",),
+        png.sniff,
+        png.read,
+        png.write,
+        options=png.READ_OPTIONS,
+        named=png.named,
+        media_type="image/png",
+    ),
     Format("esri-ascii", (".asc",), ascii_grid.sniff, ascii_grid.read),
     Format("usgs-dem", (".dem",), usgs_dem.sniff, usgs_dem.read),
     Format("srtm-hgt", (".hgt",), srtm_hgt.sniff, srtm_hgt.read, options=srtm_hgt.READ_OPTIONS, named=srtm_hgt.named),
-    Format("ply", (".ply",), ply.sniff, ply.read, ply_writer.write),
+    Format("ply", (".ply",), ply.sniff, ply.read, ply_writer.write, blocks=True),
     Format("off", (".off",), off.sniff, off.read),
-    Format("obj", (".obj",), obj.sniff, obj.read, obj_writer.write, media_type="model/obj"),
+    Format("obj", (".obj",), obj.sniff, obj.read, obj_writer.write, blocks=True, media_type="model/obj"),
     Format("pcd", (".pcd",), pcd.sniff, pcd.read),
     Format("vtk", (".vtk",), vtk_legacy.sniff, vtk_legacy.read, options=vtk_legacy.OPTIONS),
-    Format("vts", vtk_xml.SUFFIXES, vtk_xml.sniff, vtk_xml.read, vts_writer.write, vtk_xml.OPTIONS, vtk_xml.MORE),
-    Format("glb", (".glb",), glb.sniff, write=glb.write, media_type=glb.MEDIA_TYPE),
+    Format("vts", vtk_xml.SUFFIXES, vtk_xml.sniff, vtk_xml.read, vts_writer.write, True, vtk_xml.OPTIONS, vtk_xml.MORE),
+    Format("glb", (".glb",), glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
     Format("cgns", (".cgns",), cgns.sniff, cgns.read, options=cgns.OPTIONS),
     Format("bpt", (bezier.SUFFIX,), bezier.sniff, bezier.read, options=bezier.OPTIONS),
     Format("text", text_arrays.SUFFIXES, text_arrays.sniff, text_arrays.read, more=text_arrays.MORE),
@@ -240,6 +262,36 @@ def _closed(surface: Surface, closed: Closed) -> Surface:
     return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=surface.metadata)
 
 
+def check_blocks(format_: Format, count: int) -> None:
+    """Refuse to write so many blocks where the format holds but one.
+
+    Raises
+    ------
+    FormatError
+        Naming the formats that hold several.
+    """
+    if count > 1 and not format_.blocks:
+        several = [it.name for it in _FORMATS if it.write and it.blocks]
+        words = f"{', '.join(several[:-1])} and {several[-1]} hold several"
+        raise FormatError(f"expected one block for {format_.name}, got {count}: {words}")
+
+
+def for_writing(path: str | os.PathLike[str]) -> Format:
+    """The format that a file of this name is written in.
+
+    Raises
+    ------
+    OptionError
+        When no format that is written has this suffix; those that exist are named.
+    """
+    path = Path(path)
+    format_ = next((it for it in _FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
+    if format_ is None:
+        suffixes = ", ".join(suffix for it in _FORMATS if it.write for suffix in it.suffixes)
+        raise _named(OptionError(f"expected a name that ends in one of {suffixes}"), str(path))
+    return format_
+
+
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file, whose suffix names the format.
 
@@ -252,11 +304,7 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     FormatError
         When the format cannot hold this surface.
     """
-    path = Path(path)
-    format_ = next((it for it in _FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
-    if format_ is None:
-        suffixes = ", ".join(suffix for it in _FORMATS if it.write for suffix in it.suffixes)
-        raise _named(OptionError(f"expected a name that ends in one of {suffixes}"), str(path))
+    path, format_ = Path(path), for_writing(path)
     if path.exists() and not path.is_file():
         with path.open("wb") as file:  # a pipe or a device cannot be replaced by a file; a folder is refused here
             write_stream(surface, format_.name, file)
@@ -294,10 +342,13 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     FormatError
         When the format cannot hold this surface. Nothing has been written then.
     """
-    writers = {it.name: it.write for it in _FORMATS if it.write}
-    if format_name not in writers:
-        raise OptionError(f"expected a format that is written ({', '.join(writers)}), got {format_name!r}")
-    writers[format_name](restore(surface), file)
+    written = {it.name: it for it in _FORMATS if it.write}
+    if format_name not in written:
+        raise OptionError(f"expected a format that is written ({', '.join(written)}), got {format_name!r}")
+    format_ = written[format_name]
+    check_blocks(format_, len(surface.blocks))
+    assert format_.write is not None, "it is written"
+    format_.write(restore(surface), file)
 
 
 def _sniff(path: Path, suffix: str) -> Format:

@@ -25,8 +25,6 @@ def even_heights(surface: Surface, title: str) -> Surface:
     FormatError
         When it is none.
     """
-    if len(surface.blocks) != 1:
-        raise FormatError(f"expected one block for {title}, got {len(surface.blocks)}")
     if surface.points.ndim == 3:
         heights = to_heights(surface)
         if heights is None:

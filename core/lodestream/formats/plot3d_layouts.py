@@ -27,7 +27,7 @@ __all__ = ["OPTIONS", "Layout", "Numbers", "choices_of", "find_layout", "open_nu
 
 #: Options that decide where several layouts fit, with the values that they take and a line of help.
 OPTIONS: Mapping[str, tuple[Mapping[str, object], str]] = {
-    "precision": ({"single": 4, "double": 8}, "of a binary PLOT3D file: single or double"),
+    "reals": ({"single": 4, "double": 8}, "of a binary PLOT3D file: single or double"),
     "endian": ({"little": "<", "big": ">"}, "byte order of a binary PLOT3D file: little or big"),
     "records": ({"no": False, "yes": True}, "whether a binary PLOT3D file has Fortran's record markers: yes or no"),
     "blocks": (
@@ -45,7 +45,7 @@ _MAX_POINTS = 1 << 24
 _MARKER = 4
 
 #: Options that text has no use for.
-_BINARY = ("precision", "endian", "records")
+_BINARY = ("reals", "endian", "records")
 
 _KINDS = {"grid": "grid", "q": "Q", "function": "function"}
 
@@ -275,7 +275,7 @@ def _plausible(numbers: Numbers, kinds: Sequence[str], wanted: Mapping[str, obje
         if header is None:
             continue
         dims, variables = header
-        for precision, iblank in product(choices("precision"), choices("iblank") if kind == "grid" else [False]):
+        for precision, iblank in product(choices("reals"), choices("iblank") if kind == "grid" else [False]):
             yield Layout(kind, multi, dimensions, iblank, dims, variables, precision or 0, endian or "", bool(records))
 
 
