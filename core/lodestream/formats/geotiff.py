@@ -60,7 +60,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
         "dtype": bands[0].dtype,
         "nodata": nodata,
         "compress": "deflate",
-        "predictor": 3 if bands[0].dtype.kind == "f" else 2,
+        "predictor": 3 if bands[0].dtype.kind == "f" else 2 if bands[0].dtype.itemsize < 8 else 1,  # libtiff before 4.4
         "bigtiff": "if_safer",
     }
     if min(rows, columns) >= _TILE:
