@@ -90,7 +90,8 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
     "text named .tif": ("a.tif", lambda: b"not an image\n", FormatError, f"{ONE_OF} text that begins with 'not an im"),
     "OBJ named .tif": ("a.tif", lambda: b"v 0 0 0\nv 1 1 1\nl 1 2\n", FormatError, f"{ONE_OF} text that begins with"),
     "bytes": ("a.bin", lambda: b"\0\1\2\3\4\5\6\7\10", FormatError, f"{ONE_OF} bytes that begin with 00 01 02 03"),
-    "PNG": ("a.png", lambda: b"\x89PNG\r\n\x1a\n", FormatError, f"{ONE_OF} bytes that begin with 89 50 4e 47"),
+    "JPEG": ("a.png", lambda: b"\xff\xd8\xff\xe0", FormatError, f"{ONE_OF} bytes that begin with ff d8 ff e0"),
+    "PNG": ("a.png", lambda: b"\x89PNG\r\n\x1a\n", FormatError, "a PNG that begins with its header of 33 bytes, got 8"),
     "PLY": ("a.ply", lambda: b"ply\nformat ascii 1.0\n", FormatError, "a PLY header that ends with end_header within"),
     "binary named .obj": ("a.obj", lambda: b"v 0 0 0\n\0\0", FormatError, f"{ONE_OF} bytes that begin with"),
     # NPY
