@@ -26,6 +26,7 @@ def values_of(name: str) -> int:
 
 GROUPS = "grids have tiles in common from level L on, but the package begins one level later"
 PLACES = "x and y of coarser levels are those where nodes stand, but the package divides the span evenly"
+UNEVEN = ("plane-steps", "plane-centres", "plane-span", "plane-uneven")
 SEVERAL_GRIDS = ("blocks-", "cube-", "sphere-", "cylinder-disc", "cylinder-flap", "moebius")
 
 
@@ -39,7 +40,7 @@ def parameters(most: float = math.inf, levels: bool = False) -> list[Any]:
         marks = []
         if name.startswith(SEVERAL_GRIDS):
             marks.append(pytest.mark.xfail(reason=GROUPS, strict=True))
-        if levels and name in ("plane-steps", "plane-uneven"):
+        if levels and name in UNEVEN:
             marks.append(pytest.mark.xfail(reason=PLACES, strict=True))
         if values_of(name) < most:
             found.append(pytest.param(name, marks=marks))

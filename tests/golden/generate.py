@@ -79,7 +79,9 @@ def _cube_sphere(count: int) -> list[Floats]:
         (a, b, one),
         (b, a, -one),
     ]
-    return [np.round(np.stack(face, axis=-1) / np.sqrt(1 + a**2 + b**2)[..., None], 9) for face in faces]
+    patches = [np.round(np.stack(face, axis=-1) / np.sqrt(1 + a**2 + b**2)[..., None], 9) for face in faces]
+    patches[1], patches[4] = patches[1][::-1], patches[4].transpose(1, 0, 2)[:, ::-1]
+    return [np.ascontiguousarray(patch) for patch in patches]
 
 
 def _moebius(rows: int, columns: int) -> Floats:
@@ -108,6 +110,7 @@ def _simple() -> dict[str, Original]:
     rough = np.cumsum(np.cumsum(rng.normal(size=(33, 41)), 0), 1)
     attributes = np.concatenate([_torus(17, 20), rng.integers(0, 256, (17, 20, 2)).astype(np.float64)], axis=-1)
     hostile = np.array([[-0.0, 5e-324, 1.5], [1e30, -1e30, 2.0], [0.1, -7.0, np.pi]])
+    noise = np.random.default_rng(1).integers(0, 2**31, (2, 2))
     tower = np.zeros((9, 9), np.float32)
     tower[4, 4] = 1
     return {
@@ -119,6 +122,7 @@ def _simple() -> dict[str, Original]:
         "heights-decimal": Original(ls.Surface(np.round(wave * 50, 1))),
         "heights-float32": Original(ls.Surface(wave.astype(np.float32))),
         "heights-float64-hostile": Original(ls.Surface(hostile)),
+        "heights-noise": Original(ls.Surface(noise.astype(np.uint32).view(np.float32))),
         "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
         "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
         "heights-tower": Original(ls.Surface(tower)),
@@ -162,6 +166,17 @@ def _with_attributes() -> dict[str, Original]:
         "label": np.rint(40 * _wave(22, 31)).astype(np.int32) ** 3,
         "flow": _torus(22, 31)[..., :2].astype(np.float32),
     }
+    half = (np.exp2(12 * _wave(14, 19)) * rng.choice([-1, 1], (14, 19))).astype(np.float16)
+    half[2, 3:6] = np.inf, -np.inf, -0.0
+    wide: dict[str, NDArray[Any]] = {
+        "id": rng.integers(2**63 - 2**40, 2**63 + 2**40, (14, 19), np.uint64),
+        "noise": rng.integers(0, 2**62, (14, 19)).view(np.float64),
+        "half": half.astype(np.float32),
+        "cents": np.round(1e6 * _wave(14, 19), 4),
+        "pages": rng.integers(-(2**40), 2**40, (14, 19)) << 12,
+        "few": rng.integers(-3, 3, (14, 19, 1)).astype(np.int8),
+        "waves": np.round(1e-12 * _wave(14, 19), 14),
+    }
     points = _torus(22, 31).astype(np.float32)
     mask = np.ones((22, 31), bool)
     mask[10:15, 11:17] = False
@@ -171,6 +186,7 @@ def _with_attributes() -> dict[str, Original]:
     }
     return {
         "attributes-types": Original(ls.Surface(points, (True, False), mask=mask, attributes=attributes)),
+        "attributes-wide": Original(ls.Surface(np.rint(100 * _wave(14, 19)).astype(np.uint32) % 97, attributes=wide)),
         "attributes-precision": Original(
             ls.Surface(np.round(_wave(40, 33), 3), attributes=smooth), None, {"pressure": "0.5"}
         ),
@@ -195,6 +211,9 @@ def _planes() -> dict[str, Original]:
     }
     found = {name: np.stack([x, y, z], axis=-1) for name, (x, y) in grids.items()}
     found["plane-steps"][4:7, 20:25] = np.nan
+    x, y = 0.1 * (np.arange(65) + 0.5) - 17.3, np.linspace(7, -3.1, 33)
+    found["plane-centres"] = np.stack([*np.meshgrid(x, y), z], axis=-1)
+    found["plane-span"] = np.stack([*np.meshgrid(np.linspace(0.3, 2.9, 65), y), z], axis=-1)
     found["plane-uneven"] = found["plane-turned"][:29, :54]
     return {name: Original(ls.Surface(points), "1e-3d") for name, points in found.items()}
 
@@ -207,6 +226,9 @@ def _arrangements() -> dict[str, Original]:
     holes[0][-4:, 10:20] = np.nan
     holes[1][:6, 10:20] = np.nan
     bricks = [*_cut(_terrain(19, 49)[:10], [0, 9], [0, 16, 32, 48]), *_cut(_terrain(19, 49)[9:], [0, 9], [0, 22, 48])]
+    long = [block.astype(np.float32) for block in _cut(_terrain(290, 7), [0, 289], [0, 3, 6])]
+    masks = [np.ones((290, 4), bool), np.ones((290, 4), bool)]
+    masks[1][250:, 1:] = False
     whole = [np.rint(block * 40).astype(np.int32) for block in _cut(_terrain(30, 33), [0, 17, 29], [0, 14, 32])]
     ball = _sphere(17, 24)
     turns = 2 * np.pi * np.arange(22) / 22
@@ -220,7 +242,11 @@ def _arrangements() -> dict[str, Original]:
         "blocks-holes": Original(ls.Surface(blocks=wide)),
         "blocks-bricks": Original(_blocks(bricks)),
         "blocks-integers": Original(_blocks(whole)),
-        "cube-sphere": Original(_blocks([patch.astype(np.float32) for patch in _cube_sphere(14)])),
+        "blocks-windows": Original(
+            ls.Surface(blocks=[ls.Block(block, mask=mask) for block, mask in zip(long, masks, strict=True)])
+        ),
+        "cube-sphere": Original(_blocks([patch.astype(np.float32) for patch in _cube_sphere(17)])),
+        "cube-sphere-even": Original(_blocks(_cube_sphere(8))),
         "sphere-closed": Original(_blocks([ball], (False, True))),
         "sphere-seam": Original(_blocks([np.concatenate([ball, ball[:, :1]], axis=1)])),
         "sphere-halves": Original(_blocks(_cut(np.concatenate([ball, ball[:, :1]], axis=1), [0, 16], [0, 9, 24]))),

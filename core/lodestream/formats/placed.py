@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coordinate_rules import VALUES, fit_axis
+from ..coordinate_rules import VALUES, evaluate, fit_axis
 from ..errors import FormatError
-from ..heights import coordinates
 from ..seams import merge, unwrap, wrapped
 from ..surface import Closed, Surface
 from .longitudes import TURN, close_around, encircles
@@ -132,11 +131,11 @@ def _georeference(x: Coordinate, y: Coordinate, across: _Even, down: _Even) -> d
         rules["dtype"] = dtype.name
     if x.axis == 0:
         rules["rows"] = "x"
-    shape = (len(down.values), len(across.values)) if x.axis == 1 else (len(across.values), len(down.values))
-    centres = coordinates(Surface(np.zeros(shape, np.uint8), metadata=found))
-    for plane, even, axis in zip(centres, (across, down), (x.axis, y.axis), strict=True):
-        line = plane[0] if axis == 1 else plane[:, 0]
-        if line.tobytes() != even.values.astype(np.float64).tobytes():
+    for start, even, axis in ((0, across, x.axis), (3, down, y.axis)):
+        place, still = np.arange(len(even.values), dtype=np.float64), np.zeros((1, 1))
+        row, column = (place[:, None], still) if axis == 0 else (still, place[None, :])
+        centres = evaluate([*transform[start : start + 3], 0.5], row, column, False)
+        if centres.tobytes() != even.values.astype(np.float64).tobytes():
             found["axes"] = rules
     lows = [(channel, even.low) for channel, even in enumerate((across, down)) if even.low is not None]
     if lows:
