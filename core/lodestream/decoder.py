@@ -19,6 +19,7 @@ from .errors import CorruptStreamError, TruncatedStreamError
 from .reconstruction import Coded, Progress, Reconstruction
 from .selection import Wish, select
 from .surface import Surface
+from .tiles import UNANNOUNCED
 from .view import View
 
 __all__ = ["Decoder", "View", "decode"]
@@ -238,12 +239,25 @@ class Decoder:
         self.metadata = values
         self._values.update(values)
 
-    def _show(self, number: int, level: int, held: int, rms: float, max_error: float, complete: bool) -> None:
+    def _show(
+        self,
+        number: int,
+        level: int,
+        held: int,
+        rms: float,
+        max_error: float,
+        complete: bool,
+        whole_level: int = -1,
+    ) -> None:
         corrected = complete and self.header is not None and self.header.corrected
         whole = self.header is not None and (
             complete or (number == self.header.layer_count - 1 and level == self.header.levels)
         )
         length, state = self._reconstruction.length, self._progress.snapshot(whole)
+        if self.header is not None and whole_level >= 0:
+            # The index says that there is nothing more of these levels.
+            levels = state[: self.header.layout.tiles_of(whole_level).stop]
+            levels[levels == UNANNOUNCED] = 0
         if self.header is not None and self._wish.region is not None:
             # What lies outside has no part in the window.
             state[~self._wanted] = 0

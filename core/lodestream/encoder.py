@@ -282,14 +282,11 @@ class _Encoding:
 
     def _level_figures(self, last: Figures) -> list[Figures]:
         """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
-        passes = self._all_passes()
         canvases, start = self._canvases(), initial_state(self.header)
-        announced = np.where(passes > 0, 0, start).astype(np.int8)
         figures = []
         for level in range(self.layout.levels):
             state = start.copy()
-            known = slice(0, self.layout.tiles_of(level).stop)
-            state[known] = announced[known]
+            state[: self.layout.tiles_of(level).stop] = 0
             figures.append(self._figures(state, canvases))
         return [*figures, last]
 

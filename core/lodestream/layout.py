@@ -220,7 +220,8 @@ class Layout:
                     size = points
             groups = merged
             levels.append(groups)
-        return levels[::-1]
+        levels.append([])  # of level 0, whose only tile is everybody's
+        return levels[:0:-1]
 
     def _halves(self, grid: int, level: int) -> tuple[int, int]:
         """For each axis 1 if it steps from the level below to the one below that."""

@@ -142,9 +142,10 @@ class Reception:
     ) -> None:
         # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
         from .decoder import Decoder
+        from .selection import wish_of
 
         self.target = Target() if target is None else target
-        self.decoder: Decoder = Decoder()
+        self.decoder: Decoder = Decoder(wish_of(self.target))
         self.held = RangeSet() if store is None else store.ranges.copy()
         self.container = container
         self.size = size

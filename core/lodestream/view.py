@@ -135,7 +135,8 @@ class View:
             coarse = level_metadata(
                 {**values, **_plane(header)}, header.shape, surface.shape, header.closed, header.levels - level
             )
-            surface.metadata.update({key: coarse.pop(key) for key in _plane(header)})
+            if header.plane is not None:
+                surface.metadata.update({key: coarse.pop(key) for key in ("grid", "nodes") if key in coarse})
             values = coarse
         else:
             surface.metadata.update(_plane(header))

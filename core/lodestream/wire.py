@@ -32,7 +32,7 @@ from .messages import (
     Segments,
     Stop,
 )
-from .target import Target, Tolerance
+from .target import Region, Target, Tolerance
 
 __all__ = ["parse", "serialize"]
 
@@ -108,12 +108,35 @@ def _tolerance(value: Any) -> Tolerance:
     return Tolerance(_number(value[0]), value[1])
 
 
+def _region(value: Any) -> Region:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _MismatchError("[[first row, past the last], [first column, past the last]]")
+    spans = []
+    for span in value:
+        if not isinstance(span, list) or len(span) != 2:
+            raise _MismatchError("[[first row, past the last], [first column, past the last]]")
+        spans.append((_integer(span[0]), _integer(span[1])))
+    return spans[0], spans[1]
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise _MismatchError("a list of names")
+    return tuple(value)
+
+
+def _error(value: Any) -> float:
+    return math.nan if value is None else _number(value)
+
+
 _TARGET: Mapping[str, _Read] = {
     "level": _integer,
     "until_rms": _tolerance,
     "until_max": _tolerance,
     "max_bytes": _integer,
     "order": _text,
+    "region": _region,
+    "attributes": _names,
 }
 
 
@@ -144,7 +167,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
         "prefix": _flag,
     },
     Segments: {"offset": _integer, "data": _data},
-    Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _number, "max": _number},
+    Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _error, "max": _error},
     End: {"why": _text},
     Error: {"code": _text, "title": _text, "detail": _text},
 }
@@ -153,6 +176,8 @@ _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
 _OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "ticket")}
+#: What is left out where it is not known.
+_UNKNOWN = {(Layer, "rms"), (Layer, "max")}
 
 
 def serialize(event: Event) -> bytes:
@@ -222,6 +247,8 @@ def _values(kind: type[Event], fields: dict[str, Any]) -> dict[str, Any]:
     for name, read in _FIELDS[kind].items():
         if name in fields:
             values[name] = _value(f"{kind.type}.{name}", read, fields[name])
+        elif (kind, name) in _UNKNOWN:
+            values[name] = math.nan
         elif (kind, name) not in _OPTIONAL:
             raise MessageError("bad-message", f"expected {kind.type}.{name}, got {_show(list(fields))}")
     return values
@@ -240,7 +267,8 @@ def _plain(value: Any) -> Any:
         return {name: item for name, item in chosen.items() if item is not None}
     if isinstance(value, Tolerance):
         return [value.value, value.relative]
-    return value
+    # An error that is not known, of a window that is not complete.
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _show(value: Any) -> str:

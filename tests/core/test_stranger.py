@@ -24,32 +24,13 @@ def values_of(name: str) -> int:
     return sum(math.prod(array["shape"]) for array in arrays)
 
 
-GROUPS = "grids have tiles in common from level L on, but the package begins one level later"
-PLACES = "x and y of coarser levels are those where nodes stand, but the package divides the span evenly"
-UNEVEN = ("plane-steps", "plane-centres", "plane-span", "plane-uneven")
-SEVERAL_GRIDS = ("blocks-", "cube-", "sphere-", "cylinder-disc", "cylinder-flap", "moebius")
-
-
-def parameters(most: float = math.inf, levels: bool = False) -> list[Any]:
-    """Names of surfaces of fewer values, for tests of all that is shown or of levels.
-
-    Those that show where the package does not do yet what the page says are marked.
-    """
-    found = []
-    for name in EXPECTED:
-        marks = []
-        if name.startswith(SEVERAL_GRIDS):
-            marks.append(pytest.mark.xfail(reason=GROUPS, strict=True))
-        if levels and name in UNEVEN:
-            marks.append(pytest.mark.xfail(reason=PLACES, strict=True))
-        if values_of(name) < most:
-            found.append(pytest.param(name, marks=marks))
-    return found
+def parameters(most: float = math.inf) -> list[str]:
+    """Names of surfaces of fewer values."""
+    return [name for name in EXPECTED if values_of(name) < most]
 
 
 golden = pytest.mark.parametrize("name", parameters())
-golden_levels = pytest.mark.parametrize("name", parameters(levels=True))
-small_levels = pytest.mark.parametrize("name", parameters(AFFORDED, levels=True))
+small = pytest.mark.parametrize("name", parameters(AFFORDED))
 
 
 @functools.cache
@@ -121,7 +102,7 @@ def test_every_layer_gives_its_picture(name: str) -> None:
         assert (container.exactness.rms, container.exactness.maximum) == (expected[-1]["rms"], expected[-1]["max"])
 
 
-@golden_levels
+@golden
 def test_every_level_gives_its_grids(name: str) -> None:
     _, decoder = decoded(name)
     *coarser, finest = EXPECTED[name]["levels"]
@@ -142,13 +123,14 @@ def test_the_index_finds_every_segment_of_the_layers(name: str) -> None:
     assert index.pieces == ([] if container.exactness is None else container.exactness.pieces)
 
 
-@small_levels
+@small
 def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     index = index_of(name)
     entries = [entry for layer in index.entries for entry in layer]
     decoder = Decoder(decoded(name)[0])
     for level, wanted in enumerate(EXPECTED[name]["levels"][:-1]):
-        decoder.take(entry.take(file_of(name)) for entry in entries if decoder.units[entry.unit].level == level)
+        own = [entry for entry in entries if decoder.units[entry.unit].level == level]
+        decoder.take([entry.take(file_of(name)) for entry in own], level)
         assert digests(decoder.picture(level=level)) == wanted
 
 

@@ -270,9 +270,12 @@ def digest(arrays: Sequence[NDArray[Any]]) -> str:
     return digested.hexdigest()[:20]
 
 
-def digests(surface: ls.Surface) -> list[str]:
-    """Of each block, the digest of its points and then its attributes."""
-    return [digest([block.points, *block.attributes.values()]) for block in surface.blocks]
+def digests(surface: ls.Surface, heights: bool = False) -> list[str]:
+    """Of each block, the digest of its points (or of z alone, for ``heights``) and then its attributes."""
+    return [
+        digest([block.points[..., 2:] if heights else block.points, *block.attributes.values()])
+        for block in surface.blocks
+    ]
 
 
 def _kind(array: NDArray[Any]) -> dict[str, Any]:
@@ -306,7 +309,11 @@ def expectations(container: bytes) -> dict[str, Any]:
             }
             for view in decoder.layers
         ],
-        "levels": [digests(decoder.surface(level)) for level in range(header.levels + 1)],
+        # Where x and y are a rule, those of coarser levels are the receiver's to choose.
+        "levels": [
+            digests(decoder.surface(level), header.plane is not None and level < header.levels)
+            for level in range(header.levels + 1)
+        ],
     }
 
 

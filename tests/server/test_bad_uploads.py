@@ -32,8 +32,8 @@ def stored(data: Path) -> list[str]:
         (b"", "empty.npy", "0 bytes"),
         (b"just some text\n", "text.tif", "just some text"),
         (VRT, "raster.tif", "VRTDataset"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(50), "picture.png", "89 50 4e 47"),
-        (b"ply\nformat ascii 1.0\n", "mesh.ply", "written"),
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(50), "picture.png", "ff d8 ff e0"),
+        (b"glTF\x02\x00\x00\x00" + bytes(50), "mesh.glb", "written"),
         (bytes(100), "zeros", "00 00"),
     ],
 )
@@ -83,7 +83,7 @@ def bomb() -> bytes:
     [
         (npy(hills())[:200], "cut short"),
         (npy(np.zeros((1, 1))), "two points"),
-        (npy(np.full((4, 4), np.nan)), "NaN"),
+        (npy(np.full((4, 4), np.nan)), "one valid point"),
         (npy(np.array([["a", "b"], ["c", "d"]])), "strings"),
         (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "line 4"),
         (bomb(), "expected"),
@@ -107,7 +107,7 @@ def test_what_says_that_it_is_too_large_is_refused_before_it_is_read(server: str
     address = urlsplit(server)
     with socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as connection:
         # Not one byte of the body is sent: the answer comes by the header alone.
-        connection.sendall(b"POST /v1/surfaces HTTP/1.1\r\nHost: x\r\nContent-Length: 1048577\r\n\r\n")
+        connection.sendall(b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1048577\r\n\r\n")
         answer = b""
         # The server closes what it has not read to the end.
         while piece := connection.recv(65536):

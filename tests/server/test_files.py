@@ -139,7 +139,7 @@ def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any
         ("/levels/99", f"0 to {finest}"),
         ("/levels/-1", f"0 to {finest}"),
         ("/levels/x", "integer"),
-        ("/levels/1?format=glb", "npy, obj, ply"),
+        ("/levels/1?format=off", "to be one of npy, "),
     ):
         answer = http.get(surface["url"] + path)
         assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")

@@ -30,6 +30,7 @@ class Decoder:
         self.header: Header = container.header
         self.levels = Levels(self.header)
         self.units = units_of(self.header, self.levels)
+        self.named = -1  # the index names nothing more of the levels up to this one
         self.known = [self._remaining()]  # passes that remain of every unit, after 0, 1, 2, ... layers
         self.masks: Masks | None = None
         if container.masks is not None:
@@ -38,8 +39,9 @@ class Decoder:
     def _remaining(self) -> list[int]:
         return [unit.remaining for unit in self.units]
 
-    def take(self, segments: Iterable[Segment]) -> None:
-        """Decodes the segments of one layer, or of one level."""
+    def take(self, segments: Iterable[Segment], level: int = -1) -> None:
+        """Decodes the segments of one layer, or all those that the index names of one level."""
+        self.named = level
         for segment in segments:
             self.units[segment.unit].decode(segment.top, segment.passes, segment.data, 28 - self.header.fraction)
         self.known.append(self._remaining())
@@ -53,7 +55,7 @@ class Decoder:
                 remaining[number] == 0
                 or not unit.bands
                 or self.header.empty[channel] >> unit.level & 1
-                or (complete and remaining[number] < 0)
+                or (remaining[number] < 0 and (complete or unit.level <= self.named))
             )
             if unit.level and not is_known:
                 unknown = min(unknown, unit.level)
@@ -98,7 +100,7 @@ class Decoder:
         if self.masks is not None:
             valid = self.masks.masks[number][np.ix_(rows, columns)]
         points = list(channels[: header.points_channels])
-        if header.plane is not None:
+        if header.plane is not None and level in (None, self.levels.last):
             size = header.blocks[number].rows, header.blocks[number].columns
             for axis, rule in zip((0, 1), reversed(header.plane["grid"]), strict=True):
                 numbers = [plane_value(rule, axis, (row, column), size) for row in rows for column in columns]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import OptionError
-from lodestream.target import Target, Tolerance
+from lodestream.target import Region, Target, Tolerance
 
 from .. import addresses
 
@@ -237,6 +237,18 @@ def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, To
     return points, {str(name): tolerance for name, tolerance in found.items()}
 
 
+def _region(text: str) -> Region:
+    found = re.fullmatch(r"(\d+):(\d+),(\d+):(\d+)", text.replace(" ", ""))
+    if found is None:
+        raise argparse.ArgumentTypeError(f"expected rows and columns such as 0:100,200:300, got {text!r}")
+    top, bottom, left, right = map(int, found.groups())
+    return (top, bottom), (left, right)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def add_target_options(parser: argparse.ArgumentParser) -> None:
     """Add what says where to stop and in which order."""
     group = parser.add_argument_group(
@@ -248,6 +260,18 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--until-max", type=parse_tolerance, metavar="E", help="stop at a maximum error of E")
     group.add_argument("--max-bytes", type=parse_size, metavar="N", help="stop before more than N bytes of the surface")
     group.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds")
+    group.add_argument(
+        "--roi",
+        type=_region,
+        metavar="R0:R1,C0:C1",
+        help="only this window: rows and columns of the whole surface, half-open; OUT is that window",
+    )
+    group.add_argument(
+        "--attributes",
+        type=_names,
+        metavar="NAMES",
+        help="only these attributes beside the points, by their names with commas between them; none: no attribute",
+    )
     group.add_argument(
         "--order",
         choices=("quality", "level"),
@@ -266,6 +290,8 @@ def target_of(args: argparse.Namespace) -> Target:
             max_bytes=args.max_bytes,
             seconds=args.seconds,
             order=args.order,
+            region=args.roi,
+            attributes=args.attributes,
         )
     except OptionError as error:
         args.parser.error(str(error))

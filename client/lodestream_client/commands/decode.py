@@ -91,8 +91,9 @@ class _Job:
         self, file: BinaryIO, out: str, target: Target, started: float, progress: Callable[[float], None]
     ) -> None:
         from lodestream.decoder import Decoder
+        from lodestream.selection import wish_of
 
-        self.decoder: Decoder = Decoder()
+        self.decoder: Decoder = Decoder(wish_of(target))
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
         self.read_bytes = 0

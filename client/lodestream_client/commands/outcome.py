@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,8 +98,8 @@ class Outcome:
                     "bytes": self.bytes,
                     "wire_bytes": self.wire_bytes,
                     "level": self.level,
-                    "rms": self.rms,
-                    "max": self.max_error,
+                    "rms": None if math.isnan(self.rms) else self.rms,
+                    "max": None if math.isnan(self.max_error) else self.max_error,
                     "seconds": round(self.seconds, 6),
                     "ended": self.ended,
                 }

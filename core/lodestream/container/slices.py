@@ -13,8 +13,8 @@ from .model import Index, Piece, Segment
 
 __all__ = ["Slices"]
 
-#: number, level, bytes, rms, max_error, complete: what a view is made of.
-State = tuple[int, int, int, float, float, bool]
+#: number, level, bytes, rms, max_error, complete: what a view is made of; and the level that is whole, or -1.
+State = tuple[int, int, int, float, float, bool, int]
 
 
 class Slices:
@@ -120,11 +120,11 @@ class Slices:
             last = layer == len(self._index.layers) - 1
             if last and not self._pieces:
                 return self._end(layer)
-            return layer, self._layer_level[layer], self._bytes, *self._figures(record.rms, record.max_error), False
+            return layer, self._layer_level[layer], self._bytes, *self._figures(record.rms, record.max_error), False, -1
         level = self._by_level.whole(self._held)
         if level is not None and level < self._index.header.levels:
             figures = self._index.levels[level]
-            return level, level, self._bytes, *self._figures(figures.rms, figures.max_error), False
+            return level, level, self._bytes, *self._figures(figures.rms, figures.max_error), False, level
         return None
 
     def _figures(self, rms: float, max_error: float) -> tuple[float, float]:
@@ -132,7 +132,7 @@ class Slices:
 
     def _end(self, number: int) -> State:
         last = self._index.levels[-1]
-        return number, last.level, self._bytes, last.rms, last.max_error, True
+        return number, last.level, self._bytes, last.rms, last.max_error, True, -1
 
     def hold_piece(self, piece: Piece) -> State | None:
         """Note a piece of exactness; the complete state, if everything is there."""
