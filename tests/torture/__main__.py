@@ -1,7 +1,7 @@
 """``make torture``: what takes too long for every run of the tests, and the page that says what it did.
 
-Without names every part runs, and docs/reliability.md is written. ``--seconds`` is the most that each part may take
-which can be cut short; it then says how far it came. ``--count`` makes each part that many times as large.
+Without names every part runs, and docs/reliability.md is written. ``--seconds 300 fuzz=600`` is the most that each part
+may take which can be cut short; it then says how far it came. ``--count`` makes each part that many times as large.
 """
 
 from __future__ import annotations
@@ -28,7 +28,14 @@ def main() -> int:
     """Run the parts; 1 when one of them failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.torture", description=__doc__)
     parser.add_argument("part", nargs="*", help=f"of {', '.join(PARTS)}; all when none is named")
-    parser.add_argument("--seconds", type=float, help="the most that a part may take which can be cut short")
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=_limit,
+        nargs="+",
+        default=[],
+        help="the most that a part may take which can be cut short: of all parts, or PART=S of one",
+    )
     parser.add_argument("--count", type=float, default=1.0, help="how many times the usual counts (default: 1)")
     parser.add_argument(
         "--page", type=Path, help="where to write the page (default: docs/reliability.md, for all parts)"
@@ -37,13 +44,14 @@ def main() -> int:
     unknown = sorted(set(args.part) - PARTS.keys())
     if unknown:
         parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(unknown)}")
+    limits = dict(args.seconds)
     machine = _machine()
     print("\n".join(machine), flush=True)
     _warm()
     results, started = [], time.monotonic()
     for name, part in PARTS.items():
         if not args.part or name in args.part:
-            result = part.run(max(1, int(part.count * args.count)), args.seconds)
+            result = part.run(max(1, int(part.count * args.count)), limits.get(name, limits.get("")))
             results.append(result)
             print("\n" + "\n".join(_lines(result)), flush=True)
     total = f"All together: {_duration(time.monotonic() - started)}."
@@ -56,6 +64,13 @@ def main() -> int:
         before = page.read_text().partition(_MARK)[0] if page.exists() else ""
         page.write_text(before + _MARK + "\n".join(lines) + "\n")
     return 1 if any(result.failure for result in results) else 0
+
+
+def _limit(text: str) -> tuple[str, float]:
+    name, _, seconds = text.rpartition("=")
+    if name and name not in PARTS:
+        raise argparse.ArgumentTypeError(f"expected a part of {', '.join(PARTS)}, got {name}")
+    return name, float(seconds)
 
 
 def _warm() -> None:
