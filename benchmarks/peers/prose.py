@@ -33,7 +33,10 @@ SPEED = """
 MB are those of the samples as float32, whatever their type; geometric means over the surfaces, without the tiny ones;
 one core. *At 1e-4*: the setting whose RMS error is nearest, where one is within a factor of 3; for streams of layers or
 prefixes encoding is that of the whole stream. Ours is the exact stream: encoding measures the errors of every layer
-and level, decoding at 1e-4 is that of a prefix. Times are the best of three where they are short, else single."""
+and level, decoding at 1e-4 is that of a prefix. Times are the best of three where they are short, else single. A
+coder is measured again only where it changed, and this machine is shared: ours was last measured at another hour than
+most peers, with two to four times as many busy processes as cores, so our speeds are lower here than on an idle machine
+(those of [measurements.md](measurements.md) are of one run). Bytes and memory know nothing of that."""
 
 MEMORY = """
 Peak above what the process held with the surface loaded, largest over the settings, as a multiple of the samples as

@@ -8,7 +8,7 @@ __all__ = ["REMARKS", "remark_of"]
 
 REMARKS: dict[str, str] = {
     "few bytes": """\
-Less than 4 KB in all, of which header, index of tiles and frames of layers are a good part. Tried: layers only
+Less than 4 KB in all, of which the header and the frames of layers are a good part. Tried: layers only
 where they are worth their frame (kept), shorter headers (kept), trained contexts (kept). Starting every tile with
 its own final model, the best that any initial table could be, would save 1 to 2 % here; showing insignificant
 coefficients by linear prediction lowers the RMS by 0.5 to 2 %. SPERR's 9/7 filters are longer than those of the
@@ -25,6 +25,10 @@ as coarse as the error); signed sums of neighbours as contexts (+0.3 %); finer c
 band (+0.1 %); the ring mixed in for higher planes (-0.1 %, a tenth slower); other rates of learning (within 0.05
 %); surer probabilities (-0.03 %); another lifting step within bands against what is left of correlation (1 to 5 %
 worse at medium rates, nothing at the end).""",
+    "terraces": """\
+A map of heights in 8 bits that are 153 of the 256 values, where two neighbours in three are equal: the peer's tree of
+predictors says so exactly, while the optimal hierarchy spreads each edge of a terrace over its levels. Finer classes of
+contexts (as above) gain nothing here either; a precision is no help below the values' own step.""",
     "transforms": """\
 The peer is a wavelet coder with longer filters (9/7) and its rates are chosen after coding. Tried: layers that end
 where the error has just fallen (kept, up to 6 %); weights of bands other than the norms of their synthesis (no
@@ -41,6 +45,7 @@ white noise into noise that is not quite white. Tried: storing values rather tha
 there are interpolated between two of its settings that are a factor of ten apart.""",
 }
 
+_TERRACES = ("gcanyon_elev_crop.bw.png",)
 _WAVELETS = ("JPEG 2000", "SPERR", "HTJ2K", "PyWavelets")
 
 
@@ -50,6 +55,8 @@ def remark_of(group: str, kind: str, cell: Cell) -> str:
         return group
     if kind == "max":
         return "maximum"
+    if cell.surface in _TERRACES:
+        return "terraces"
     if cell.peer_bytes < SMALL:
         return "few bytes"
     return "transforms" if cell.peer.startswith(_WAVELETS) else "quantised values"
