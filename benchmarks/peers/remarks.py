@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .curves import SMALL, Cell
 
-__all__ = ["REMARKS", "remark_of"]
+__all__ = ["REMARKS", "TERRACES", "remark_of"]
 
 REMARKS: dict[str, str] = {
     "few bytes": """\
@@ -45,7 +45,7 @@ white noise into noise that is not quite white. Tried: storing values rather tha
 there are interpolated between two of its settings that are a factor of ten apart.""",
 }
 
-_TERRACES = ("gcanyon_elev_crop.bw.png",)
+TERRACES = ("gcanyon_elev_crop.bw.png",)
 _WAVELETS = ("JPEG 2000", "SPERR", "HTJ2K", "PyWavelets")
 
 
@@ -55,7 +55,7 @@ def remark_of(group: str, kind: str, cell: Cell) -> str:
         return group
     if kind == "max":
         return "maximum"
-    if cell.surface in _TERRACES:
+    if cell.surface in TERRACES:
         return "terraces"
     if cell.peer_bytes < SMALL:
         return "few bytes"

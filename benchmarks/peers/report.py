@@ -14,7 +14,7 @@ from . import figures
 from .curves import Cell, Results, geometric_mean
 from .prose import GATES, LOSSLESS, MEMORY, RULES, SPEED
 from .registry import OURS, PEERS
-from .remarks import REMARKS, remark_of
+from .remarks import REMARKS, TERRACES, remark_of
 from .speed import memory_table, speed_table
 from .surfaces import GROUPS
 from .trial import TARGETS
@@ -129,6 +129,20 @@ def _summary(results: Results, kind: str) -> Iterator[str]:
     yield from _table(head, rows)
     if kind == "rms":
         yield "\n" + GATES
+        yield from _without_terraces(results)
+
+
+def _without_terraces(results: Results) -> Iterator[str]:
+    """What one surface of another kind does to the means."""
+    names = [name for name in results.group("rough terrain") if name not in TERRACES]
+    if len(names) == len(results.group("rough terrain")):
+        return
+    cells = [cell for cell in results.cells(names, "rms") if cell.counts]
+    at = [[cell for cell in cells if cell.target == target] for target in TARGETS]
+    best = ", ".join(_number(geometric_mean([cell.ratio for cell in some])) for some in at)
+    alone = ", ".join(_number(geometric_mean([cell.exact_ratio for cell in some])) for some in at)
+    yield f"\nRough terrain without {', '.join(TERRACES)} (terraces, see the cells that lose): means of"
+    yield f"{best} at the best setting, of {alone} with one exact stream."
 
 
 def _cells(cells: Sequence[Cell]) -> Iterator[str]:
@@ -154,7 +168,10 @@ def _cells(cells: Sequence[Cell]) -> Iterator[str]:
 def _lossless(results: Results) -> Iterator[str]:
     gates = ("JPEG XL, effort 9", "pcodec", "SZ3")
     rows: list[list[str]] = []
-    ratios: dict[str, dict[str, list[float]]] = {"heights of 16 bits": {}, "float32 x, y, z": {}}
+    ratios: dict[str, dict[str, list[float]]] = {}
+    without = f"the same heights without {', '.join(TERRACES)}"
+    for kind in ("heights of at most 16 bits", without, "float32 x, y, z"):
+        ratios[kind] = {}
     for name, facts in results.surfaces.items():
         ours = results.lossless(name, OURS)
         if ours is None:
@@ -166,11 +183,13 @@ def _lossless(results: Results) -> Iterator[str]:
             ratio = ours["bytes"] / found[peer] if peer in found else math.nan
             cells += [f"{found[peer]:,}" if peer in found else "-", _bold(ratio, 1.0)]
             xyz = facts["shape"][2:] == [3]
-            kind = "float32 x, y, z" if xyz else "heights of 16 bits"
+            kind = "float32 x, y, z" if xyz else "heights of at most 16 bits"
             fits = facts["dtype"] == "float32" if xyz else _sixteen_bits(results, name)
             counted = facts["group"] != "tiny" and fits
             if counted and not math.isnan(ratio):
                 ratios[kind].setdefault(peer, []).append(ratio)
+                if name not in TERRACES and not xyz:
+                    ratios[without].setdefault(peer, []).append(ratio)
         last = [best, f"{found[best]:,}", _bold(ours["bytes"] / found[best], 1.0)] if best else ["-", "-", ""]
         rows.append([name, f"{ours['bytes']:,}", f"{ours['file']:,}", *cells, *last])
     head = [
