@@ -64,8 +64,8 @@ def load() -> tuple[Array, ...]:
 
 
 @functools.cache
-def fractal(side: int = 4097) -> NDArray[np.float64]:
-    """Terrain-like heights of any size, whole numbers of 16 bits: octaves of noise, each of half the height."""
+def fractal(side: int = 4097, share: float = 0.5) -> NDArray[np.float64]:
+    """Terrain-like heights of any size, whole numbers of 16 bits: octaves of noise, each of a share of the height."""
     rng = np.random.default_rng(2002)
     heights = np.zeros((2, 2))
     amplitude = 1.0
@@ -75,7 +75,7 @@ def fractal(side: int = 4097) -> NDArray[np.float64]:
         finer[1::2, ::2] = (heights[:-1] + heights[1:]) / 2
         finer[:, 1::2] = (finer[:, :-1:2] + finer[:, 2::2]) / 2
         heights = finer + amplitude * rng.standard_normal(finer.shape)
-        amplitude /= 2
+        amplitude *= share
     heights = heights[:side, :side] - heights[:side, :side].min()
     scaled: NDArray[np.float64] = np.rint(heights * (65535 / heights.max()))
     return scaled

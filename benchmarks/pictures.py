@@ -46,7 +46,7 @@ class Subject:
     axes: tuple[int, int, int]
     camera: tuple[float, float, float]
     until: tuple[float, float]
-    options: dict[str, str]
+    options: dict[str, Any]
 
 
 SUBJECTS = (
