@@ -124,7 +124,7 @@ def _prefixes() -> None:
             for inverse in inverses:
                 inverse()
 
-        seconds = medians({"prefix": partial(_decode, prefix), "inverse": alone})
+        seconds = medians({"prefix": partial(_decode, prefix), "inverse": alone}, rounds=21)
         spent, least = seconds["prefix"], seconds["inverse"]
         cells = [f"{mark.bytes:,}", f"{mark.rms / array.extent:.1e}", f"{1e3 * spent:.1f}", f"{1e3 * least:.1f}"]
         rows.append([array.name, *cells, f"{spent / least:.2f}"])

@@ -10,7 +10,7 @@ __all__ = ["medians", "memory", "note", "table"]
 
 
 def medians(work: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, float]:
-    """Median seconds of each piece of work.
+    """Median seconds of each piece of work, of this process's processor: others that share it do not count.
 
     Every piece runs once untimed (compilation, first touch of memory) and then once in each round, so that a machine
     that slows down for a while slows all of them down, and their ratios stay what they are.
@@ -20,9 +20,9 @@ def medians(work: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[s
     seconds: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(rounds):
         for name, run in work.items():
-            start = time.perf_counter()
+            start = time.process_time()
             run()
-            seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(time.process_time() - start)
     return {name: statistics.median(times) for name, times in seconds.items()}
 
 
