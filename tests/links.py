@@ -54,6 +54,8 @@ class Link:
 
     Attributes
     ----------
+    url : str
+        The address given, by way of this link.
     connections : int
         How many there were.
     down : int
@@ -64,11 +66,14 @@ class Link:
         self._parts = urlsplit(url)
         self._fault = fault
         self._tasks: set[asyncio.Task[None]] = set()
+        self.url = url
         self.connections = 0
         self.down = 0
 
     async def __aenter__(self) -> Link:
         self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        port = self._server.sockets[0].getsockname()[1]
+        self.url = urlunsplit(self._parts._replace(netloc=f"127.0.0.1:{port}"))
         return self
 
     async def __aexit__(self, *raised: object) -> None:
@@ -77,12 +82,6 @@ class Link:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-    @property
-    def url(self) -> str:
-        """The address given, by way of this link."""
-        port = self._server.sockets[0].getsockname()[1]
-        return urlunsplit(self._parts._replace(netloc=f"127.0.0.1:{port}"))
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()

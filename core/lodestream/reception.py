@@ -294,7 +294,9 @@ class Reception:
             self._order = deque(gap for place in (*before, *surface, *after) for gap in self._fed.missing(*place))
 
     def _count(self, offset: int, length: int) -> None:
-        """Add to `received` what of a range belongs to the surface."""
+        """Add to `received` what of a range belongs to the surface, once that is known."""
+        if self.planned is None:
+            return
         if self._surface is not None:
             belongs = self._surface.overlap(offset, length)
         else:

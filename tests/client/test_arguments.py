@@ -6,7 +6,7 @@ import pytest
 
 from lodestream.errors import OptionError
 from lodestream_client import addresses, pacing
-from lodestream_client.commands import arguments
+from lodestream_client.commands import arguments, output
 
 
 @pytest.mark.parametrize(
@@ -74,3 +74,52 @@ def test_a_link_delays_each_message_by_its_length() -> None:
 @pytest.mark.parametrize(("rate", "window"), [(100.0, 1024), (8000.0, 2000), (125_000.0, 31_250), (1e9, 256 * 1024)])
 def test_the_window_follows_the_rate(rate: float, window: int) -> None:
     assert pacing.window_for(rate) == window
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.2, "1 s left"), (59.0, "59 s left"), (61.0, "1:01 left"), (3599.0, "59:59 left"), (7500.0, "2:05 h left")],
+)
+def test_how_long_is_left_is_told_in_words(seconds: float, words: str) -> None:
+    assert output.human_time(seconds) == words
+
+
+def test_the_bar_knows_how_long_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    with output.progress_bar() as bar:
+        monkeypatch.setattr(bar, "get_time", lambda: now[0])
+        for limit, expected in ((None, "8 s left"), (5.0, "3 s left")):
+            now[0] = 0.0
+            task = bar.add_task("pulling", total=1000, figures="", limit=limit)
+            for second in (1.0, 2.0):
+                now[0] = second
+                bar.update(task, completed=int(100 * second))
+            shown = bar.columns[-1]
+            bar.tasks[-1].__dict__["_get_time"] = lambda: now[0]
+            assert not isinstance(shown, str)
+            assert str(shown(bar.tasks[-1])) == expected
+
+
+@pytest.mark.parametrize(
+    "url", ["http://host/a.lode", "http://host/v1/containers/ab.lode", "https://host/x/a.lode?key=1", "http://host/a"]
+)
+def test_a_file_on_any_server_can_be_pulled(url: str) -> None:
+    assert addresses.source_url(url) == addresses.container_url(url) == url
+    assert not addresses.is_surface(url)
+
+
+def test_a_surface_can_be_pulled_too() -> None:
+    url = "http://host/maps/v1/surfaces/ab"
+    assert addresses.source_url(f"{url}/?x=1") == url
+    assert addresses.is_surface(url)
+    assert addresses.container_url(url) == f"{url}/container"
+    assert addresses.same_origin(url, "http://host/other")
+    assert not addresses.same_origin(url, "https://host/other")
+
+
+@pytest.mark.parametrize(
+    "url", ["http://host", "http://host/", "http://host/v1/surfaces", "host/a.lode", "file:///a.lode"]
+)
+def test_what_cannot_be_pulled(url: str) -> None:
+    with pytest.raises(OptionError, match="expected"):
+        addresses.source_url(url)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -238,3 +239,14 @@ def test_a_level_that_does_not_exist(surface: str) -> None:
         sync.connect(surface, target=ls.Target(level=99)) as stream,
     ):
         next(stream)
+
+
+def test_the_client_of_the_manual_works(surface: str, terrain: Terrain) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+    code = page.partition("## A client in Python")[2].partition("```python\n")[2].partition("```")[0]
+    host, _, name = surface.removeprefix("http://").partition("/v1/surfaces/")
+    names: dict[str, Any] = {"host": host, "id": name}
+    exec(compile(code.replace("max_bytes=20_000", "max_bytes=9_000"), "docs/protocol.md", "exec"), names)
+    assert names["reception"].ended == "bytes"
+    assert names["surface"].points.shape == terrain.shape
+    assert names["reception"].decoder.rms == pytest.approx(rms(names["surface"].points, terrain), rel=1e-9)

@@ -383,3 +383,73 @@ def test_an_ended_download_gives_ended_last(url: str) -> None:
                 stream.socket.send(message)
             events += driver.receive(stream.socket.recv(timeout=PATIENCE, decode=False))
     assert events[-1] == Ended("level")
+
+
+def test_what_a_client_holds_is_not_sent_again(url: str, surface: dict[str, Any], http: httpx.Client) -> None:
+    container = http.get(f"{surface['url']}/container", follow_redirects=True).content
+    held = ((0, 1000), (1500, 20_000), (len(container) - 40, 40), (500, 700))
+    with raw_stream(url) as stream:
+        stream.send(Open(held=held, container=surface["container"]))
+        events: list[Event] = []
+        while not events or not isinstance(events[-1], End):
+            events.append(stream.receive())
+            if isinstance(events[-1], Segments):
+                stream.send(Credit(len(events[-1].data)))
+        stream.send(Bye())
+        closed(stream, 1000)
+    header = events[0]
+    assert isinstance(header, Header)
+    assert header.planned == surface["levels"][-1]["bytes"], "held or not"
+    slices = [event for event in events if isinstance(event, Segments)]
+    assert [slices[0].offset, len(slices[0].data)] == [1200, 300]
+    assert slices[1].offset == 21_500
+    assert all(container[event.offset :].startswith(event.data) for event in slices)
+    assert data_of(events) == header.planned - 21_200 + surface_tail(header)
+    told = [event.bytes for event in events if isinstance(event, Layer)]
+    assert told == [layer["bytes"] for layer in surface["layers"] if layer["bytes"] > 1200]
+
+
+def surface_tail(header: Header) -> int:
+    """Bytes that are sent beside the surface."""
+    assert header.prefix
+    return header.metadata[1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "words"),
+    [
+        ({"held": [[0, 10]]}, "bad-held", "open.container"),
+        ({"held": [[0, 10**12]], "container": True}, "bad-held", "to byte 1000000000000"),
+        ({"held": [[2 * n, 1] for n in range(4097)], "container": True}, "bad-held", "at most 4096 ranges, got 4097"),
+        ({"held": [[0, 10]], "container": "0" * 64}, "other-container", "expected container"),
+        ({"container": "0" * 64}, "other-container", "expected container"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(
+    url: str, surface: dict[str, Any], changes: dict[str, Any], code: str, words: str
+) -> None:
+    fields = {"type": "open", "version": 1, "credit": 1000, **changes}
+    if fields.get("container") is True:
+        fields["container"] = surface["container"]
+    with raw_stream(url) as stream:
+        stream.socket.send(msgpack.packb(fields))
+        event = stream.receive()
+        assert isinstance(event, Error)
+        assert event.code == code
+        assert words in event.detail
+        assert closed(stream, CODES[code].close).startswith(code)
+
+
+def test_a_message_takes_a_quarter_of_the_credit(url: str) -> None:
+    with raw_stream(url) as stream:
+        stream.send(Open(credit=64 * 1024))
+        received, left = [], 64 * 1024
+        while left:
+            event = stream.receive()
+            if isinstance(event, Segments):
+                assert len(event.data) <= max(left // 4, 4096)
+                left -= len(event.data)
+                received.append(len(event.data))
+        stream.send(Stop())
+        assert data_of(stream.until_end()) == 0
+    assert len(received) >= 8

@@ -83,8 +83,8 @@ class Report:
 
 
 def terrain() -> NDArray[np.float32]:
-    """A surface of some 4 KB."""
-    rows, columns = np.mgrid[0:41, 0:37]
+    """A surface of some 3 KB."""
+    rows, columns = np.mgrid[0:31, 0:27]
     noise = np.random.default_rng(11).normal(size=rows.shape)
     return np.asarray(90 * np.sin(rows / 9) * np.cos(columns / 13) + noise, np.float32)
 

@@ -1,0 +1,155 @@
+"""Which address is tried next, by which road, and after how long."""
+
+from __future__ import annotations
+
+import pytest
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidHandshake, InvalidStatus
+from websockets.http11 import Response
+
+import lodestream as ls
+from lodestream.errors import LodestreamError, RemoteError
+from lodestream_client import roads
+from lodestream_client.errors import SilenceError, UnreachableError
+from lodestream_client.roads import Roads, Transport
+
+ONE, TWO, FILE = "http://one/v1/surfaces/ab", "http://two/v1/surfaces/ab", "http://three/ab.lode"
+LOST = UnreachableError("no connection")
+
+
+def caused(error: LodestreamError, cause: Exception) -> LodestreamError:
+    error.__cause__ = cause
+    return error
+
+
+def refused(status: int, body: bytes) -> LodestreamError:
+    response = Response(status, "No", Headers(), body)
+    return caused(RemoteError(f"http-{status}", "no"), InvalidStatus(response))
+
+
+@pytest.fixture(autouse=True)
+def without_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(roads, "_WAIT", lambda state: 0.1 * 2**state.attempt_number)
+
+
+def road(made: Roads) -> str:
+    return made.place.road
+
+
+def met(*urls: str, deadline: float = 60.0) -> Roads:
+    made = Roads(urls, "auto", deadline)
+    made.met = True
+    made.progress(0.0)
+    return made
+
+
+def test_waits_grow_until_something_comes() -> None:
+    made = met(ONE)
+    assert [made.failed(LOST, 0.0, progressed=False) for _ in range(3)] == [0.2, 0.4, 0.8]
+    made.progress(5.0)
+    assert made.failed(LOST, 5.0, progressed=True) == 0.2
+
+
+def test_addresses_take_turns() -> None:
+    made = met(ONE, TWO, FILE)
+    seen = []
+    for _ in range(4):
+        seen.append(made.place.url)
+        made.failed(LOST, 0.0, progressed=True)
+    assert seen == [ONE, TWO, FILE, ONE]
+
+
+def test_a_road_that_leads_nowhere_is_left_for_the_other() -> None:
+    made = met(ONE)
+    made.failed(LOST, 0.0, progressed=True)
+    assert road(made) == "ws"
+    made.failed(SilenceError("nothing"), 0.0, progressed=False)
+    assert road(made) == "http"
+    made.failed(LOST, 0.0, progressed=False)
+    assert road(made) == "ws"
+
+
+def test_only_the_roads_that_are_allowed() -> None:
+    only: tuple[Transport, ...] = ("ws", "http")
+    for transport in only:
+        made = Roads([ONE], transport, 60.0)
+        made.met = True
+        for _ in range(3):
+            assert road(made) == transport
+            made.failed(LOST, 0.0, progressed=False)
+    made = Roads([FILE], "auto", 60.0)
+    assert road(made) == "http"
+
+
+def test_the_deadline_counts_from_the_last_byte() -> None:
+    made = met(ONE, deadline=10.0)
+    assert made.failed(LOST, 9.0, progressed=False) > 0
+    with pytest.raises(UnreachableError):
+        made.failed(LOST, 9.9, progressed=False)
+    made.progress(20.0)
+    assert made.failed(LOST, 29.0, progressed=False) > 0
+
+
+@pytest.mark.parametrize("body", [b"", b"<html>", b"[]"])
+def test_a_proxy_that_refuses_sockets_is_gone_around_at_once(body: bytes) -> None:
+    made = Roads([ONE], "auto", 60.0)
+    assert made.failed(refused(501, body), 0.0, progressed=False) == 0
+    assert road(made) == "http"
+    with pytest.raises(RemoteError, match=r"gone wrong \(and by WebSocket: no\)"):
+        made.failed(RemoteError("odd", "gone wrong"), 0.0, progressed=False)
+
+
+def test_what_the_server_itself_says_is_final() -> None:
+    made = Roads([ONE], "auto", 60.0)
+    with pytest.raises(RemoteError):
+        made.failed(refused(403, b'{"code": "bad-token"}'), 0.0, progressed=False)
+    made = met(ONE)
+    with pytest.raises(ls.NotFoundError):
+        made.failed(ls.NotFoundError("gone"), 0.0, progressed=False)
+
+
+def test_a_handshake_that_breaks_tells_nothing_once_another_did_not() -> None:
+    broken = caused(ls.RemoteError("x", "broke"), caused_by_end())
+    made = met(ONE)
+    made.failed(caused(UnreachableError("broke"), caused_by_end()), 0.0, progressed=True)
+    assert road(made) == "ws"
+    made = Roads([ONE], "auto", 60.0)
+    assert made.failed(broken, 0.0, progressed=False) == 0
+    assert road(made) == "http"
+
+
+def caused_by_end() -> Exception:
+    error = InvalidHandshake("no answer")
+    error.__cause__ = EOFError()
+    return error
+
+
+def test_before_anybody_answered_there_are_three_attempts() -> None:
+    made = Roads([ONE], "ws", 60.0)
+    made.progress(0.0)
+    made.failed(LOST, 0.0, progressed=False)
+    made.failed(LOST, 0.0, progressed=False)
+    with pytest.raises(UnreachableError):
+        made.failed(LOST, 0.0, progressed=False)
+
+
+def test_another_address_may_have_what_one_has_not() -> None:
+    made = Roads([ONE, TWO], "ws", 60.0)
+    assert made.failed(ls.NotFoundError("not here"), 0.0, progressed=False) == 0
+    assert made.place.url == TWO
+    with pytest.raises(ls.NotFoundError):
+        made.failed(ls.NotFoundError("nor here"), 0.0, progressed=False)
+    made = Roads([ONE, TWO], "ws", 60.0)
+    with pytest.raises(ls.OptionError):
+        made.failed(ls.OptionError("no such level"), 0.0, progressed=False)
+
+
+@pytest.mark.parametrize("code", ["restarting", "idle", "busy", "too-many", "internal", "http-502", "http-503"])
+def test_what_may_pass(code: str) -> None:
+    assert met(ONE).failed(RemoteError(code, "later"), 0.0, progressed=False) > 0
+
+
+@pytest.mark.parametrize("code", ["other-container", "bad-held", "damaged", "failed", "not-ready", "http-403"])
+def test_what_does_not_pass(code: str) -> None:
+    with pytest.raises(RemoteError):
+        met(ONE).failed(RemoteError(code, "never"), 0.0, progressed=False)
