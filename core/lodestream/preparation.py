@@ -70,6 +70,11 @@ class Preparation:
         )
         self._valid = _valid_points(surface.blocks, [arrays[0] for arrays in self.arrays])
         self.extent = extent_of(self._valid, self.geometric)
+        if self.plane is not None:
+            # It came as x, y and z: tolerances are relative to the diagonal of its box.
+            block = self.given.blocks[0]
+            points = block.points if block.mask is None else block.points[block.mask][:, np.newaxis]
+            self.extent = extent_of(points, 3)
         precision, self.attribute_precisions = precisions
         if precision is not None and precision.relative and not self.extent:
             precision = None  # a fraction of nothing: one point, which a lattice holds exactly
