@@ -190,6 +190,11 @@ class Stream(BaseStream):
         if response is not None:
             await response.aclose()
 
+    async def _drop(self) -> None:
+        if self._socket is not None:
+            self._socket.transport.abort()
+        await self._hang_up()
+
     async def _get(self, url: str, headers: dict[str, str], seconds: float) -> tuple[int, dict[str, str], str]:
         import httpx
 

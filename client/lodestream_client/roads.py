@@ -47,7 +47,7 @@ class Roads:
     transport : "auto", "ws" or "http"
         Which roads may be taken.
     deadline : float
-        Seconds without a new byte after which a lost connection is not replaced any more.
+        Seconds since a connection was lost in which no byte came, after which it is given up.
 
     Attributes
     ----------
@@ -76,12 +76,19 @@ class Roads:
         """Where to try now."""
         return self._places[self._current]
 
-    def progress(self, now: float) -> None:
-        """New bytes have come."""
+    def start(self, now: float) -> None:
+        """The first attempt begins."""
         self._attempts, self._since = 0, now
 
     def failed(self, error: LodestreamError, now: float, *, progressed: bool) -> float:
         """An attempt at `place` ended with an error; the seconds to wait before the next one.
+
+        Parameters
+        ----------
+        error : LodestreamError
+        now : float
+        progressed : bool
+            New bytes had come before.
 
         Raises
         ------
@@ -89,6 +96,8 @@ class Roads:
             The error itself, when there is nothing left to try.
         """
         place, number = self.place, self._current
+        if progressed:
+            self.start(now)
         if place.road == "ws" and "http" in place.allowed and problems.blocks_sockets(error, met=self.met):
             place.road, place.blocked = "http", error
             return 0.0

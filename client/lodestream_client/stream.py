@@ -188,7 +188,11 @@ class BaseStream:
         raise NotImplementedError
 
     def _hang_up(self) -> Any:
-        """Close whatever is open, whoever is at the other end."""
+        """Close whatever is open."""
+        raise NotImplementedError
+
+    def _drop(self) -> Any:
+        """Close whatever is open without a word to the other side, which has not been heard of."""
         raise NotImplementedError
 
     def _get(self, url: str, headers: dict[str, str], seconds: float) -> Any:
@@ -206,14 +210,14 @@ class BaseStream:
     # The way.
 
     def _travel(self) -> Way:
-        self._roads.progress(time.monotonic())
+        self._roads.start(time.monotonic())
         while True:
             before = self._reception.held.total
             try:
                 yield from self._by_socket() if self._roads.place.road == "ws" else self._by_parts()
                 return
             except LodestreamError as error:
-                yield self._hang_up()
+                yield self._drop()
                 if self._over():
                     return
                 progressed = self._reception.held.total > before
@@ -312,15 +316,11 @@ class BaseStream:
             yield self._wait(wait if left is None else min(wait, left))
 
     def _take(self, receive: Callable[[], list[DownloadEvent]]) -> None:
-        before = self._reception.held.total
         with self._lock:
             try:
                 events = receive()
             except RemoteError as error:
                 raise problems.from_code(error.code, str(error)) from error
-            finally:
-                if self._reception.held.total > before:
-                    self._roads.progress(time.monotonic())
             if not self._stopped:
                 self._views.extend(event for event in events if not isinstance(event, Ended))
         if self._progress is not None:

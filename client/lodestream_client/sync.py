@@ -12,10 +12,11 @@ Examples
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -181,6 +182,12 @@ class Stream(BaseStream):
         self._socket = self._body = None
         self._held.close()
 
+    def _drop(self) -> None:
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.socket.shutdown(socket.SHUT_RDWR)
+        self._hang_up()
+
     def _get(self, url: str, headers: dict[str, str], seconds: float) -> tuple[int, dict[str, str], str]:
         import httpx
 
@@ -250,7 +257,7 @@ def connect(
     silence : float
         Seconds without a word after which a connection is given up, with `SilenceError` if it is not replaced.
     deadline : float
-        Seconds without a new byte after which a lost connection is not replaced any more and its error is raised; 0
+        Seconds for which a lost connection is tried to be replaced while no byte comes, before the error is raised; 0
         for never replacing one.
     close_timeout : float
         Seconds that taking leave may last.

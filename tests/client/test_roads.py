@@ -39,15 +39,15 @@ def road(made: Roads) -> str:
 def met(*urls: str, deadline: float = 60.0) -> Roads:
     made = Roads(urls, "auto", deadline)
     made.met = True
-    made.progress(0.0)
+    made.start(0.0)
     return made
 
 
 def test_waits_grow_until_something_comes() -> None:
     made = met(ONE)
     assert [made.failed(LOST, 0.0, progressed=False) for _ in range(3)] == [0.2, 0.4, 0.8]
-    made.progress(5.0)
     assert made.failed(LOST, 5.0, progressed=True) == 0.2
+    assert made.failed(LOST, 5.0, progressed=False) == 0.4
 
 
 def test_addresses_take_turns() -> None:
@@ -81,13 +81,16 @@ def test_only_the_roads_that_are_allowed() -> None:
     assert road(made) == "http"
 
 
-def test_the_deadline_counts_from_the_last_byte() -> None:
+def test_the_deadline_counts_from_the_loss() -> None:
     made = met(ONE, deadline=10.0)
     assert made.failed(LOST, 9.0, progressed=False) > 0
     with pytest.raises(UnreachableError):
         made.failed(LOST, 9.9, progressed=False)
-    made.progress(20.0)
-    assert made.failed(LOST, 29.0, progressed=False) > 0
+    # Whoever thought for an hour over a view has lost nothing by it.
+    assert made.failed(LOST, 3600.0, progressed=True) > 0
+    assert made.failed(LOST, 3609.0, progressed=False) > 0
+    with pytest.raises(UnreachableError):
+        made.failed(LOST, 3609.9, progressed=False)
 
 
 @pytest.mark.parametrize("body", [b"", b"<html>", b"[]"])
@@ -126,7 +129,7 @@ def caused_by_end() -> Exception:
 
 def test_before_anybody_answered_there_are_three_attempts() -> None:
     made = Roads([ONE], "ws", 60.0)
-    made.progress(0.0)
+    made.start(0.0)
     made.failed(LOST, 0.0, progressed=False)
     made.failed(LOST, 0.0, progressed=False)
     with pytest.raises(UnreachableError):

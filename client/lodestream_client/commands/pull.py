@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 __all__ = ["register", "run"]
 
+# Seconds without a word after which a connection counts as lost.
+_SILENCE = 30.0
+
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-command."""
@@ -78,7 +81,8 @@ def register(subparsers: Subparsers) -> None:
         type=parse_seconds,
         default=60.0,
         metavar="S",
-        help="give up when no byte has come for S seconds, whatever was tried; 0 replaces no connection (default: 60)",
+        help="give up when no byte has come for S seconds since a connection was lost or fell silent; 0 replaces no "
+        "connection (default: 60)",
     )
     add_token_option(parser)
     add_json_option(parser)
@@ -115,6 +119,7 @@ def _pull(
             token=token_of(args),
             transport=args.transport,
             deadline=args.retry,
+            silence=min(args.retry, _SILENCE) or _SILENCE,
             limit_rate=args.limit_rate,
             store=part,
             container=identity.container if identity is not None else None,
