@@ -78,10 +78,14 @@ def pass_count(planes: int) -> int:
     return 2 * planes - 1 if planes else 0
 
 
+_START = np.array(
+    [*(chance << 16 | 1 << 15 | sure for chance, sure in zip(CHANCES, SURENESS, strict=True)), *[WEIGHT] * 4], np.int32
+)
+
+
 def new_model() -> NDArray[np.int32]:
     """The contexts of a tile before its first plane, see `binary_coder`, and the weights: int32, flat."""
-    contexts = [chance << 16 | 1 << 15 | sure for chance, sure in zip(CHANCES, SURENESS, strict=True)]
-    return np.array([*contexts, *[WEIGHT] * 4], np.int32)
+    return _START.copy()
 
 
 @inlined
