@@ -47,10 +47,13 @@ _CLOSE_SECONDS = 5.0
 @router.websocket("/v1/surfaces/{surface}/stream")
 async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
     """Send a surface under the client's credit."""
-    if SUBPROTOCOL not in socket.scope["subprotocols"]:
-        await _refuse_handshake(socket)
+    try:
+        if SUBPROTOCOL not in socket.scope["subprotocols"]:
+            await _refuse_handshake(socket)
+            return
+        await socket.accept(subprotocol=SUBPROTOCOL)
+    except OSError:  # the client is gone before it was answered
         return
-    await socket.accept(subprotocol=SUBPROTOCOL)
     caller = caller_of(socket)
     try:
         with parts.limits.stream((caller or anybody(socket)).key):

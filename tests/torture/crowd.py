@@ -124,9 +124,13 @@ async def one_byte_a_second(client: _Client) -> None:
 
 
 async def vanishes(client: _Client) -> None:
-    """Open a stream, read some of it, and be gone without a word."""
-    await client.open()
-    await client.receive(client.random.randrange(1, 65536))
+    """Open a stream, read some of it, or do not even await the answer, and be gone without a word."""
+    if client.random.random() < 0.5:
+        await client.open()
+        await client.receive(client.random.randrange(1, 65536))
+    else:
+        await client.connect()
+        await client.send(handshake(client.place))
     client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, not closed
 
 
