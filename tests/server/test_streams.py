@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import time
+from collections.abc import MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +16,8 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
+from fastapi import WebSocket
+from uvicorn.protocols.utils import ClientDisconnected
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -35,8 +39,9 @@ from lodestream.messages import (
     Segments,
     Stop,
 )
+from lodestream.ranges import RangeSet
 from lodestream.wire import serialize
-from lodestream_server import running_server
+from lodestream_server import running_server, streams
 from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, push, raw_stream
 
 
@@ -401,18 +406,16 @@ def test_what_a_client_holds_is_not_sent_again(url: str, surface: dict[str, Any]
     assert isinstance(header, Header)
     assert header.planned == surface["levels"][-1]["bytes"], "held or not"
     slices = [event for event in events if isinstance(event, Segments)]
-    assert [slices[0].offset, len(slices[0].data)] == [1200, 300]
-    assert slices[1].offset == 21_500
     assert all(container[event.offset :].startswith(event.data) for event in slices)
-    assert data_of(events) == header.planned - 21_200 + surface_tail(header)
-    told = [event.bytes for event in events if isinstance(event, Layer)]
-    assert told == [layer["bytes"] for layer in surface["layers"] if layer["bytes"] > 1200]
-
-
-def surface_tail(header: Header) -> int:
-    """Bytes that are sent beside the surface."""
     assert header.prefix
-    return header.metadata[1]
+    planned = RangeSet([(0, header.planned), header.metadata])
+    missing = RangeSet(gap for place in planned for gap in RangeSet(held).missing(*place))
+    assert RangeSet((event.offset, len(event.data)) for event in slices) == missing
+    assert data_of(events) == missing.total, "each byte once"
+    assert [event.offset for event in slices] == sorted(event.offset for event in slices)
+    told = [event.bytes for event in events if isinstance(event, Layer)]
+    expected = {*(layer["bytes"] for layer in surface["layers"]), header.planned}
+    assert told == sorted(size for size in expected if size > 1200)
 
 
 @pytest.mark.parametrize(
@@ -453,3 +456,19 @@ def test_a_message_takes_a_quarter_of_the_credit(url: str) -> None:
         stream.send(Stop())
         assert data_of(stream.until_end()) == 0
     assert len(received) >= 8
+
+
+@pytest.mark.parametrize("offered", [[SUBPROTOCOL], []])
+def test_a_client_that_is_gone_before_the_handshakes_end_is_no_error(offered: list[str]) -> None:
+    async def receive() -> dict[str, Any]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message["type"])
+        raise ClientDisconnected
+
+    sent: list[str] = []
+    extensions: dict[str, Any] = {"websocket.http.response": {}}
+    scope = {"type": "websocket", "path": "/", "headers": [], "subprotocols": offered, "extensions": extensions}
+    asyncio.run(streams.stream(WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
+    assert len(sent) == 1

@@ -127,13 +127,15 @@ async def _all(url: str, container: bytes, count: int, until: float, seed: int, 
     async def some() -> None:
         while report.schedules < count or time.monotonic() < until:
             report.schedules += 1
+            number = report.schedules
             await _one(url, container, next(numbers), expected, report)
-            if report.schedules % 1000 == 0:
-                report.memory.append((report.schedules, _memory()))
+            if number % 1000 == 0:
+                report.memory.append((number, _memory()))
 
     report.memory.append((0, _memory()))
     await asyncio.gather(*(some() for _ in range(_TOGETHER)))
-    report.memory.append((report.schedules, _memory()))
+    if report.schedules % 1000:
+        report.memory.append((report.schedules, _memory()))
 
 
 async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, NDArray[Any]], report: Report) -> None:
