@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 __all__ = ["RangeDownload", "RangeRequest"]
 
-# The first bytes hold the header and, of most surfaces, the first layers; the last ones, a share of the file, hold
-# index and metadata of most. Where they do not, one more request brings the rest.
+# The first bytes hold the header and, of most surfaces, the first layers; the last ones, some and a share of the file,
+# hold index and metadata of most. Where they do not, one more request brings the rest.
 _HEAD = 4096
 _TAIL_SHARE = 512
-_TAIL_LEAST = 4096
+_TAIL_LEAST = 2048
 _TAIL_MOST = 64 * 1024
 
 _CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d{1,18})-(\d{1,18})/(\d{1,18})\s*")
@@ -253,7 +253,7 @@ class RangeDownload:
         held, size = self.reception.held, self.reception.size
         if size is None:
             return 0, _HEAD
-        tail = min(max(size // _TAIL_SHARE, _TAIL_LEAST), _TAIL_MOST, size)
+        tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
         for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
             gap = next(held.missing(start, length), None)
             if gap is not None:
