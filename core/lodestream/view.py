@@ -103,7 +103,7 @@ class View:
         OptionError
             When there is no such level.
         CorruptStreamError
-            When the complete surface is not the one that was encoded.
+            When the complete surface is not the one that was encoded, or nothing that was is finite.
         """
         header = self._reconstruction.header
         asked, finest = level is not None, level is None or level == header.levels
@@ -129,7 +129,11 @@ class View:
             }
             if mask is not None and not mask.any():
                 mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
-            blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=mask, attributes=named))
+            points = points[..., 0] if header.flat else points
+            try:
+                blocks.append(Block(points, closed, mask=mask, attributes=named))
+            except InputError as error:
+                raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
         surface = Surface(blocks=blocks)
         if not finest and len(blocks) == 1 and header.point_channels == 1:
             coarse = level_metadata(

@@ -89,15 +89,17 @@ def run(target: str, count: int, seconds: float | None = None, seed: int = 1) ->
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         started = time.monotonic()
         with subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
         ) as process:
-            assert process.stderr is not None
-            said = process.stderr.read()
+            assert process.stdout is not None
+            said = process.stdout.read()
         found = (
             json.loads(state.read_text()) if state.exists() else {"cases": 0, "taken": 0, "fuzzer": "?", "memory": 0}
         )
         faults = [repr(path.read_bytes()[:4000]) for path in Path(folder).glob("fault-*")]
-        assert process.returncode == 0, f"{target}, after {found['cases']} cases: {said[-4000:]} {faults}"
+        # The fuzzer's own diary is of no interest where there is a traceback.
+        said = said[said.rfind("Traceback (most recent call last)") :] if "Traceback" in said else said
+        assert process.returncode == 0, f"{target}, after {found['cases']:,} cases: {said[:4000]} {faults}"
         return Fuzzed(target, seconds=time.monotonic() - started, **found)
 
 

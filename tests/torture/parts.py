@@ -158,13 +158,14 @@ def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
     for thread in threads:
         thread.join()
     faults = [str(item) for item in found.values() if isinstance(item, BaseException)]
-    assert not faults, "\n".join(faults)
     done = [item for item in found.values() if isinstance(item, fuzz.Fuzzed)]
-    return sum(item.cases for item in done), tuple(
+    facts = tuple(
         f"{item.target}: {item.cases:,} cases with {item.fuzzer}, {item.taken:,} of them taken, the others refused as "
         f"documented; at most {item.memory / 2**20:.0f} MiB"
         for item in done
     )
+    assert not faults, "\n".join((*facts, *faults))
+    return sum(item.cases for item in done), facts
 
 
 PARTS = {
