@@ -78,9 +78,10 @@ def is_surface(url: str) -> bool:
     return _clean(url).rpartition("/")[0].endswith(_SURFACES)
 
 
-def stream_url(url: str) -> str:
+def stream_url(url: str, query: str | None = None) -> str:
     """Where the stream of the surface at this address is."""
-    return "ws" + surface_url(url).removeprefix("http") + "/stream"
+    address = "ws" + surface_url(url).removeprefix("http") + "/stream"
+    return address if query is None else f"{address}?{query}"
 
 
 def container_url(url: str) -> str:

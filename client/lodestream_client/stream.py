@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 from lodestream.download import Download, Ended
 from lodestream.errors import LodestreamError, RemoteError, RemoteProtocolError, TruncatedStreamError
 from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL
+from lodestream.opening import OPENED, to_address
 from lodestream.range_download import RangeDownload
 from lodestream.reception import Reception, Store
 from lodestream.target import Target
@@ -228,14 +229,22 @@ class BaseStream:
                 return
 
     def _by_socket(self) -> Way:
+        download = Download(window=self._window, reception=self._reception)
         with self._lock:
-            self._download = download = Download(window=self._window, reception=self._reception)
-        subprotocol = yield self._dial(addresses.stream_url(self.url))
+            self._download = None
+        began = time.monotonic()
+        subprotocol = yield self._dial(addresses.stream_url(self.url, to_address(download.opening)))
         self._connections += 1
-        if subprotocol != SUBPROTOCOL:
+        if subprotocol not in (OPENED, SUBPROTOCOL):
             raise problems.NoStreamError(
                 f"expected {self.url} to speak {SUBPROTOCOL}, got {subprotocol or 'no subprotocol'}"
             )
+        if subprotocol == OPENED:
+            download.opened(began)
+        with self._lock:
+            self._download = download
+            if self._stopped:
+                download.stop()
         self._roads.met = True
         while self.ended is None:
             left = self._tick()
@@ -362,7 +371,7 @@ class BaseStream:
 
     def _socket_options(self) -> dict[str, Any]:
         options: dict[str, Any] = {
-            "subprotocols": [SUBPROTOCOL],
+            "subprotocols": [OPENED, SUBPROTOCOL],
             "compression": None,  # what travels is coded already
             "max_size": MAX_MESSAGE,
             "max_queue": _MAX_QUEUE,

@@ -46,6 +46,8 @@ class Download:
         The figures that the server told last.
     window : Window
         How much may be under way.
+    opening : bytes
+        The first message, for whoever puts it into the handshake's address; see `opened`.
     """
 
     def __init__(
@@ -65,7 +67,8 @@ class Download:
             _largest(self.reception) if known else (),
             self.reception.container,
         )
-        self._outbox = [self._connection.send(opening)]
+        self.opening = self._connection.send(opening)
+        self._outbox = [self.opening]
         self.window.grant(self.window.size)
 
     @property
@@ -134,6 +137,17 @@ class Download:
         """The messages to send now, in order; each is given once."""
         messages, self._outbox = self._outbox, []
         return messages
+
+    def opened(self, now: float) -> None:
+        """Tell that the server has taken `opening` with the handshake: it is not to be sent again.
+
+        Parameters
+        ----------
+        now : float
+            When the handshake began, by the clock that `tick` is told.
+        """
+        self._outbox.remove(self.opening)
+        self._opened = now
 
     def stop(self, why: str = "stopped") -> None:
         """Ask for no more; at once, whatever is under way. Again, or after the end, it does nothing.

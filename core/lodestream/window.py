@@ -6,9 +6,9 @@ that: grants come in steps and the first of them are small, so that a link that 
 twice as much from one round to the next, and one that was busy keeps what it needs.
 
 Both quantities are measured without sending anything for it. The *round trip* is the shortest time seen between a grant
-and the first byte that only this grant allowed, or what the handshake took: in a queue times are longer, never shorter.
-The *rate* is that of a whole window as it came, over at least a round trip, since bytes that were held up somewhere
-arrive together and prove nothing.
+and the first byte that only this grant allowed, or what the first answer took: in a queue times are longer, never
+shorter. The *rate* is that of a whole window as it came, over at least a round trip, since bytes that were held up
+somewhere arrive together and prove nothing.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
+from lodestream.opening import OPENED, PARAMETER, from_address
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
@@ -48,19 +49,22 @@ _CLOSE_SECONDS = 5.0
 async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
     """Send a surface under the client's credit."""
     try:
-        if SUBPROTOCOL not in socket.scope["subprotocols"]:
+        offered = socket.scope["subprotocols"]
+        if SUBPROTOCOL not in offered:
             await _refuse_handshake(socket)
             return
-        await socket.accept(subprotocol=SUBPROTOCOL)
+        opening = socket.query_params.get(PARAMETER) if OPENED in offered else None
+        await socket.accept(subprotocol=SUBPROTOCOL if opening is None else OPENED)
     except OSError:  # the client is gone before it was answered
         return
     caller = caller_of(socket)
     try:
         with parts.limits.stream((caller or anybody(socket)).key):
-            first = None
+            first = None if opening is None else from_address(opening)
             if caller is None:
                 # Nothing is told of the surface, not even whether it exists, before the ticket was seen.
-                first = await _first_message(socket, parts.settings.head_seconds)
+                if first is None:
+                    first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.redeem(_ticket(first))
             record = ready(parts, surface)
             container = await asyncio.to_thread(parts.containers.open, record.container or "")
@@ -194,7 +198,7 @@ class _Session:
 
     async def _receive(self) -> None:
         while self._sender.state is not State.CLOSED:
-            data, self._first = self._first or await _message(self._socket), None
+            data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
             self._sender.receive(data)
             self._heard.set()

@@ -92,8 +92,8 @@ def data_of(events: list[Event]) -> int:
 
 
 @contextmanager
-def raw_stream(url: str, **options: Any) -> Iterator[Raw]:
+def raw_stream(url: str, query: str = "", **options: Any) -> Iterator[Raw]:
     """A socket to the stream of the surface at a URL."""
     options = {"subprotocols": [SUBPROTOCOL], "max_size": MAX_MESSAGE, "compression": None, "proxy": None, **options}
-    with connect(url.replace("http", "ws", 1) + "/stream", **options) as socket:
+    with connect(url.replace("http", "ws", 1) + "/stream" + query, **options) as socket:
         yield Raw(socket)

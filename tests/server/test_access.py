@@ -23,7 +23,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
 from lodestream.errors import RemoteError
-from lodestream.messages import CODES, Error, Header, Open
+from lodestream.messages import CODES, SUBPROTOCOL, Error, Header, Open
+from lodestream.opening import OPENED, to_address
+from lodestream.wire import serialize
 from lodestream_client import sync
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access import Access
@@ -413,6 +415,34 @@ def test_a_ticket_does_what_a_header_would(served: Served, http: httpx.Client) -
         with raw_stream(served.surface) as stream:
             stream.send(Open(ticket=text))
             assert isinstance(stream.until_end()[0], Header)
+
+
+def opening(message: Open, **options: Any) -> Any:
+    return {"query": f"?{to_address(serialize(message))}", "subprotocols": [OPENED, SUBPROTOCOL], **options}
+
+
+def test_an_open_in_the_address_needs_as_much_as_a_message(
+    served: Served, http: httpx.Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = ticket(http, served.keys)
+    missing = served.url + "/v1/surfaces/" + "0" * 20
+    with caplog.at_level("DEBUG", "lodestream_server"):
+        with raw_stream(served.surface, **opening(Open(ticket=text))) as stream:
+            assert isinstance(stream.until_end()[0], Header)
+        with raw_stream(served.surface, **opening(Open(), additional_headers=served.keys.header("read"))) as stream:
+            assert isinstance(stream.until_end()[0], Header)
+        for address in (served.surface, missing):
+            for shown, code in ((None, "no-token"), ("x" * 1000, "bad-token")):
+                with raw_stream(address, **opening(Open(ticket=shown))) as stream:
+                    assert refused(stream) == code
+        with raw_stream(missing, **opening(Open(ticket=text))) as stream:
+            assert refused(stream) == "not-found"
+        with pytest.raises(InvalidStatus), raw_stream(served.surface, **opening(Open(ticket=text), origin="null")):
+            pass
+    told = [repr(vars(record)) for record in caplog.records]
+    assert any("stream ended" in line for line in told)
+    query = to_address(serialize(Open(ticket=text))) or text
+    assert not any(text in line or query[-40:] in line or "open=" in line for line in told)
 
 
 def test_without_token_and_ticket_nothing_is_told(served: Served, http: httpx.Client) -> None:
