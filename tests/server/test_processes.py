@@ -23,6 +23,23 @@ from tests.server.helpers import PATIENCE, eventually
 
 _MEMORY = 512 << 20
 
+# Prints which loops were compiled, or loaded, by what stands after the warming.
+_FIRST_MESH = """
+from pathlib import Path
+import gc, sys
+import numba.core.dispatcher
+from lodestream_server.worker import warm
+def versions():
+    loops = [item for item in gc.get_objects() if isinstance(item, numba.core.dispatcher.Dispatcher)]
+    return {(loop.py_func.__qualname__, signature) for loop in loops for signature in loop.signatures}
+warm()
+before = versions()
+import lodestream
+surface = lodestream.read(Path(sys.argv[1]))
+assert surface.blocks[0].points.shape == (3, 4, 3)
+print(len(before), sorted(versions() - before))
+"""
+
 
 @asynccontextmanager
 async def pool(size: int = 1) -> AsyncIterator[Pool]:
@@ -138,3 +155,18 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
         assert not gone(child)
         parent.kill()
     assert eventually(lambda: gone(child), "the process to end with its parent")
+
+
+@pytest.mark.parametrize("faces", ["{a} {b} {c} {d}", "{a} {b} {c}\nf {a} {c} {d}"])
+def test_the_first_mesh_finds_its_loops_compiled(tmp_path: Path, faces: str) -> None:
+    mesh = tmp_path / "mesh.obj"
+    lines = [f"v {column} {row} {row * column % 3}" for row in range(3) for column in range(4)]
+    lines += ["f " + faces.format(a=a, b=a + 1, c=a + 5, d=a + 4) for a in (1, 2, 3, 5, 6, 7)]
+    mesh.write_text("\n".join(lines) + "\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", _FIRST_MESH, str(mesh)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    count, _, new = done.stdout.partition(" ")
+    assert int(count) >= 10
+    assert new == "[]\n"
