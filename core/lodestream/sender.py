@@ -38,6 +38,8 @@ class Sender:
         Bytes of the container that have been handed out.
     layers : int
         Layers or levels that have been handed out; from the first one on there is something to draw.
+    held : RangeSet
+        Bytes of the container that the client holds already, as its `open` says.
     why : str or None
         Why the stream ended, once it has.
     """
@@ -45,6 +47,7 @@ class Sender:
     def __init__(self, index: Index, container: str) -> None:
         self.sent = 0
         self.layers = 0
+        self.held = RangeSet()
         self.why: str | None = None
         self._index = index
         self._container = container
@@ -134,7 +137,8 @@ class Sender:
     def _plan(self, event: Open) -> None:
         index = self._index
         try:
-            chosen = plan(index, event.target, self._held(event))
+            self.held = self._said(event)
+            chosen = plan(index, event.target, self.held)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         first = sum(slice_.length for slice_ in chosen.before)
@@ -155,7 +159,7 @@ class Sender:
         )
         self._end_if_done()
 
-    def _held(self, event: Open) -> RangeSet:
+    def _said(self, event: Open) -> RangeSet:
         if event.held and event.container is None:
             raise MessageError("bad-held", "expected open.container with open.held, got none")
         if event.container not in (None, self._container):

@@ -157,10 +157,11 @@ class _Session:
 
     @property
     def saved(self) -> int:
-        """Bytes of the surface that were not sent, since the target was met or the client had seen enough."""
+        """Bytes that the client did not hold of the surface and did not need: it met its target, or had seen enough."""
         if self._sender.why in (None, "complete"):
             return 0
-        return max(plan(self._container.index).bytes - self._sender.sent, 0)
+        missing = plan(self._container.index, held=self._sender.held).ranges
+        return max(sum(place.length for place in missing) - self._sender.sent, 0)
 
     def close(self) -> None:
         """Close the container."""

@@ -96,15 +96,26 @@ def test_a_complete_stream_saves_nothing_and_a_stop_does(http: httpx.Client, ser
     assert whole(small) <= grown(http, before, "lodestream_stream_bytes_total") <= small["bytes"]
 
 
+def test_what_the_client_held_is_not_saved(http: httpx.Client, server: str, made: dict[str, Any]) -> None:
+    before = figures(http)
+    with raw_stream(server + made["url"]) as stream:
+        stream.send(Open(ls.Target(max_bytes=5000), held=((0, 3000),), container=made["container"]))
+        sent = data_of(stream.until_end())
+    eventually(lambda: grown(http, before, "lodestream_streams_total", "bytes") == 1, "the stream to be counted")
+    assert sent < 5000
+    assert grown(http, before, "lodestream_stream_saved_bytes_total") == whole(made) - 3000 - sent
+
+
 def test_builds_uploads_and_errors_are_counted(http: httpx.Client, server: str) -> None:
     before = figures(http)
     push(http, npy(hills(8, 8, seed=6)))
     push(http, npy(hills(8, 8, seed=7))[:-8])
+    # A surface is ready a moment before its build is over and counted.
+    eventually(lambda: figures(http)["lodestream_builds_pending",] == 0, "the builds to be over")
     assert grown(http, before, "lodestream_build_seconds_count", "ready") == 1
     assert grown(http, before, "lodestream_build_seconds_count", "failed") == 1
     assert grown(http, before, "lodestream_upload_bytes_total") > 500
     assert figures(http)["lodestream_surfaces",] == len(http.get("/v1/surfaces?limit=1000").json()["surfaces"])
-    assert figures(http)["lodestream_builds_pending",] == 0
     assert figures(http)["lodestream_disk_free_bytes",] > 0
     assert figures(http)["process_resident_memory_bytes",] > 0
     http.get("/v1/surfaces/nothing")
