@@ -84,8 +84,10 @@ class Limits:
                 del self._streams[client]
 
     @asynccontextmanager
-    async def upload(self, request: Request) -> AsyncIterator[Request]:
+    async def upload(self, request: Request, *, stored: bool = True) -> AsyncIterator[Request]:
         """Be one of the uploads under way: the request, which watches its own body as it comes.
+
+        One that is not stored needs no room and makes no surface, so that only the number of uploads is a limit to it.
 
         Raises
         ------
@@ -96,17 +98,18 @@ class Limits:
         RestartingError
             When the server ends meanwhile.
         """
-        self._check_numbers()
+        self._check_numbers(stored)
         size = request.headers.get("content-length", "")
         promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
         # One that is too large anyway is refused for that.
-        room = _Room(self, promised if promised <= self._settings.upload_bytes else 0)
+        room = _Room(self, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
         clock = asyncio.timeout(None)
         self._uploads.add(clock)
         self._promised += room.promised
         try:
             async with clock:
-                await self.check_disk()
+                if stored:
+                    await self.check_disk()
                 yield Request(request.scope, _watched(request, room, self._settings))
         except TimeoutError:
             if clock.expired():
@@ -139,10 +142,12 @@ class Limits:
         room.promised -= size
         self._promised -= size
 
-    def _check_numbers(self) -> None:
+    def _check_numbers(self, stored: bool) -> None:
         settings = self._settings
         if len(self._uploads) >= settings.max_uploads:
             raise BusyError(f"expected at most {settings.max_uploads} uploads at the same time; come back soon")
+        if not stored:
+            return
         if self._builds() >= settings.max_builds:
             raise BusyError(f"expected at most {settings.max_builds} builds to do; come back when some are done")
         if self._surfaces() >= settings.max_surfaces:
@@ -152,8 +157,9 @@ class Limits:
 class _Room:
     """What an upload has said it will take and has not taken yet, and what it has."""
 
-    def __init__(self, limits: Limits, promised: int) -> None:
+    def __init__(self, limits: Limits, promised: int, stored: bool) -> None:
         self.promised = promised
+        self._stored = stored
         self._limits = limits
         self._unchecked = 0
 
@@ -161,7 +167,7 @@ class _Room:
         self._limits.took(self, size)
         self._unchecked += size
         # One that did not say how large it is, or lied, still leaves the room that is to stay free.
-        if self._unchecked >= _STRIDE:
+        if self._stored and self._unchecked >= _STRIDE:
             self._unchecked = 0
             await self._limits.check_disk()
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import AsyncExitStack
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
@@ -12,7 +14,7 @@ from fastapi.responses import JSONResponse, Response
 
 from . import examples, options, uploads
 from .durable import remove
-from .problems import responses
+from .problems import BusyError, FullError, responses
 from .records import Record
 from .routing import Parts, State, readable
 
@@ -40,17 +42,23 @@ async def upload(request: Request, parts: Parts) -> Response:
     """Take a file, raw or as parts called ``file`` of a form, and build the surface in the background.
 
     What is neither precision, closed, name nor filename in the query is an option of the file's format. Bytes and
-    options that are known already give the surface that is there.
+    options that are known already give the surface that is there, even where there is no room for others.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
-    async with parts.limits.upload(request) as watched:
-        folder = await asyncio.to_thread(parts.storage.new_upload)
+    async with AsyncExitStack() as held:
         try:
-            received = await uploads.receive(watched, folder, parts.settings, chosen.filename)
-            record = await asyncio.to_thread(_record, received, chosen, parts)
-            record, _ = await parts.builder.accept(record, folder)
-        finally:
-            await asyncio.to_thread(remove, folder)
+            watched = await held.enter_async_context(parts.limits.upload(request))
+        except (BusyError, FullError) as refusal:
+            if not _perhaps_known(request, parts):
+                raise
+            watched = await held.enter_async_context(parts.limits.upload(request, stored=False))
+            received = await uploads.receive(watched, None, parts.settings, chosen.filename)
+            known = await asyncio.to_thread(_known, received, chosen, parts)
+            if known is None:
+                raise refusal from None
+            record = known
+        else:
+            received, record = await _keep(watched, chosen, parts)
     parts.metrics.uploaded(received.size)
     content = _present(record, parts, request, full=True)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
@@ -99,11 +107,56 @@ async def delete(parts: Parts, surface: str) -> Response:
     return Response(status_code=204)
 
 
-def _record(received: uploads.Upload, chosen: options.SurfaceOptions, parts: State) -> Record:
+async def _keep(request: Request, chosen: options.SurfaceOptions, parts: State) -> tuple[uploads.Upload, Record]:
+    folder = await asyncio.to_thread(parts.storage.new_upload)
+    try:
+        received = await uploads.receive(request, folder, parts.settings, chosen.filename)
+        record = await asyncio.to_thread(_record, received, chosen)
+        record, _ = await parts.builder.accept(record, folder)
+    finally:
+        await asyncio.to_thread(remove, folder)
+    return received, record
+
+
+def _perhaps_known(request: Request, parts: State) -> bool:
+    """Whether an upload of this size may be there already: where there is no room, no other body is read."""
+    said = request.headers.get("content-length", "")
+    size = int(said) if said.isascii() and said.isdecimal() and len(said) < 19 else None
+    form = request.headers.get("content-type", "").startswith("multipart/")
+    return any(
+        size is None or record.upload_bytes == size or (form and record.upload_bytes < size)
+        for record in parts.storage.records()
+        if record.state != "failed"
+    )
+
+
+def _known(received: uploads.Upload, chosen: options.SurfaceOptions, parts: State) -> Record | None:
+    """The surface that this upload, of which only the hash was kept, has made already."""
+    digest = received.digest.hexdigest()
+    for record in parts.storage.records():
+        if record.upload_sha256 == digest and record.state != "failed":
+            try:
+                # The same bytes, so they say the same of their format.
+                surface, _ = _identify(received, parts.storage.upload_files(record), chosen)
+            except FileNotFoundError:  # deleted since
+                continue
+            found = parts.storage.find(surface)
+            return found if found is not None and found.state != "failed" else None
+    return None
+
+
+def _identify(
+    received: uploads.Upload, files: list[Path], chosen: options.SurfaceOptions
+) -> tuple[str, list[str | None]]:
     names = [options.plain_name(name or "") for name in received.names]
-    format_ = options.check(received.paths, names, chosen)
+    format_ = options.check(files, names, chosen)
+    return options.identify(received.digest, format_, names[0], chosen), names
+
+
+def _record(received: uploads.Upload, chosen: options.SurfaceOptions) -> Record:
+    surface, names = _identify(received, received.paths, chosen)
     return Record(
-        id=options.identify(received.digest, format_, names[0], chosen),
+        id=surface,
         name=chosen.name,
         created=time.time(),
         filenames=tuple(name or "" for name in names),

@@ -36,6 +36,12 @@ _MOST_PART_HEADERS = 16 * 1024
 class Upload:
     """Files as they come, in a folder, called 0, 1, ...
 
+    Parameters
+    ----------
+    folder : Path or None
+        None keeps nothing of them but their hash.
+    most_files : int
+
     Attributes
     ----------
     names : list of (str or None)
@@ -44,25 +50,30 @@ class Upload:
         Bytes of all files.
     """
 
-    def __init__(self, folder: Path, most_files: int) -> None:
+    def __init__(self, folder: Path | None, most_files: int) -> None:
         self.names: list[str | None] = []
         self.size = 0
         self.digest = hashlib.sha256()
         self._folder = folder
         self._most_files = most_files
         self._stack = ExitStack()
-        self._file: NewFile | None = None
+        self._file: NewFile | _Nowhere | None = None
 
     @property
     def paths(self) -> list[Path]:
-        """The files."""
+        """The files; none if they are not kept."""
+        if self._folder is None:
+            return []
         return [self._folder / str(number) for number in range(len(self.names))]
 
     def begin(self, name: str | None) -> None:
         """Start the next file."""
         if len(self.names) == self._most_files:
             raise TooLargeError(f"expected at most {self._most_files} files in an upload")
-        self._file = self._stack.enter_context(NewFile(self._folder / str(len(self.names))))
+        if self._folder is None:
+            self._file = _Nowhere()
+        else:
+            self._file = self._stack.enter_context(NewFile(self._folder / str(len(self.names))))
         self.names.append(name)
 
     def write(self, data: bytes) -> None:
@@ -85,6 +96,16 @@ class Upload:
     def abort(self) -> None:
         """Close what is open, after an error."""
         self._stack.close()
+
+
+class _Nowhere:
+    """A file of which only the size is kept."""
+
+    def __init__(self) -> None:
+        self.size = 0
+
+    def write(self, data: bytes) -> None:
+        self.size += len(data)
 
 
 def digest_of(files: Iterable[Path]) -> str:
@@ -196,8 +217,8 @@ class _Multipart:
         return header
 
 
-async def receive(request: Request, folder: Path, settings: Settings, name: str | None) -> Upload:
-    """Stream a request's body into files of a folder.
+async def receive(request: Request, folder: Path | None, settings: Settings, name: str | None) -> Upload:
+    """Stream a request's body into files of a folder, or only hash it if there is none.
 
     Raises
     ------

@@ -18,10 +18,11 @@ from fastapi import Request
 from websockets.exceptions import ConnectionClosed
 
 from lodestream.messages import Error, Header, Open
-from lodestream_server import Settings, running_server
+from lodestream_server import Settings, durable, running_server
 from lodestream_server.limits import Limits, Turnstile
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
 from lodestream_server.tokens import TokenFile
+from tests.server.disks import FullDisk
 from tests.server.helpers import PATIENCE, Raw, eventually, hills, npy, push, raw_stream
 
 
@@ -187,9 +188,13 @@ def test_one_at_a_time_and_some_waiting() -> None:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, dict[str, str]]]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("small")
+
+
+@pytest.fixture(scope="module")
+def small(folder: Path) -> Iterator[tuple[str, str, dict[str, str]]]:
     """A server with little room: its address, a surface, and tokens."""
-    folder = tmp_path_factory.mktemp("small")
     file = TokenFile(folder / "tokens.json")
     tokens = {name: file.create(name, ("write",))[0] for name in ("one", "two", "three")}
     with running_server(
@@ -243,7 +248,21 @@ def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str,
     assert eventually(free, "room after they are gone")
 
 
-def test_uploads_too_many_are_told_to_come_back(small: tuple[str, str, dict[str, str]]) -> None:
+def refused_at_once(url: str, token: str, length: int) -> bytes:
+    """The answer to an upload that says its size and of which nothing comes."""
+    address = urlsplit(url)
+    with socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as asking:
+        asking.sendall(
+            f"POST /v1/surfaces HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: Bearer {token}\r\n"
+            f"Content-Length: {length}\r\nConnection: close\r\n\r\n".encode()
+        )
+        answer = b""
+        while piece := asking.recv(65536):
+            answer += piece
+    return answer
+
+
+def test_uploads_too_many_are_told_to_come_back(folder: Path, small: tuple[str, str, dict[str, str]]) -> None:
     url, _, tokens = small
     address = urlsplit(url)
     with client(url, tokens["one"]) as http, socket.create_connection((address.hostname, address.port)) as slow:
@@ -251,12 +270,10 @@ def test_uploads_too_many_are_told_to_come_back(small: tuple[str, str, dict[str,
             f"POST /v1/surfaces HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: Bearer {tokens['two']}\r\n"
             "Content-Length: 100000\r\n\r\nxxx".encode()
         )
-
-        def refused() -> httpx.Response | None:
-            answer = http.post("/v1/surfaces", content=b"x" * 2_000_000)
-            return answer if answer.status_code == 503 else None
-
-        answer = eventually(refused, "the slow upload to be counted")
+        # Seen in the folder: whoever asked by another upload might be the one that is taken.
+        eventually(lambda: list((folder / "incoming").glob("*/0")), "the slow upload to begin")
+        answer = http.post("/v1/surfaces", content=npy(hills(6, 5)))
+        assert answer.status_code == 503
         assert answer.headers["retry-after"].isdecimal()
         assert answer.json()["code"] == "busy"
     with client(url, tokens["one"]) as http:
@@ -269,8 +286,27 @@ def test_uploads_too_many_are_told_to_come_back(small: tuple[str, str, dict[str,
         full = http.post("/v1/surfaces", content=npy(hills(7, 5)))
         assert (full.status_code, full.json()["code"]) == (507, "full")
         assert "2 surfaces" in full.json()["detail"]
-        large = http.post("/v1/surfaces", content=bytes((1 << 20) + 1))
-        assert large.status_code in (413, 507)
+        assert refused_at_once(url, tokens["one"], (1 << 20) + 1).startswith(b"HTTP/1.1 507 ")
+        # What is there already needs no room; the same bytes with an option are another surface.
+        body = npy(hills(6, 5))
+        known = eventually(lambda: settled_upload(http, body), "the build to end")
+        assert known.json()["state"] == "ready"
+        assert http.post("/v1/surfaces", files={"file": ("a.npy", body)}).json() == known.json()
+        chunked = http.post("/v1/surfaces", content=iter((body[:100], body[100:])))
+        assert (chunked.status_code, chunked.json()) == (200, known.json())
+        assert http.post("/v1/surfaces", content=body, params={"precision": "1"}).status_code == 507
+        assert http.post("/v1/surfaces", content=npy(hills(6, 5, seed=9))).status_code == 507
+        bad = http.post("/v1/surfaces", content=body, params={"colour": "1"})
+        assert (bad.status_code, bad.json()["code"]) == (422, "bad-option")
+        # Of what cannot be there, by its size, nothing is awaited.
+        assert refused_at_once(url, tokens["one"], len(body) + 1).startswith(b"HTTP/1.1 507 ")
+        assert list((folder / "incoming").iterdir()) == []
+
+
+def settled_upload(http: httpx.Client, body: bytes) -> httpx.Response | None:
+    answer = http.post("/v1/surfaces", content=body)
+    assert answer.status_code in (200, 202), answer.text
+    return answer if answer.status_code == 200 else None
 
 
 def test_a_server_without_room_says_so(tmp_path: Path) -> None:
@@ -283,12 +319,30 @@ def test_a_server_without_room_says_so(tmp_path: Path) -> None:
         assert list((tmp_path / "incoming").iterdir()) == []
 
 
+def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        running_server(tmp_path, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        made = push(http, npy(hills()))
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(1 << 40, 1 << 40, 0))
+        monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
+        again = http.post("/v1/surfaces", content=npy(hills()))
+        assert (again.status_code, again.json()) == (200, made)
+        assert again.headers["location"] == made["url"]
+        for other in (npy(hills(seed=2)), npy(hills(9, 9))):
+            answer = http.post("/v1/surfaces", content=other)
+            assert (answer.status_code, answer.json()["code"]) == (507, "full")
+        assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+
+
 def test_levels_are_asked_for_by_so_many_at_a_time(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, workers=1, max_level_requests=1) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
     ):
-        made = push(http, npy(hills(300, 300)))
+        made = push(http, npy(hills(100, 100)))
         statuses: list[int] = []
 
         def ask() -> None:
