@@ -43,7 +43,8 @@ class Metrics:
         )
         self._sent = self._counter("stream_bytes", "bytes of containers sent in streams")
         self._saved = self._counter(
-            "stream_saved_bytes", "bytes of surfaces that clients did not hold and were not sent, since they had seen enough"
+            "stream_saved_bytes",
+            "bytes of surfaces that clients did not hold and were not sent, since they had seen enough",
         )
         self._uploaded = self._counter("upload_bytes", "bytes of uploads received")
         self._build_seconds = self._histogram(

@@ -1,7 +1,8 @@
 """``make torture``: what takes too long for every run of the tests, and the page that says what it did.
 
-Without names every part runs, and docs/reliability.md is written. ``--seconds 300 fuzz=600`` is the most that each part
-may take which can be cut short; it then says how far it came. ``--count`` makes each part that many times as large.
+Without names every part runs, and docs/reliability.md is written, again whenever a part ends: a run that is interrupted
+leaves what there is. ``--seconds 300 fuzz=600`` is the most that each part may take which can be cut short; it then
+says how far it came. ``--count`` makes each part that many times as large.
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import signal
 import subprocess
 import sys
+import threading
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import lodestream
 
-from .parts import PARTS, Result
+from .lanes import Lanes, Wish
+from .parts import PARTS, Part, Result
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
 
@@ -45,25 +49,84 @@ def main() -> int:
     if unknown:
         parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(unknown)}")
     limits = dict(args.seconds)
-    machine = _machine()
-    print("\n".join(machine), flush=True)
+    wishes = [
+        Wish(part, max(1, int(part.count * args.count)), limits.get(name, limits.get("")))
+        for name, part in PARTS.items()
+        if not args.part or name in args.part
+    ]
+    page = Page(args.page or (None if args.part else PAGE), [wish.part for wish in wishes])
+    print("\n".join(page.machine), flush=True)
     _warm()
-    results, started = [], time.monotonic()
-    for name, part in PARTS.items():
-        if not args.part or name in args.part:
-            result = part.run(max(1, int(part.count * args.count)), limits.get(name, limits.get("")))
-            results.append(result)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        Lanes(page.begun, page.ended).run(wishes)
+    except KeyboardInterrupt:
+        print(f"\n{page.state()}")
+        return 130
+    finally:
+        page.write()
+    print(f"\n{page.state()}")
+    return 1 if any(result.failure for result in page.results.values()) else 0
+
+
+class Page:
+    """The page, which is written again whenever a part ends.
+
+    Parameters
+    ----------
+    path : Path or None
+        None writes none.
+    parts : list of Part
+        What is to be done.
+
+    Attributes
+    ----------
+    machine : list of str
+    results : dict of str to Result
+        What has been done, by the names of the parts.
+    """
+
+    def __init__(self, path: Path | None, parts: list[Part]) -> None:
+        self.machine = _machine()
+        self.results: dict[str, Result] = {}
+        self._path = path
+        self._parts = parts
+        self._started = time.monotonic()
+        self._lock = threading.Lock()
+
+    def begun(self, part: Part) -> None:
+        """A part has begun."""
+        with self._lock:
+            print(f"\n{part.name} begins, {_duration(time.monotonic() - self._started)} after the start", flush=True)
+
+    def ended(self, result: Result) -> None:
+        """A part has ended."""
+        with self._lock:
+            self.results[result.part.name] = result
             print("\n" + "\n".join(_lines(result)), flush=True)
-    total = f"All together: {_duration(time.monotonic() - started)}."
-    print(f"\n{total}")
-    page = args.page or (None if args.part else PAGE)
-    if page is not None:
-        lines = ["", *machine, "", total]
-        for result in results:
-            lines += ["", *_lines(result)]
-        before = page.read_text().partition(_MARK)[0] if page.exists() else ""
-        page.write_text(before + _MARK + "\n".join(lines) + "\n")
-    return 1 if any(result.failure for result in results) else 0
+        self.write()
+
+    def state(self) -> str:
+        """How long it took, and what is not done."""
+        taken = _duration(time.monotonic() - self._started)
+        left = [f"`{part.name}`" for part in self._parts if part.name not in self.results]
+        if left:
+            return f"**Interrupted, or not yet at its end**, after {taken}: {', '.join(left)} had not ended."
+        return f"All together, parts side by side: {taken}."
+
+    def write(self) -> None:
+        """Write it."""
+        with self._lock:
+            if self._path is None or not self.results:
+                return
+            lines = ["", *self.machine, "", self.state()]
+            for part in self._parts:
+                if part.name in self.results:
+                    lines += ["", *_lines(self.results[part.name])]
+            before = self._path.read_text().partition(_MARK)[0] if self._path.exists() else ""
+            new = self._path.with_suffix(".new")
+            new.write_text(before + _MARK + "\n".join(lines) + "\n")
+            new.replace(self._path)
 
 
 def _limit(text: str) -> tuple[str, float]:
@@ -100,7 +163,11 @@ def _machine() -> list[str]:
 
 
 def _lines(result: Result) -> list[str]:
-    done = f"{result.cases:,} in {_duration(result.seconds)}" if not result.failure else "**failed**"
+    done = f"{result.cases:,} in {_duration(result.seconds)}"
+    if result.failure:
+        done = f"**failed** after {_duration(result.seconds)}"
+    elif result.cases < result.wanted:
+        done += f", **of {result.wanted:,}**"
     lines = [f"### {result.part.title}", "", f"`{result.part.name}` ({result.part.unit}): {done}.", ""]
     if result.failure:
         return [*lines, "```text", *result.failure.strip().splitlines()[-40:], "```"]

@@ -1,4 +1,7 @@
-"""The parts of ``make torture``: each does what it is told for a while and says what it did."""
+"""The parts of ``make torture``: each does what it is told for a while and says what it did.
+
+``python -m tests.torture.parts NAME COUNT SECONDS FILE`` writes what one did into a file; SECONDS may be ``-``.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import asyncio
 import contextlib
 import hashlib
 import io
+import json
+import sys
 import tempfile
 import threading
 import time
@@ -24,6 +29,10 @@ from . import crowd, fuzz, kills, small_disk, streams
 
 __all__ = ["PARTS", "Part", "Result", "sent"]
 
+#: So many schedules, and at least an hour of them; fewer of them take less of an hour.
+_SCHEDULES = 10_000
+_STREAM_SECONDS = 3600.0
+
 
 @dataclass(frozen=True)
 class Result:
@@ -32,8 +41,8 @@ class Result:
     Attributes
     ----------
     part : Part
-    cases : int
-        How many of what it counts.
+    wanted, cases : int
+        How many of what it counts it was to do, and did.
     facts : tuple of str
         Lines for the page.
     seconds : float
@@ -42,10 +51,21 @@ class Result:
     """
 
     part: Part
+    wanted: int
     cases: int
     facts: tuple[str, ...]
     seconds: float
     failure: str | None
+
+    def to_json(self) -> str:
+        """All of it."""
+        return json.dumps([self.part.name, self.wanted, self.cases, self.facts, self.seconds, self.failure])
+
+    @staticmethod
+    def of_json(text: str) -> Result:
+        """What `to_json` has written."""
+        name, wanted, cases, facts, seconds, failure = json.loads(text)
+        return Result(PARTS[name], wanted, cases, tuple(facts), seconds, failure)
 
 
 @dataclass(frozen=True)
@@ -77,7 +97,7 @@ class Part:
                 failure = None
             except Exception:
                 cases, facts, failure = 0, (), traceback.format_exc()
-        return Result(self, cases, facts, time.monotonic() - started, failure)
+        return Result(self, count, cases, facts, time.monotonic() - started, failure)
 
 
 def sent(container: bytes) -> str:
@@ -97,7 +117,7 @@ def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
     assert not outcome.wrong, outcome.wrong
     assert not outcome.remains, outcome.remains
     assert outcome.grown < 128 * 1024, outcome
-    return outcome.hostile, (
+    return count, (
         f"{outcome.hostile} hostile connections of {len(crowd.BEHAVIOURS)} kinds and {outcome.honest} honest ones",
         f"all {outcome.honest} honest streams right, the last after {outcome.seconds:.1f} s",
         f"the server's memory grew by {outcome.grown / 1024:.0f} KiB a connection (allowed: 128)",
@@ -106,10 +126,20 @@ def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
 
 
 def _streams(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
-    # It does so many and then more until the time is over.
-    report = streams.run(count if seconds is None else 1, seconds or 0.0)
-    assert not report.problems, "\n".join(report.problems[:20])
-    return report.schedules, (str(report),)
+    least = _STREAM_SECONDS * count / _SCHEDULES
+    report = streams.run(count, least, most=seconds)
+    assert not report.problems, "\n".join((str(report), *report.problems[:20]))
+    assert report.identical > 0.9 * report.schedules, report
+    growth = streams.growth(report.memory)
+    facts = (str(report), f"memory of the process with both ends: {streams.told(report.memory)}")
+    if growth is None:
+        return report.schedules, (*facts, "too few schedules to tell whether memory grows")
+    limits = (
+        f"the last fifth beside the first after {streams.WARM_UP:,} schedules; allowed: {streams.MOST_GROWTH >> 20}"
+    )
+    grown = f"memory grew by {growth / 2**20:.1f} MiB ({limits})"
+    assert growth <= streams.MOST_GROWTH, "\n".join((*facts, grown))
+    return report.schedules, (*facts, grown)
 
 
 def _throughput(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
@@ -165,17 +195,28 @@ def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
         for item in done
     )
     assert not faults, "\n".join((*facts, *faults))
-    return sum(item.cases for item in done), facts
+    return min(item.cases for item in done), facts
 
 
 PARTS = {
     part.name: part
     for part in (
         Part("crowds", "Clients that do not behave, beside honest ones", "of each kind", 200, _crowds),
-        Part("streams", "Streams over links that break, stall and lie", "schedules", 10_000, _streams),
+        Part("streams", "Streams over links that break, stall and lie", "schedules", _SCHEDULES, _streams),
         Part("throughput", "Many streams at once from one server", "streams at once", 500, _throughput),
         Part("kills", "Kill -9 under upload, build, stream and delete", "kills", 200, _kills),
         Part("disk", "A disk that is full most of the time", "requests", 2000, _disk),
         Part("fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz),
     )
 }
+
+
+def main() -> None:
+    """Do one part."""
+    name, count, seconds, file = sys.argv[1:]
+    result = PARTS[name].run(int(count), None if seconds == "-" else float(seconds))
+    Path(file).write_text(result.to_json())
+
+
+if __name__ == "__main__":
+    main()

@@ -12,11 +12,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,11 @@ from lodestream_client import aio, roads, sync
 from lodestream_server import running_server
 from tests.links import Link, faults_of
 
-__all__ = ["Report", "run"]
+__all__ = ["MOST_GROWTH", "WARM_UP", "Report", "growth", "run", "told"]
+
+#: Schedules after which memory must not grow any more, and bytes by which it may seem to.
+WARM_UP = 2000
+MOST_GROWTH = 16 << 20
 
 _TARGETS = (
     ls.Target(),
@@ -42,6 +47,7 @@ _TARGETS = (
 )
 _TOGETHER = 16
 _SILENCE = 0.5
+_MEMORY_EACH = 500
 
 
 @dataclass
@@ -75,10 +81,9 @@ class Report:
 
     def __str__(self) -> str:
         errors = ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
-        memory = ", ".join(f"{size / 2**20:.0f} MiB after {number}" for number, size in self.memory)
         return (
-            f"{self.schedules} schedules, {self.connections} connections in {self.seconds:.0f} s: "
-            f"{self.identical} bit-identical; errors: {errors}; problems: {len(self.problems)}; memory: {memory}"
+            f"{self.schedules:,} schedules, {self.connections:,} connections in {self.seconds:.0f} s: "
+            f"{self.identical:,} bit-identical; errors: {errors}; problems: {len(self.problems)}"
         )
 
 
@@ -89,15 +94,35 @@ def terrain() -> NDArray[np.float32]:
     return np.asarray(90 * np.sin(rows / 9) * np.cos(columns / 13) + noise, np.float32)
 
 
-def run(count: int, seconds: float = 0.0, seed: int = 0) -> Report:
-    """Run `count` schedules, then more of them until `seconds` are over; a seed gives the same ones again."""
+def growth(memory: Sequence[tuple[int, int]]) -> int | None:
+    """By how many bytes memory has grown since it was warm; None where there is too little to tell.
+
+    Compared are the medians of the first and of the last fifth of the figures after `WARM_UP` schedules.
+    """
+    warm = [size for number, size in memory if number >= WARM_UP]
+    fifth = len(warm) // 5
+    return int(median(warm[-fifth:]) - median(warm[:fifth])) if fifth else None
+
+
+def told(memory: Sequence[tuple[int, int]]) -> str:
+    """About a dozen of the figures, in words."""
+    chosen = {*range(0, len(memory), -(-len(memory) // 12)), len(memory) - 1}
+    return ", ".join(f"{memory[n][1] / 2**20:.1f} MiB after {memory[n][0]:,}" for n in sorted(chosen))
+
+
+def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None = None) -> Report:
+    """Run `count` schedules, then more of them until `seconds` are over; a seed gives the same ones again.
+
+    After `most` seconds no more are begun, however few there were.
+    """
     report = Report()
     started = time.monotonic()
+    last = started + (float("inf") if most is None else most)
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
         url = sync.upload(server, ls.Surface(terrain())).url
         container = sync.fetch_range(url, 0, int(sync.describe(url).details["bytes"]))
         with _hasty():
-            asyncio.run(_all(url, container, count, started + seconds, seed, report))
+            asyncio.run(_all(url, container, count, (started + seconds, last), seed, report))
     report.seconds = time.monotonic() - started
     return report
 
@@ -113,7 +138,7 @@ def _hasty() -> Iterator[None]:
         roads._WAIT = usual
 
 
-async def _all(url: str, container: bytes, count: int, until: float, seed: int, report: Report) -> None:
+async def _all(url: str, container: bytes, count: int, until: tuple[float, float], seed: int, report: Report) -> None:
     expected: dict[ls.Target, NDArray[Any]] = {}
     for target in _TARGETS:
         async with aio.connect(url, target=target) as stream:
@@ -125,16 +150,17 @@ async def _all(url: str, container: bytes, count: int, until: float, seed: int, 
     numbers = iter(range(seed, sys.maxsize))
 
     async def some() -> None:
-        while report.schedules < count or time.monotonic() < until:
+        least, last = until
+        while (report.schedules < count or time.monotonic() < least) and time.monotonic() < last:
             report.schedules += 1
             number = report.schedules
             await _one(url, container, next(numbers), expected, report)
-            if number % 1000 == 0:
+            if number % _MEMORY_EACH == 0:
                 report.memory.append((number, _memory()))
 
     report.memory.append((0, _memory()))
     await asyncio.gather(*(some() for _ in range(_TOGETHER)))
-    if report.schedules % 1000:
+    if report.schedules % _MEMORY_EACH:
         report.memory.append((report.schedules, _memory()))
 
 
@@ -182,5 +208,5 @@ def _memory() -> int:
 if __name__ == "__main__":
     chosen = [int(argument) for argument in sys.argv[1:4]] + [500, 0, 0][len(sys.argv) - 1 :]
     made = run(chosen[0], chosen[1], chosen[2])
-    print(made, *made.problems[:20], sep="\n")
+    print(made, told(made.memory), *made.problems[:20], sep="\n")
     sys.exit(bool(made.problems))

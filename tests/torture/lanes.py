@@ -1,0 +1,109 @@
+"""Parts in processes of their own, some side by side: one that fails, or dies, takes no other with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .parts import Part, Result
+
+__all__ = ["STAGES", "Lanes", "Wish"]
+
+#: What measures runs first and alone. The others wait for links and processes most of the time, or compute all the
+#: time: these lanes run side by side, the parts of each one after another.
+STAGES = ((("throughput", "crowds"),), (("streams",), ("kills", "disk"), ("fuzz",)))
+
+# Long enough to end servers and remove folders.
+_PATIENCE = 30.0
+
+
+@dataclass(frozen=True)
+class Wish:
+    """A part, how many of what it counts, and the most seconds, if it may be cut short."""
+
+    part: Part
+    count: int
+    seconds: float | None
+
+
+class Lanes:
+    """Runs parts.
+
+    Parameters
+    ----------
+    begun, ended : callable
+        Told of each part; from several threads.
+    """
+
+    def __init__(self, begun: Callable[[Part], None], ended: Callable[[Result], None]) -> None:
+        self._begun = begun
+        self._ended = ended
+        self._over = threading.Event()
+
+    def run(self, wishes: Sequence[Wish]) -> None:
+        """Run them all; after KeyboardInterrupt, those that are under way are ended and nothing is told of them."""
+        by_name = {wish.part.name: wish for wish in wishes}
+        for stage in STAGES:
+            threads = [
+                threading.Thread(target=self._lane, args=([by_name[name] for name in lane if name in by_name],))
+                for lane in stage
+            ]
+            try:
+                for thread in threads:
+                    thread.start()
+                for thread in threads:
+                    thread.join()
+            except KeyboardInterrupt:
+                self._over.set()
+                for thread in threads:
+                    thread.join()
+                raise
+
+    def _lane(self, wishes: Sequence[Wish]) -> None:
+        for wish in wishes:
+            if self._over.is_set():
+                return
+            self._begun(wish.part)
+            result = self._one(wish)
+            if result is not None:
+                self._ended(result)
+
+    def _one(self, wish: Wish) -> Result | None:
+        started = time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            file, said = Path(folder, "result.json"), Path(folder, "said")
+            seconds = "-" if wish.seconds is None else str(wish.seconds)
+            command = [sys.executable, "-m", "tests.torture.parts", wish.part.name, str(wish.count), seconds, str(file)]
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            with said.open("wb") as output:
+                # A group of its own: what it has started can be ended with it.
+                process = subprocess.Popen(
+                    command, stdout=output, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                )
+            self._await(process)
+            if file.exists():
+                return Result.of_json(file.read_text())
+            if self._over.is_set():
+                return None
+            words = f"the process ended with {process.returncode}\n{said.read_text(errors='replace')[-4000:]}"
+            return Result(wish.part, wish.count, 0, (), time.monotonic() - started, words)
+
+    def _await(self, process: subprocess.Popen[bytes]) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            while process.poll() is None and not self._over.wait(0.2):
+                pass
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGINT)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_PATIENCE)
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()

@@ -1,0 +1,69 @@
+"""The harness of ``make torture``: what one part does to the others, and what is left of a run that is interrupted."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.server.helpers import eventually
+from tests.torture import streams
+from tests.torture.lanes import STAGES, Lanes, Wish
+from tests.torture.parts import PARTS, Part, Result
+
+MIB = 1 << 20
+
+
+def test_memory_that_grows_is_told_from_memory_that_is_warm_or_uneven() -> None:
+    numbers = range(0, 50_001, 500)
+    flat = [(number, 200 * MIB + min(number, streams.WARM_UP) * 10_000) for number in numbers]
+    assert streams.growth(flat) == 0
+    uneven = [(number, size + (number // 500 % 3) * MIB) for number, size in flat]
+    assert abs(streams.growth(uneven) or 0) <= MIB
+    leaking = [(number, size + number * 600) for number, size in flat]
+    assert (streams.growth(leaking) or 0) > streams.MOST_GROWTH
+    assert streams.growth(flat[:5]) is None
+    assert streams.told(flat).count("MiB") <= 13
+    assert streams.told(flat).endswith("after 50,000")
+
+
+def test_a_result_comes_whole_from_another_process() -> None:
+    result = Result(PARTS["disk"], 20, 10, ("one", "two"), 1.5, None)
+    assert Result.of_json(result.to_json()) == result
+
+
+def torture(page: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "tests.torture", *arguments, "--page", str(page)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_run_that_is_interrupted_leaves_what_there_is(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Reliability\n\n## One run\n\nan old one\n")
+    with torture(page, "disk", "streams", "--count", "0.05", "--seconds", "disk=0") as process:
+        eventually(lambda: "`disk` (requests)" in page.read_text(), "the first part to end")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 130
+    text = page.read_text()
+    assert text.startswith("# Reliability\n\n## One run\n")
+    assert "an old one" not in text
+    assert "**Interrupted, or not yet at its end**" in text
+    assert "`streams` had not ended" in text
+    assert re.search(r"`disk` \(requests\): 0 in \d+ s, \*\*of 100\*\*\.", text)
+
+
+def test_a_part_that_dies_is_a_result() -> None:
+    nobody = Part("nobody", "", "", 1, PARTS["disk"].work)
+    result = Lanes(lambda part: None, lambda result: None)._one(Wish(nobody, 7, None))
+    assert result is not None
+    assert (result.part, result.wanted, result.cases) == (nobody, 7, 0)
+    assert "the process ended with 1" in (result.failure or "")
+    assert "KeyError: 'nobody'" in (result.failure or "")
+
+
+def test_every_part_has_a_lane() -> None:
+    assert sorted(name for stage in STAGES for lane in stage for name in lane) == sorted(PARTS)
