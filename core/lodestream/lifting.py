@@ -58,6 +58,16 @@ def _magnitude(values: NDArray[np.int32]) -> int:
 
 
 @kernel
+def _rise(nodes: NDArray[np.int32], gap: int) -> int:
+    """Something at least as large as every difference of neighbours along the axis, see `_magnitude`."""
+    bits = _i32(0)
+    for i in range(nodes.size - gap):
+        rise = _i32(nodes[i + gap] - nodes[i])
+        bits = _i32(bits | rise ^ (rise >> 31))
+    return int(bits) + 1
+
+
+@kernel
 def _copy(source: NDArray[np.int32], target: NDArray[np.int32]) -> None:
     for i in range(target.size):
         target[i] = source[i]
@@ -169,9 +179,10 @@ def _surplus(
     a32, b32, sign32 = _i32(a), _i32(b), _i32(sign)
     highest = _DETAIL_CLAMP if sign > 0 else _ANY
     lowest = _i32(-highest)
-    # Nodes extrapolated from ones of at most m are at most 7 m and 25 m.
-    if _magnitude(n[2 * gap : (run + 2) * gap]) * max(10 * abs(a) + 34 * abs(b), 25) < 2**31 - 128:
-        _surround(n, run, midpoints == run, gap)
+    _surround(n, run, midpoints == run, gap)
+    # Sums modulo 2**32 are right where v fits int32: two rises make up an inner sum, four an outer. A rise beyond an
+    # end is at most five times as large as those inside, so that none has left int32 where all are below 2**28.
+    if _rise(n[: count + 5 * gap], gap) * max(2 * abs(a) + 4 * abs(b), 8) < 2**31 - 128:
         for i in range(count):
             near = _i32(n[i + 2 * gap] + n[i + 3 * gap])
             inner = _i32(near - n[i + gap] - n[i + 4 * gap])

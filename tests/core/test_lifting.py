@@ -186,6 +186,25 @@ def test_hostile_coefficients_stay_within_the_limit_and_are_those_of_exact_integ
         assert not step.midpoints or np.abs(ours).max() <= CLAMP
 
 
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize("predictor", [*PREDICTORS, (1, 0)])
+def test_nodes_far_out_that_rise_slowly_or_steeply_are_those_of_exact_integers(
+    ends: Ends, predictor: tuple[int, int]
+) -> None:
+    """Whether int32 or float64 is computed with depends on the rises alone, and makes no difference."""
+    extreme = 2**28 - 1
+    for length, bits in itertools.product((6, 7, 12, 19), range(4, 30)):
+        step, rng = step_of(length, ends), np.random.default_rng(bits)
+        lines = rng.integers(-(2**18), 2**18, (length, 3), np.int32)
+        rises = rng.integers(-(2**bits), 2**bits, (step.coarse, 3)).cumsum(axis=0)
+        lines[: step.coarse] = np.clip(rng.choice([-extreme, extreme], 3) + rises, -extreme, extreme)
+        ours = lines.copy()
+        inverse_step(ours, 0, step, predictor)
+        np.testing.assert_array_equal(
+            ours.astype(object), reference.inverse(lines.astype(object), ends, *predictor), f"{length}, {bits}"
+        )
+
+
 def test_the_reference_in_plain_and_in_python_integers_agree() -> None:
     lines = random_grid((21, 4), 5)
     for ends, predictor in itertools.product(ENDS, PREDICTORS):
