@@ -79,8 +79,9 @@ class Block:
         if self.points.dtype.kind == "f":
             coordinates = self.points if self.points.ndim == 2 else self.points[..., : min(self.points.shape[2], 3)]
             finite = np.isfinite(coordinates)
-            finite = finite if finite.ndim == 2 else finite.all(axis=2)
-            valid = finite if valid is None else valid & finite
+            if not finite.all():
+                finite = finite if finite.ndim == 2 else finite.all(axis=2)
+                valid = finite if valid is None else valid & finite
         if valid is None or valid.all():
             return None
         if not valid.any():
