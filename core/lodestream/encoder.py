@@ -311,12 +311,12 @@ class _Encoding:
             original, restored = self._given(window), self._last[window.block].window(window)
             chosen = slice(None) if block.mask is None else block.mask[rows, columns]
             original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
-            step = self.lattices[window.channel].step if original.dtype == np.float32 else None
-            piece = exactness.encode_piece(original, restored, step)
-            if piece and kept[window.channel]:
-                exact[0 if window.channel < self.geometric else 1] = False
-                piece = b""
-            pieces.append(piece)
+            if kept[window.channel]:
+                exact[0 if window.channel < self.geometric else 1] &= exactness.agree(original, restored)
+                pieces.append(b"")
+            else:
+                step = self.lattices[window.channel].step if original.dtype == np.float32 else None
+                pieces.append(exactness.encode_piece(original, restored, step))
         return pieces, exact[0], all(exact)
 
     def _given(self, window: Window) -> NDArray[Any]:

@@ -20,7 +20,7 @@ from .errors import CorruptStreamError
 from .kernels import inlined, kernel
 from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["decode_piece", "encode_piece"]
+__all__ = ["agree", "decode_piece", "encode_piece"]
 
 _RAW, _PATTERNS, _DECIMALS, _OFFSETS = range(4)
 _MOST_DECIMALS = 15
@@ -68,10 +68,10 @@ def encode_piece(original: NDArray[Any], restored: NDArray[Any], step: float | N
         Empty when they agree bit for bit; never more than the values themselves and one byte.
     """
     original, restored = np.ascontiguousarray(original), np.ascontiguousarray(restored)
+    if agree(original, restored):
+        return b""
     unsigned = np.dtype(f"u{original.dtype.itemsize}")
     patterns = original.view(unsigned)
-    if np.array_equal(patterns, restored.view(unsigned)):
-        return b""
     candidates = [bytes([_RAW]) + patterns.astype(unsigned.newbyteorder("<")).tobytes()]
     specials = np.unique(patterns[~np.isfinite(original)]) if original.dtype.kind == "f" else patterns[:0]
     if specials.size <= _MOST_SPECIALS:
@@ -83,6 +83,12 @@ def encode_piece(original: NDArray[Any], restored: NDArray[Any], step: float | N
     if step is not None and not specials.size and have_offsets(original, restored, step):
         candidates += _with_offsets(original, restored, step)
     return min(candidates, key=len)
+
+
+def agree(original: NDArray[Any], restored: NDArray[Any]) -> bool:
+    """Whether contiguous arrays of one dtype are the same bit for bit."""
+    unsigned = np.dtype(f"u{original.dtype.itemsize}")
+    return np.array_equal(original.view(unsigned), restored.view(unsigned))
 
 
 def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[Any]:
