@@ -37,8 +37,7 @@ class Source(NamedTuple):
     reversed: bool
 
 
-@dataclass(frozen=True)
-class Band:
+class Band(NamedTuple):
     """A tile's part of one band.
 
     Attributes
@@ -65,8 +64,7 @@ class Band:
         return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
 
 
-@dataclass(frozen=True)
-class Tile:
+class Tile(NamedTuple):
     """A tile: its level, its place in the level's grid of tiles, its bands (none empty), its parent's number or -1.
 
     ``whole`` are the bands of channels that take nothing from curves.
@@ -251,9 +249,10 @@ class Layout:
             coarse = self.shape(number, level - 1) if level else self.shape(number, 0)
             own = bounds if bounds and len(group) == 1 else ([0, coarse[0]], [0, coarse[1]])
             bands += self._bands(number, level, own, place, grid.taken)
-            if not grid.curve:
+            if self.shared and not grid.curve:
                 whole += self._bands(number, level, own, place, _NONE)
-        return tuple(bands), tuple(whole) if self.shared else tuple(bands)
+        coordinate = tuple(bands)
+        return coordinate, tuple(whole) if self.shared else coordinate
 
     def _bands(
         self, number: int, level: int, bounds: tuple[list[int], list[int]], place: tuple[int, int], taken: Sides
@@ -261,23 +260,20 @@ class Layout:
         fine = self.shape(number, level)
         coarse = self.shape(number, level - 1) if level else fine
         kinds = ((False, True), (True, False), (True, True)) if level else ((False, False),)
+        spans = []  # of either axis: its nodes and its details, and where they begin within the whole band
+        for axis in range(2):
+            start, stop = bounds[axis][place[axis]], bounds[axis][place[axis] + 1]
+            last = place[axis] == len(bounds[axis]) - 2
+            first = start + (taken[2 * axis] and place[axis] == 0)
+            nodes = (first, stop - (taken[2 * axis + 1] and last)), first
+            details = fine[axis] - coarse[axis]
+            start, stop = min(start, details), details if last else min(stop, details)
+            spans.append((nodes, ((coarse[axis] + start, coarse[axis] + stop), start)))
         bands = []
         for kind in kinds:
-            spans = []
-            for axis in range(2):
-                start, stop = bounds[axis][place[axis]], bounds[axis][place[axis] + 1]
-                last = place[axis] == len(bounds[axis]) - 2
-                if kind[axis]:
-                    details = fine[axis] - coarse[axis]
-                    start, stop = min(start, details), details if last else min(stop, details)
-                    spans.append((coarse[axis] + start, coarse[axis] + stop, start))
-                else:
-                    start += taken[2 * axis] and place[axis] == 0
-                    stop -= taken[2 * axis + 1] and last
-                    spans.append((start, stop, start))
-            rows, columns = spans
+            (rows, top), (columns, left) = spans[0][kind[0]], spans[1][kind[1]]
             if rows[1] > rows[0] and columns[1] > columns[0]:
-                bands.append(Band(kind, rows[:2], columns[:2], (rows[2], columns[2]), number))
+                bands.append(Band(kind, rows, columns, (top, left), number))
         return bands
 
     def tiles_of(self, level: int) -> range:
