@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import exactness
 from .allocation import TileCurve, assign_layers
-from .bitplanes import code_passes, new_model, pass_count, pass_gains
+from .bitplanes import code_passes, pass_count, pass_gains
 from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.pieces import Window, windows
@@ -353,11 +353,9 @@ class _TileCoder:
     def __init__(self, tables: list[TileTable], channels: list[_Channel]) -> None:
         self._channels = channels
         self.tiles = [Tiles(table) for table in tables]
-        self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
-        model = self._models.setdefault((tile, channel), new_model())
         tiles = self.tiles[channel]
         rows = tiles.table.of_tile(tile)
         coefficients = int((rows[:, 2] * rows[:, 3]).sum())
@@ -373,7 +371,7 @@ class _TileCoder:
             tiles.flags,
             tiles.early,
             self._channels[channel].true,
-            model,
+            tiles.models[tile],
             data,
             np.zeros(0, np.float64) if costs is None else costs,
         )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import exactness
-from .bitplanes import code_passes, new_model, pass_count
+from .bitplanes import pass_count
 from .container.model import Header
 from .container.pieces import Window, windows
 from .errors import CorruptStreamError
@@ -35,8 +35,7 @@ __all__ = [
 #: Lattice coordinates of each grid, over two to the power of the second.
 Picture = tuple[list[NDArray[np.int32]], int]
 
-_NO_COSTS = np.zeros(0, np.float64)
-_NO_TRUTH = np.zeros(0, np.int32)
+_BATCH = 64  # segments decoded in one go: few enough that an interruption is not kept waiting
 
 
 @dataclass(frozen=True)
@@ -61,21 +60,21 @@ class Reconstruction:
 
     def __init__(self, header: Header) -> None:
         self.header = header
-        self._queue: list[Coded] = []
-        self._taken = 0
+        self._queue: list[Coded] = []  # what is not decoded yet
+        self._added = self._taken = 0
         self._lock = Lock()
         self._pieces: dict[int, tuple[bytes, int]] = {}
         self._tiles: list[Tiles] = []
-        self._models: dict[tuple[int, int], NDArray[np.int32]] = {}
 
     @property
     def length(self) -> int:
         """Segments added so far."""
-        return len(self._queue)
+        return self._added
 
     def add(self, segment: Coded) -> None:
         """Take a segment; nothing is decoded yet."""
         self._queue.append(segment)
+        self._added += 1
 
     def correct(self, number: int, data: bytes, offset: int) -> None:
         """Take a piece of the exactness section, which stands at ``offset``."""
@@ -136,28 +135,16 @@ class Reconstruction:
     def _decode(self, length: int) -> None:
         every = self._prepare()
         while self._taken < length:
-            segment = self._queue[self._taken]
-            key = segment.tile, segment.channel
-            tiles = every[segment.channel]
-            model = self._models.setdefault(key, new_model())
-            code_passes(
-                True,
-                tiles.table.of_tile(segment.tile),
-                segment.first,
-                segment.first - segment.passes + 1,
-                tiles.known,
-                tiles.sign,
-                tiles.flags,
-                tiles.early,
-                _NO_TRUTH,
-                model,
-                np.frombuffer(segment.data, np.uint8).copy(),
-                _NO_COSTS,
-            )
-            if segment.first < segment.passes:
-                del self._models[key]
-            self._queue[self._taken] = Coded(*key, segment.first, segment.passes, b"", segment.offset)
-            self._taken += 1
+            count = min(_BATCH, length - self._taken)
+            runs: list[list[tuple[int, int, int, bytes]]] = [[] for _ in every]
+            for segment in self._queue[:count]:
+                last = segment.first - segment.passes + 1
+                runs[segment.channel].append((segment.tile, segment.first, last, segment.data))
+            for tiles, own in zip(every, runs, strict=True):
+                if own:
+                    tiles.read(own)
+            del self._queue[:count]
+            self._taken += count
 
 
 class Progress:

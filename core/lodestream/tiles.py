@@ -8,16 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .bitplanes import BAND_FIELDS, reconstruction_point
-from .kernels import kernel
+from .bitplanes import BAND_FIELDS, code_passes, new_model, reconstruction_point
+from .kernels import inlined, kernel
 from .layout import Band, Layout
 
 __all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
 
 #: Passes that remain of a tile that was not announced: more than any tile has.
 UNANNOUNCED = 57
-_NO_SHIFT = 31  # takes any row or column to 0
-_NO_PARENT = 1  # where a band without a parent finds a zero between zeros
+#: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
+_NO_PARENT = (1, 0, 31, 31)
+
+#: By grid and kind, a tile's bands, where they begin in the flat arrays, and their strides there.
+_Places = dict[tuple[int, int], tuple[Band, int, int]]
 
 
 @dataclass(frozen=True)
@@ -50,46 +53,34 @@ class TileTable:
     @classmethod
     def of(cls, layout: Layout, coordinate: bool = True) -> TileTable:
         """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
-        rows: list[list[int]] = []
+        rows: list[tuple[int, ...]] = []
         windows: list[tuple[int, int, int]] = []
         of_grid: list[list[int]] = [[] for _ in layout.grids]
         first = [0]
         size, blocks = 3, 0
         members = [tile.bands if coordinate else tile.whole for tile in layout.tiles]
-        for number, bands in enumerate(members):
+        known: list[_Places] = []  # of every tile so far; parents come before their children
+        for number, (tile, bands) in enumerate(zip(layout.tiles, members, strict=True)):
+            above, own = known[tile.parent] if tile.parent >= 0 else {}, {}
             for band in bands:
                 of_grid[band.grid].append(len(rows))
                 height, width = band.shape
                 stride, across = width + 2, (width + 7) // 8
                 place = size + 2 * stride + 2
                 flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
-                rows.append([place, stride, height, width, flags, _NO_PARENT, 0, _NO_SHIFT, _NO_SHIFT, kind])
+                own[band.grid, kind] = band, place, stride
+                parent = above.get((band.grid, kind))
+                joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
+                rows.append((place, stride, height, width, flags, *joined, kind))
                 windows.append((number, band.rows[0], band.columns[0]))
                 size += (height + 4) * stride + 2
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
+            known.append(own)
         places = np.array(windows, np.int64).reshape(-1, 3)
         of = [np.array(numbers, np.int64) for numbers in of_grid]
         described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
-        table = cls(layout, members, described, first, size + 8, blocks, places, of)
-        table._join_parents()
-        return table
-
-    def _join_parents(self) -> None:
-        for number, tile in enumerate(self.layout.tiles):
-            if tile.parent < 0:
-                continue
-            above = self.members[tile.parent]
-            parents = {(b.grid, b.kind): (b, row) for b, row in zip(above, self.of_tile(tile.parent), strict=True)}
-            for band, row in zip(self.members[number], self.of_tile(number), strict=True):
-                if (band.grid, band.kind) not in parents:
-                    continue
-                finer, coarser = (self.layout.shape(band.grid, tile.level - below) for below in (1, 2))
-                shifts = [int(a != b) for a, b in zip(finer, coarser, strict=True)]
-                parent, (place, stride) = parents[band.grid, band.kind][0], parents[band.grid, band.kind][1][:2]
-                # Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
-                down, right = (((o + s) >> s) - p for o, s, p in zip(band.origin, shifts, parent.origin, strict=True))
-                row[5:9] = place + down * stride + right, stride, *shifts
+        return cls(layout, members, described, first, size + 8, blocks, places, of)
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, a view."""
@@ -97,7 +88,7 @@ class TileTable:
 
 
 class Tiles:
-    """Magnitudes, signs, block flags and marks of first passes of one channel, see `bitplanes.code_passes`."""
+    """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`."""
 
     def __init__(self, table: TileTable) -> None:
         self.table = table
@@ -105,6 +96,16 @@ class Tiles:
         self.sign = np.zeros(table.size, np.int8)
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
+        self.models = np.tile(new_model(), (len(table.members), 1))
+
+    def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
+        """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
+        ends = np.cumsum([len(data) for *_, data in runs])
+        places = np.array([(tile, first, last, end) for (tile, first, last, _), end in zip(runs, ends, strict=True)])
+        data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
+        table = self.table
+        first_bands = np.array(table.first)
+        _read(table.bands, first_bands, places, self.known, self.sign, self.flags, self.early, self.models, data)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
@@ -138,8 +139,41 @@ class Tiles:
         _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch)
 
 
+def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
+    """What a band of this level says of its parent, see `bitplanes.code_passes`."""
+    finer, coarser = layout.shape(band.grid, level - 1), layout.shape(band.grid, level - 2)
+    down, right = int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
+    # Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
+    row = ((band.origin[0] + down) >> down) - parent.origin[0]
+    column = ((band.origin[1] + right) >> right) - parent.origin[1]
+    return place + row * stride + column, stride, down, right
+
+
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
     return coefficients[slice(*band.rows), slice(*band.columns)]
+
+
+@kernel
+def _read(
+    bands: NDArray[np.int64],
+    first: NDArray[np.int64],
+    runs: NDArray[np.int64],
+    known: NDArray[np.int32],
+    sign: NDArray[np.int8],
+    flags: NDArray[np.uint8],
+    early: NDArray[np.uint8],
+    models: NDArray[np.int32],
+    data: NDArray[np.uint8],
+) -> None:
+    truth, costs = np.zeros(0, np.int32), np.zeros(0, np.float64)
+    start = 0
+    for run in range(runs.shape[0]):
+        tile, stop = runs[run, 0], runs[run, 3]
+        rows, coded = bands[first[tile] : first[tile + 1]], data[start:stop]
+        code_passes(
+            True, rows, runs[run, 1], runs[run, 2], known, sign, flags, early, truth, models[tile], coded, costs
+        )
+        start = stop
 
 
 @kernel
@@ -173,7 +207,7 @@ def _spread(
             )
 
 
-@kernel
+@inlined
 def _spread_row(
     magnitudes: NDArray[np.int32],
     signs: NDArray[np.int8],
@@ -186,7 +220,8 @@ def _spread_row(
     plane = begun + (remaining & 1)
     shift = np.int32(fraction)
     if remaining >= UNANNOUNCED:
-        out[:] = 0
+        for j in range(out.size):
+            out[j] = 0
     elif remaining == 0:
         for j in range(out.size):
             out[j] = np.int32(np.int32(signs[j]) * magnitudes[j]) << shift
