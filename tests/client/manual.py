@@ -27,6 +27,10 @@ This page is `--help` of every command, written by `python -m tests.client.manua
   `wire_bytes` (all that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
   bytes, seconds, stopped or truncated.
 - A limit that is out of reach gives the complete surface, with a note.
+- `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the whole surface, `--attributes speed,kind`
+  these attributes beside the points, `--attributes none` the points alone; both go with each other and with the limits,
+  but a window not with `--level`. What only the rest needs is not asked for. `rms` and `max` of a window are null until
+  it is complete.
 - Clients take a token from `--token` or the environment variable `LODESTREAM_TOKEN`.
 """
 
