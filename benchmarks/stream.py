@@ -8,6 +8,7 @@ second towards the client, in packets of 1,400 bytes, with 64 KiB of queue. Time
 from __future__ import annotations
 
 import asyncio
+import math
 import statistics
 import tempfile
 import time
@@ -152,7 +153,7 @@ def error_table(array: Array, served: Served) -> None:
             trip = f"{2 * delay * 1000:.0f} ms"
             rows.append([trip, f"{share:.0e}", "plain download", f"{prefix:,}", f"{plain:.3f}", ""])
             for road, url, transport in roads(served):
-                seconds = timed(partial(pull, target=target, transport=transport), url, delay)
+                seconds = timed(partial(pull, target=target, rms=share * array.extent, transport=transport), url, delay)
                 rows.append(["", "", road, "", f"{seconds:.3f}", f"{seconds / plain:.2f}"])
     head = ["round trip", "RMS / extent", "road", "bytes", "seconds", "ratio"]
     table(f"{array.name} to an RMS error at 1 Mbit/s, median of three", head, rows)
@@ -175,11 +176,11 @@ async def download(url: str, size: int) -> float:
         return time.monotonic() - started
 
 
-async def pull(url: str, target: ls.Target, transport: Any) -> float:
+async def pull(url: str, target: ls.Target, rms: float, transport: Any) -> float:
     started = time.monotonic()
     async with aio.connect(url, target=target, transport=transport) as stream:
         async for view in stream:
-            if view.rms <= 0 or stream.received >= (stream.planned or 0):
+            if view.rms <= rms:
                 break
         return time.monotonic() - started
 
@@ -212,7 +213,7 @@ def window_share(points: Any, container: bytes, corner: tuple[int, int]) -> floa
 
 
 def window_side(side: int) -> int:
-    return round(side * WINDOW**0.5)
+    return round(side * math.sqrt(WINDOW))
 
 
 def corners(side: int) -> list[tuple[int, int]]:

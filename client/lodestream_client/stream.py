@@ -265,11 +265,12 @@ class BaseStream:
         download = self._parts.setdefault(url, RangeDownload(self._reception))
         address = addresses.container_url(url)
         while True:
-            request = self._next_part(download)
-            if request is None:
-                break
+            # First: what was asked to stop has stopped, even if all that there is has come.
             left = self._tick_parts(download)
             if self.ended is not None:
+                break
+            request = self._next_part(download)
+            if request is None:
                 break
             patience = self._patience() if left is None else min(self._patience(), left)
             try:

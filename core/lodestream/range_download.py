@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["RangeDownload", "RangeRequest"]
 
-# The first bytes hold the header and, of most surfaces, the first layers; the last ones, some and a share of the file,
+# The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
+# pictures come with them, and more where it is known that more is wanted. The last ones, some and a share of the file,
 # hold index and metadata of most. Where they do not, one more request brings the rest.
 _HEAD = 4096
+_FIRST = MIN_WINDOW
+_FIRST_MOST = MAX_CREDIT
 _TAIL_SHARE = 512
 _TAIL_LEAST = 2048
 _TAIL_MOST = 64 * 1024
@@ -252,13 +255,25 @@ class RangeDownload:
         """What to ask for before the index can be looked for."""
         held, size = self.reception.held, self.reception.size
         if size is None:
-            return 0, _HEAD
+            return 0, self._beginning()
         tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
         for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
             gap = next(held.missing(start, length), None)
             if gap is not None:
                 return gap
         return None
+
+    def _beginning(self) -> int:
+        """How many bytes to ask for first, of a file of which nothing is known."""
+        from .beginning import in_file_order
+
+        target = self.reception.target
+        if not in_file_order(target) or self.reception.held.total:
+            return _HEAD
+        if target.max_bytes is not None:
+            return min(max(target.max_bytes, _HEAD), _FIRST_MOST)
+        limited = target.until_rms or target.until_max or target.seconds
+        return _FIRST if limited else _FIRST_MOST
 
     def _read_index(self) -> list[DownloadEvent]:
         from .container import read_index

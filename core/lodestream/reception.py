@@ -315,7 +315,7 @@ class Reception:
         if self._store is None:
             return []
         if self._order is None:
-            return self._learn()
+            return self._learn() if self._service else self._begin()
         views: list[View] = []
         while self._order:
             offset, length = self._order[0]
@@ -329,6 +329,21 @@ class Reception:
             views += self.decoder.feed_at(offset, self._store.read(offset, size))
             if self.plan is not None:
                 self._store.used(offset, size)
+        return views
+
+    def _begin(self) -> list[View]:
+        """Feed the decoder with what is in the plan for certain, before that is made."""
+        from .beginning import in_file_order, sure
+
+        store, views = self._store, []
+        if store is None or not in_file_order(self.target):
+            return []
+        position = self._fed.run(0)
+        while size := sure(self.target, self.decoder, position, store.ranges.run(position), store.read):
+            self._fed.add(position, size)
+            views += self.decoder.feed_at(position, store.read(position, size))
+            position += size
+        self.received = self.decoder.bytes
         return views
 
     def _learn(self) -> list[View]:

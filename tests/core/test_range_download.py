@@ -13,13 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
+from lodestream.container import Index
 from lodestream.download import Download
 from lodestream.errors import OptionError, RemoteError, RemoteProtocolError, TruncatedStreamError
+from lodestream.messages import MAX_CREDIT, MIN_WINDOW
 from lodestream.plan import plan
 from lodestream.range_download import RangeDownload, RangeRequest
 from lodestream.reception import MemoryStore, Reception
 from lodestream.selection import wish_of
 from lodestream.sender import Sender
+from lodestream.view import View
 
 from .surfaces import SAMPLES, contained, index_of, terrain
 
@@ -112,8 +115,8 @@ def test_little_more_than_the_plan_comes_in_few_requests(large: bytes, target: l
     assert download.requests == len(file.asked) <= 3 + len(chosen.ranges)
     assert reception.data_bytes == reception.held.total, "nothing came twice"
     if target.order == "quality" and target.level is None:
-        assert download.requests <= 3
-        assert reception.wire_bytes <= needed + 2 * 4096
+        assert download.requests <= (2 if target.region is None else 3)
+        assert reception.wire_bytes <= max(needed, MIN_WINDOW) + 2 * 4096
 
 
 def test_slices_that_are_near_are_asked_for_together(large: bytes) -> None:
@@ -188,8 +191,8 @@ def by_socket(download: Download, sender: Sender, container: bytes, messages: in
 
 
 def started(headers: dict[str, str] | None = None, status: int = 206) -> RangeDownload:
-    """A download whose first request was answered like this."""
-    download = RangeDownload(Reception())
+    """A download whose first request, of 4,096 bytes, was answered like this."""
+    download = RangeDownload(Reception(ls.Target(order="level")))
     download.request()
     download.answer(status, {"content-range": "bytes 0-4095/100000", **(headers or {})})
     return download
@@ -247,7 +250,7 @@ def test_a_file_that_changes_is_not_mixed_with_itself(first: dict[str, str], sec
     container = ls.encode(terrain((60, 60)).astype(np.float32))
     size = len(container)
     assert size > 8192
-    download = RangeDownload(Reception())
+    download = RangeDownload(Reception(ls.Target(order="level")))
     request, _ = download.request()
     assert request is not None
     headers = {"content-range": f"bytes 0-4095/{size}", **first}
@@ -298,12 +301,69 @@ def test_stopping_ends_it_with_what_has_come(large: bytes) -> None:
 def test_an_index_longer_than_the_first_guess(monkeypatch: pytest.MonkeyPatch, large: bytes) -> None:
     monkeypatch.setattr("lodestream.range_download._TAIL_LEAST", 64)
     monkeypatch.setattr("lodestream.range_download._HEAD", 16)
-    reception = Reception()
+    reception = Reception(ls.Target(order="level"))
     file = File(large)
     file.serve(RangeDownload(reception))
     assert reception.ended == "complete"
     assert reception.data_bytes == reception.held.total
     assert len(file.asked) > 3
+
+
+def limits_of(index: Index) -> list[ls.Target]:
+    """Targets that end at, just before and just behind a layer."""
+    found = []
+    for record in index.layers[::5]:
+        found += [ls.Target(max_bytes=record.end + near) for near in (-1, 0, 1)]
+        found += [ls.Target(until_rms=ls.Tolerance(record.rms * near)) for near in (0.999, 1.0, 1.001)]
+        found.append(ls.Target(until_max=ls.Tolerance(record.max_error)))
+    return found
+
+
+def with_holes() -> bytes:
+    points = terrain((90, 80)).astype(np.float32)
+    points[20:30, 40:60] = np.nan
+    return ls.encode(ls.Surface(points))
+
+
+@pytest.mark.parametrize("name", ["large", "heights", "holes"])
+def test_layers_are_shown_before_the_index_has_come_and_none_too_many(name: str, large: bytes) -> None:
+    container = {"large": lambda: large, "heights": lambda: contained("heights")[0], "holes": with_holes}[name]()
+    index = index_of(container)
+    for target in limits_of(index):
+        try:
+            chosen = plan(index, target)
+        except OptionError:
+            with pytest.raises(OptionError, match="first step"):
+                File(container).serve(RangeDownload(Reception(target)))
+            continue
+        reception = Reception(target)
+        download = RangeDownload(reception)
+        request, _ = download.request()
+        assert request is not None
+        head = container[: request.length]
+        download.answer(206, {"content-range": f"bytes 0-{len(head) - 1}/{len(container)}"})
+        views = [view for start in range(0, len(head), 137) for view in download.receive(head[start : start + 137])]
+        download.finish()
+        assert [view.bytes for view in views if isinstance(view, View)] == [
+            mark.bytes for mark in chosen.marks if mark.number < len(index.layers) and mark.bytes <= len(head)
+        ]
+        File(container, None).serve(download)
+        assert reception.ended == chosen.ended
+        assert (reception.decoder.bytes, reception.decoder.rms) == (chosen.bytes, chosen.rms)
+        assert download.requests <= 3
+
+
+@pytest.mark.parametrize(
+    ("target", "requests"),
+    [(ls.Target(), 1), (ls.Target(until_rms=ls.Tolerance(3e-2, True)), 2), (ls.Target(max_bytes=6000), 2)],
+    ids=repr,
+)
+def test_the_first_request_is_as_large_as_the_target_allows(large: bytes, target: ls.Target, requests: int) -> None:
+    assert 2 * MIN_WINDOW < len(large) < MAX_CREDIT
+    file = File(large)
+    file.serve(RangeDownload(Reception(target)))
+    assert len(file.asked) == requests
+    assert file.asked[0] == (0, {1: MAX_CREDIT, 2: target.max_bytes or MIN_WINDOW}[requests])
 
 
 def kept(target: Any, data: bytes) -> MemoryStore:
