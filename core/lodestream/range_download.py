@@ -1,7 +1,8 @@
 """A surface received in parts of its container's file, as HTTP Range gives them, without I/O.
 
 The same plan that a server follows over WebSocket is made here: the first bytes tell what the file is and how long, the
-last ones hold its index, and what the target needs of the rest is asked for in few requests.
+last ones hold its index, and what the target needs of the rest is asked for in few requests. Layers that come with the
+first bytes are shown before the plan is made, where it is certain to have them.
 """
 
 from __future__ import annotations
