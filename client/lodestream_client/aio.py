@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import LodestreamError
-from lodestream.target import Target, Tolerance
+from lodestream.target import Region, Target, Tolerance
 
 from . import problems, requests
 from .bodies import Body, Closure, Source, opened, surface_parameters
@@ -100,6 +100,25 @@ class Stream(BaseStream):
         """
         self._stop()
         self._wake.set()
+        await self._flush()
+
+    async def focus(self, region: Region | None) -> None:
+        """Let what a region needs come before the rest; at any time, and as often as one looks elsewhere.
+
+        Nothing is sent twice for it, and the end is the same. Views then come whenever a layer is whole in the region,
+        or everywhere; their errors are not known (NaN) where they hold more than belongs to that layer.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int)) or None
+            Rows and columns, half-open, in full-resolution indices; None for the target's own order again.
+
+        Raises
+        ------
+        OptionError
+            When the surface has no such region, or several blocks; before it is known, the iteration raises it.
+        """
+        self._turn(region)
         await self._flush()
 
     async def close(self) -> None:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from lodestream.download import Download, Ended
 from lodestream.errors import LodestreamError, RemoteError, RemoteProtocolError, TruncatedStreamError
-from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL
+from lodestream.messages import MAX_MESSAGE, MIN_WINDOW, SUBPROTOCOL
 from lodestream.opening import OPENED, to_address
 from lodestream.range_download import RangeDownload
 from lodestream.reception import Reception, Store
-from lodestream.target import Target
+from lodestream.target import Region, Target
 
 from . import addresses, problems, requests
 from .errors import SilenceError
@@ -96,6 +96,7 @@ class BaseStream:
         # The download is told things by whoever iterates and by whoever stops, which may be two threads.
         self._lock = threading.RLock()
         self._stopped = False
+        self._turned = False  # a focus has come, and the next part is to obey it
         self._abandoned = False
         self._close_by: float | None = None
         self._connections = 0
@@ -282,7 +283,7 @@ class BaseStream:
                     yield from self._pace(len(piece))
                     self._take(lambda piece=piece: download.receive(piece))  # type: ignore[misc]
                     self._tick_parts(download)
-                    if self.ended is not None:
+                    if self.ended is not None or (self._turned and download.left > MIN_WINDOW):
                         break
             except SilenceError:
                 self._tick_parts(download)
@@ -290,11 +291,16 @@ class BaseStream:
                     raise
             if self.ended is not None:
                 break
-            download.finish(time.monotonic())
+            if self._turned and download.left > MIN_WINDOW:
+                download.leave()
+                yield self._hang_up()
+            else:
+                download.finish(time.monotonic())
         yield self._hang_up()
 
     def _next_part(self, download: RangeDownload) -> Any:
         made: list[Any] = []
+        self._turned = False
 
         def ask() -> list[DownloadEvent]:
             request, events = download.request(time.monotonic())
@@ -344,6 +350,16 @@ class BaseStream:
             self._views.clear()
             if self._download is not None:
                 self._download.stop()
+
+    def _turn(self, region: Region | None) -> None:
+        with self._lock:
+            if self._stopped or self.ended is not None:
+                return
+            if self._download is not None and self.transport == "ws":
+                self._download.focus(region)
+            else:
+                self._reception.focus(region)
+                self._turned = True
 
     def _over(self) -> bool:
         """Whether a connection that broke is not to be replaced, since nothing more is wanted."""

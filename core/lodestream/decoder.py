@@ -6,6 +6,7 @@ import zlib
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from .container import headers, sections
@@ -13,12 +14,13 @@ from .container.frames import Frame, FrameReader, section_extent
 from .container.model import ByteRange, Header, Index, Piece
 from .container.pieces import windows
 from .container.reader import index_from, read_metadata, with_level_bytes
-from .container.slices import Slices
+from .container.slices import Slices, State
 from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
 from .reconstruction import Coded, Progress, Reconstruction
 from .selection import Wish, select
 from .surface import Surface
+from .target import Region
 from .tiles import UNANNOUNCED
 from .view import View
 
@@ -50,6 +52,8 @@ class Decoder:
         self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
         self._frames = FrameReader()
         self._slices: Slices | None = None
+        self._focus: Region | None = None
+        self._turned = False
         self._early: list[tuple[int, bytes]] = []
         self._loose: tuple[int, bytearray] | None = None
         self._footer = bytearray()
@@ -91,6 +95,22 @@ class Decoder:
         else:
             self._take_loose(offset, bytes(chunk))
         return self.layers[before:]
+
+    def focus(self, region: Region | None) -> None:
+        """Say that from now on bytes come in another order: what a region needs first, or the plan's own order again.
+
+        The index has to be among them, unless it came before. A view is given whenever a layer or level has become
+        whole in the region, or everywhere. Its errors are not known (NaN) where it has more than belongs to that layer.
+
+        Raises
+        ------
+        OptionError
+            When the header has come, and there is no such region in the surface.
+        """
+        self._focus, self._turned = region, True
+        if self.header is not None:
+            Wish(region).check(self.header)
+        self._follow_focus()
 
     def finish(self) -> None:
         """Say that no more bytes come.
@@ -217,14 +237,16 @@ class Decoder:
             self._level = max(self._level, header.layout.tiles[entry.tile].level)
         for segment in segments:
             self._reconstruction.add(segment)
-        complete = number + 1 == header.layer_count and not header.corrected
-        self._show(number, self._level, frame.end, rms, max_error, complete)
+        last = number + 1 == header.layer_count
+        complete = last and not header.corrected
+        whole = complete or (last and self._level == header.levels)
+        self._show(State(number, self._level, frame.end, rms, max_error, complete, whole))
 
     def _take_exactness(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
             raise CorruptStreamError("expected layers, got exactness", frame.offset)
         figures = self._correct(frame, header)
-        self._show(len(self.layers), header.levels, frame.end, *figures, True)
+        self._show(State(len(self.layers), header.levels, frame.end, *figures, True, True))
 
     def _correct(self, frame: Frame, header: Header) -> tuple[float, float]:
         count = sum(1 for _ in windows(header))
@@ -239,36 +261,27 @@ class Decoder:
         self.metadata = values
         self._values.update(values)
 
-    def _show(
-        self,
-        number: int,
-        level: int,
-        held: int,
-        rms: float,
-        max_error: float,
-        complete: bool,
-        whole_level: int = -1,
-    ) -> None:
-        corrected = complete and self.header is not None and self.header.corrected
-        whole = self.header is not None and (
-            complete or (number == self.header.layer_count - 1 and level == self.header.levels)
-        )
-        length, state = self._reconstruction.length, self._progress.snapshot(whole)
-        if self.header is not None and whole_level >= 0:
+    def _show(self, made: State) -> None:
+        corrected = made.complete and self.header is not None and self.header.corrected
+        length, state = self._reconstruction.length, self._progress.snapshot(made.all_planes)
+        if self.header is not None and made.whole_level >= 0:
             # The index says that there is nothing more of these levels.
-            levels = state[: self.header.layout.tiles_of(whole_level).stop]
+            levels = state[: self.header.layout.tiles_of(made.whole_level).stop]
             levels[levels == UNANNOUNCED] = 0
+        if self.header is not None and made.whole_near and self._focus is not None:
+            near = state[Wish(self._focus).tiles(self.header)]
+            state[Wish(self._focus).tiles(self.header)] = np.where(near == UNANNOUNCED, 0, near)
         if self.header is not None and self._wish.region is not None:
             # What lies outside has no part in the window.
             state[~self._wanted] = 0
         self.layers.append(
             View(
-                number,
-                level,
-                held,
-                rms,
-                max_error,
-                complete,
+                made.number,
+                made.level,
+                made.bytes,
+                made.rms,
+                made.max_error,
+                made.complete,
                 self._reconstruction,
                 length,
                 state,
@@ -302,8 +315,20 @@ class Decoder:
             chosen = select(self.index, self._wish)
             partial = self._wish.region is not None
             self._slices = Slices(self.index, chosen.segments, chosen.pieces, partial, chosen.whole)
-            if (state := self._slices.state()) is not None:
-                self._show(*state)
+            if self.layers or self._frames.pending:
+                # The file was read in its own order so far, and is not any more.
+                self._slices.continue_file(self._frames.position)
+                self._follow_focus()
+                self._take_slice(self._frames.position, self._frames.rest())
+            else:
+                self._follow_focus()
+                if (state := self._slices.state()) is not None:
+                    self._show(state)
+
+    def _follow_focus(self) -> None:
+        if self._turned and self._slices is not None and self.header is not None:
+            region = self._focus
+            self._slices.focus(None if region is None else Wish(region).tiles(self.header))
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None
@@ -322,7 +347,7 @@ class Decoder:
                 self._reconstruction.add(Coded(item.tile, item.channel, first, item.passes, payload, place))
                 state = self._slices.hold(item)
             if state is not None:
-                self._show(*state)
+                self._show(state)
         frame = self._slices.metadata()
         if frame is not None:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))

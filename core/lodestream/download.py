@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .errors import RemoteError, TruncatedStreamError
-from .messages import CODES, MAX_HELD, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
+from .messages import CODES, MAX_HELD, Bye, Credit, End, Error, Focus, Header, Layer, Open, Segments, Stop
 from .protocol import Connection, Side, State
 from .reception import Ended, Reception
-from .target import Target
+from .target import Region, Target
 from .window import Window
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ class Download:
         )
         self.opening = self._connection.send(opening)
         self._outbox = [self.opening]
+        if self.reception.turned:
+            self._outbox.append(self._connection.send(Focus(self.reception.region)))
         self.window.grant(self.window.size)
 
     @property
@@ -148,6 +150,23 @@ class Download:
         """
         self._outbox.remove(self.opening)
         self._opened = now
+
+    def focus(self, region: Region | None) -> None:
+        """Ask for what a region needs before the rest, or for the target's own order again; at any time.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int)) or None
+            Rows and columns, half-open, in full-resolution indices.
+
+        Raises
+        ------
+        OptionError
+            When it is known already that the surface has no such region; the server refuses it otherwise.
+        """
+        self.reception.focus(region)
+        if self._connection.state in (State.OPENED, State.STREAMING):
+            self._outbox.append(self._connection.send(Focus(region)))
 
     def stop(self, why: str = "stopped") -> None:
         """Ask for no more; at once, whatever is under way. Again, or after the end, it does nothing.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
 from .errors import RemoteProtocolError
-from .target import Target
+from .target import Region, Target, check_spans
 
 __all__ = [
     "CODES",
@@ -28,6 +28,7 @@ __all__ = [
     "End",
     "Error",
     "Event",
+    "Focus",
     "Header",
     "Layer",
     "MessageError",
@@ -140,6 +141,24 @@ class Credit:
 
 
 @dataclass(frozen=True)
+class Focus:
+    """Client: of what is still to be sent, what this region needs first.
+
+    Attributes
+    ----------
+    region : ((int, int), (int, int)) or None
+        Rows and columns, half-open, in full-resolution indices; None: the target's own order again.
+    """
+
+    type: ClassVar[str] = "focus"
+    region: Region | None = None
+
+    def __post_init__(self) -> None:
+        if self.region is not None:
+            check_spans(self.region)
+
+
+@dataclass(frozen=True)
 class Stop:
     """Client: enough; nothing but `End` is to follow."""
 
@@ -199,6 +218,8 @@ class Layer:
     """Server: with what has been sent so far, a layer (quality order) or a level (level order) is complete.
 
     ``number`` counts layers or levels from 0; ``bytes``, ``rms`` and ``max`` are those of the container's own record.
+    Under a focus it is complete in the region first, then everywhere; while more is held than belongs to it, ``rms``
+    and ``max`` are NaN, and ``bytes`` are what is held.
     """
 
     type: ClassVar[str] = "layer"
@@ -227,4 +248,4 @@ class Error:
     detail: str
 
 
-Event: TypeAlias = Open | Credit | Stop | Bye | Header | Segments | Layer | End | Error
+Event: TypeAlias = Open | Credit | Focus | Stop | Bye | Header | Segments | Layer | End | Error

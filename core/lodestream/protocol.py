@@ -8,9 +8,9 @@ The machine
 The client opens, the server answers with a header, then sends slices and figures as far as credit goes, then ends; the
 client says bye; the server closes. Two things make it more than a list of steps:
 
-- *Messages cross.* A ``credit`` or ``stop`` may be under way while the server ends by itself, and slices are under way
-  when the client stops. So each side has its own table: after its own ``stop`` the client still takes what comes until
-  ``end``; after its own ``end`` the server still takes ``credit`` and ``stop`` until ``bye``.
+- *Messages cross.* A ``credit``, ``focus`` or ``stop`` may be under way while the server ends by itself, and slices
+  are under way when the client stops. So each side has its own table: after its own ``stop`` the client still takes
+  what comes until ``end``; after its own ``end`` the server still takes these three until ``bye``.
 - *Stop takes effect at once.* Once the server has heard ``stop``, its table allows ``end`` and nothing else. A client
   that has stopped is in one of two states, since it may stop before the header has come, and must not take two.
 
@@ -32,6 +32,7 @@ from .messages import (
     End,
     Error,
     Event,
+    Focus,
     Header,
     Layer,
     MessageError,
@@ -74,11 +75,11 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
             {Error: State.FAILED},
         ),
         State.OPENED: (
-            {Credit: State.OPENED, Stop: State.WITHDRAWN},
+            {Credit: State.OPENED, Focus: State.OPENED, Stop: State.WITHDRAWN},
             {Header: State.STREAMING, Error: State.FAILED},
         ),
         State.STREAMING: (
-            {Credit: State.STREAMING, Stop: State.STOPPING},
+            {Credit: State.STREAMING, Focus: State.STREAMING, Stop: State.STOPPING},
             {Segments: State.STREAMING, Layer: State.STREAMING, End: State.ENDED, Error: State.FAILED},
         ),
         State.WITHDRAWN: (
@@ -103,11 +104,11 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.OPENED: (
             {Header: State.STREAMING, Error: State.FAILED},
-            {Credit: State.OPENED, Stop: State.STOPPING},
+            {Credit: State.OPENED, Focus: State.OPENED, Stop: State.STOPPING},
         ),
         State.STREAMING: (
             {Segments: State.STREAMING, Layer: State.STREAMING, End: State.ENDED, Error: State.FAILED},
-            {Credit: State.STREAMING, Stop: State.STOPPING},
+            {Credit: State.STREAMING, Focus: State.STREAMING, Stop: State.STOPPING},
         ),
         State.STOPPING: (
             {End: State.ENDED, Error: State.FAILED},
@@ -115,12 +116,18 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.ENDED: (
             {Error: State.FAILED},
-            {Credit: State.ENDED, Stop: State.ENDED, Bye: State.CLOSED},
+            {Credit: State.ENDED, Focus: State.ENDED, Stop: State.ENDED, Bye: State.CLOSED},
         ),
         State.CLOSED: ({}, {}),
         State.FAILED: (
             {},
-            {Open: State.FAILED, Credit: State.FAILED, Stop: State.FAILED, Bye: State.FAILED},
+            {
+                Open: State.FAILED,
+                Credit: State.FAILED,
+                Focus: State.FAILED,
+                Stop: State.FAILED,
+                Bye: State.FAILED,
+            },
         ),
     },
 }

@@ -220,6 +220,15 @@ class RangeDownload:
             raise TruncatedStreamError(f"expected {expected} bytes of the file from {asked.offset} on, got {got}")
         self._measure(got, now)
 
+    @property
+    def left(self) -> int:
+        """How many bytes of the present answer are still to come."""
+        return self._asked.offset + self._asked.length - self._position if self._asked is not None else 0
+
+    def leave(self) -> None:
+        """Tell that the present answer is not read to its end: something else is wanted first."""
+        self._asked = None
+
     def stop(self, why: str = "stopped") -> None:
         """Want no more; whoever integrates this closes the connection.
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 from .errors import RemoteError, RemoteProtocolError, TruncatedStreamError
 from .messages import MAX_DATA
 from .ranges import RangeSet
-from .target import Target
+from .target import Region, Target, check_spans
 
 if TYPE_CHECKING:
     from .container import Index
@@ -118,6 +118,10 @@ class Reception:
         Its bytes, once they are known.
     planned : int or None
         Bytes of the surface that the target needs, once they are known.
+    turned : bool
+        There was a focus, and slices come in an order of their own.
+    region : ((int, int), (int, int)) or None
+        What the focus is on, if on anything.
     index : Index or None
         The container's, if the road or the order needs it and once it has come.
     plan : Plan or None
@@ -150,6 +154,8 @@ class Reception:
         self.container = container
         self.size = size
         self.planned: int | None = None
+        self.turned = False
+        self.region: Region | None = None
         self.index: Index | None = None
         self.plan: Plan | None = None
         self.received = 0
@@ -205,7 +211,22 @@ class Reception:
         self.planned, self.plan = chosen.bytes, chosen
         parts = (chosen.ranges, chosen.before, chosen.after)
         self._follow(*([(place.offset, place.length) for place in part] for part in parts))
+        self._reorder()
         return self._advance()
+
+    def focus(self, region: Region | None) -> None:
+        """What a region needs is to come first, or the target's own order is to go on.
+
+        Raises
+        ------
+        OptionError
+            When it has no point, or it is known already that the surface has no such region.
+        """
+        if region is not None:
+            check_spans(region)
+        self.decoder.focus(region)
+        self.turned, self.region = True, region
+        self._reorder()
 
     def take(self, offset: int, data: bytes) -> list[View]:
         """Take bytes of the container; the views that they complete.
@@ -293,6 +314,13 @@ class Reception:
         if self._store is not None:
             self._order = deque(gap for place in (*before, *surface, *after) for gap in self._fed.missing(*place))
 
+    def _reorder(self) -> None:
+        if self.turned and self.index is not None and self.plan is not None and self._store is not None:
+            from .focus import focused
+
+            slices, _ = focused(self.index, self.plan, self._fed, self.region)
+            self._order = deque((place.offset, place.length) for place in slices)
+
     def _count(self, offset: int, length: int) -> None:
         """Add to `received` what of a range belongs to the surface, once that is known."""
         if self.planned is None:
@@ -314,8 +342,12 @@ class Reception:
         """Feed the decoder with what is kept, as far as it goes on."""
         if self._store is None:
             return []
-        if self._order is None:
-            return self._learn() if self._service else self._begin()
+        if self._order is None and not self._service:
+            return self._begin()
+        if self._order is None or (self.turned and self.plan is None):
+            learned = self._learn()
+            if self._order is None or learned is not None:
+                return learned or []
         views: list[View] = []
         while self._order:
             offset, length = self._order[0]
@@ -346,14 +378,14 @@ class Reception:
         self.received = self.decoder.bytes
         return views
 
-    def _learn(self) -> list[View]:
-        """The order of slices stands in the index, which needs the header of the container to be read."""
+    def _learn(self) -> list[View] | None:
+        """The order of slices stands in the index, which needs the header to be read; None: not all is there."""
         from .container import ByteRange, index_from
         from .decoder import Decoder
 
         store = self._store
         if store is None or not self._service or not store.ranges.covers(*self._service[0]):
-            return []
+            return None
         place = self._service[0]
         header = self.decoder.header
         if header is None:
@@ -361,5 +393,5 @@ class Reception:
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):
-            return []
+            return None
         return self.follow(index_from(store.read(*place), ByteRange(*place), header))

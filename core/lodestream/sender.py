@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 from .container import ByteRange, Index
 from .errors import CorruptStreamError, OptionError
-from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+from .focus import focused
+from .messages import CODES, MAX_DATA, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
 from .plan import Mark, plan
 from .protocol import Connection, Side, State
 from .ranges import RangeSet
+from .selection import Wish
+from .target import Region, Target
 
 __all__ = ["Sender"]
 
@@ -53,8 +57,13 @@ class Sender:
         self._container = container
         self._connection = Connection(Side.SERVER)
         self._outbox: deque[Event] = deque()
+        self._target = Target()
         self._slices: deque[ByteRange] = deque()
-        self._marks: deque[tuple[int, Mark]] = deque()
+        self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
+        self._provided = 0
+        self._held = RangeSet()  # by the client, soon or already
+        self._focus: Region | None = None
+        self._changed = False  # the focus, and the order has not followed yet
         self._ended = "complete"
 
     @property
@@ -75,6 +84,8 @@ class Sender:
         event = self._connection.receive(message)
         if isinstance(event, Open):
             self._plan(event)
+        elif isinstance(event, Focus):
+            self._turn(event)
         elif isinstance(event, Stop) and self.state is State.STOPPING:
             # A header in the outbox is dropped too: a client that has stopped takes an end without one.
             self._outbox = deque([End("stopped")])
@@ -107,8 +118,11 @@ class Sender:
         """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
         if self.state is not State.STREAMING or self._outbox or not self._slices or not self._connection.credit:
             return None
+        if self._changed:
+            # Not before now: of many changes, only the last one costs anything.
+            self._reorder()
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
-        until_mark = self._marks[0][0] - self.sent if self._marks else MAX_DATA
+        until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
         # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
         credit = self._connection.credit
         share = min(credit, max(credit // _SHARES, _LEAST))
@@ -116,7 +130,7 @@ class Sender:
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
-        """Hand over the bytes of a slice that `wanted` has named; after a stop they are dropped.
+        """Hand over the bytes of a slice that `wanted` has named; after a stop, or a change of order, they are dropped.
 
         Raises
         ------
@@ -125,13 +139,18 @@ class Sender:
         """
         if self.state is not State.STREAMING or not self._slices:
             return
+        slice_ = self._slices[0]
+        if slice_.offset != wanted.offset or slice_.length < wanted.length:
+            return
         if len(data) != wanted.length:
             raise CorruptStreamError(f"expected {wanted.length} bytes, got {len(data)}", wanted.offset)
-        slice_ = self._slices.popleft()
+        self._slices.popleft()
         if slice_.length > wanted.length:
             self._slices.appendleft(ByteRange(wanted.end, slice_.length - wanted.length))
         self._outbox.append(Segments(wanted.offset, data))
-        self._mark(self.sent + len(data))
+        self._held.add(wanted.offset, wanted.length)
+        self._provided += wanted.length
+        self._mark()
         self._end_if_done()
 
     def _plan(self, event: Open) -> None:
@@ -141,10 +160,8 @@ class Sender:
             chosen = plan(index, event.target, self.held)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
-        first = sum(slice_.length for slice_ in chosen.before)
-        self._slices.extend(slice_ for slice_ in chosen.slices if slice_.length)
-        # Of the states that what is held makes already, there is nothing to say.
-        self._marks.extend((first + mark.sent, mark) for mark in chosen.marks if mark.sent)
+        self._target, self._held = event.target, self.held.copy()
+        self._follow(chosen.slices, chosen.marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
             Header(
@@ -159,6 +176,24 @@ class Sender:
         )
         self._end_if_done()
 
+    def _turn(self, event: Focus) -> None:
+        try:
+            Wish(event.region).check(self._index.header)
+        except OptionError as error:
+            raise MessageError("bad-target", str(error)) from None
+        self._changed = self._changed or event.region != self._focus
+        self._focus = event.region
+
+    def _reorder(self) -> None:
+        self._changed = False
+        slices, marks = focused(self._index, plan(self._index, self._target), self._held, self._focus)
+        self._follow(slices, marks, 0)
+
+    def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:
+        self._slices = deque(slice_ for slice_ in slices if slice_.length)
+        # Of the states that what is held makes already, there is nothing to say.
+        self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
+
     def _said(self, event: Open) -> RangeSet:
         if event.held and event.container is None:
             raise MessageError("bad-held", "expected open.container with open.held, got none")
@@ -169,8 +204,8 @@ class Sender:
             raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {held.end}")
         return held
 
-    def _mark(self, sent: int) -> None:
-        while self._marks and self._marks[0][0] <= sent:
+    def _mark(self) -> None:
+        while self._marks and self._marks[0][0] <= self._provided:
             mark = self._marks.popleft()[1]
             self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
 

@@ -8,11 +8,23 @@ from typing import Literal
 
 from .errors import OptionError
 
-__all__ = ["Order", "Region", "Target", "Tolerance"]
+__all__ = ["Order", "Region", "Target", "Tolerance", "check_spans"]
 
 Order = Literal["quality", "level"]
 #: Rows and columns, half-open, in full-resolution indices.
 Region = tuple[tuple[int, int], tuple[int, int]]
+
+
+def check_spans(region: Region) -> None:
+    """Refuse a region without a point, of whatever surface.
+
+    Raises
+    ------
+    OptionError
+    """
+    for start, stop in region:
+        if not 0 <= start < stop:
+            raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")
 
 
 @dataclass(frozen=True)
@@ -96,6 +108,4 @@ class Target:
         if self.region is not None:
             if self.level is not None:
                 raise OptionError("expected either a level or a region, got both")
-            for start, stop in self.region:
-                if not 0 <= start < stop:
-                    raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")
+            check_spans(self.region)

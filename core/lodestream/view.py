@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from .parts import level_masks
 from .reconstruction import Reconstruction
 from .selection import Wish
 from .surface import Block, Surface
+from .target import Region
 from .windows import window_of
 
 __all__ = ["View"]
@@ -87,6 +88,33 @@ class View:
         if not 0 <= block < len(surface.blocks):
             raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
         return surface.blocks[block].points
+
+    def window(self, region: Region) -> Surface:
+        """A window of the full-resolution picture, for which nothing outside of what it needs is looked at.
+
+        Heights on a lattice of their own are exact in it as soon as all that it needs has come, whatever is missing
+        elsewhere: a picture of the whole is computed between lattice steps until then.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int))
+            Rows and columns, half-open, in full-resolution indices.
+
+        Raises
+        ------
+        OptionError
+            When the surface has no such region, or several blocks, or the view shows another region only.
+        """
+        header, shown = self._reconstruction.header, self._wish.region
+        wish = Wish(region, self._wish.attributes)
+        wish.check(header)
+        if shown is not None and not all(
+            a <= start and stop <= b for (start, stop), (a, b) in zip(region, shown, strict=True)
+        ):
+            raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
+        state = self._state.copy()
+        state[~wish.tiles(header)] = 0
+        return replace(self, _wish=wish, _state=state).surface()
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
         """The full-resolution picture as a surface, or the grids of a coarser level.

@@ -18,6 +18,7 @@ from lodestream.messages import (
     End,
     Error,
     Event,
+    Focus,
     Header,
     Layer,
     MessageError,
@@ -32,6 +33,7 @@ HEADER = Header("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
 SAMPLES: dict[type[Event], Event] = {
     Open: Open(credit=100),
     Credit: Credit(50),
+    Focus: Focus(((0, 3), (4, 7))),
     Stop: Stop(),
     Bye: Bye(),
     Header: HEADER,
@@ -98,7 +100,7 @@ def test_every_state_is_reached_and_every_end_is_silent() -> None:
 def test_what_one_side_may_send_the_other_side_knows() -> None:
     kinds = {side: {kind for sends, _ in TRANSITIONS[side].values() for kind in sends} for side in Side}
     heard = {side: {kind for _, receives in TRANSITIONS[side].values() for kind in receives} for side in Side}
-    assert kinds[Side.CLIENT] == heard[Side.SERVER] == {Open, Credit, Stop, Bye}
+    assert kinds[Side.CLIENT] == heard[Side.SERVER] == {Open, Credit, Focus, Stop, Bye}
     assert kinds[Side.SERVER] == heard[Side.CLIENT] == {Header, Segments, Layer, End, Error}
 
 
@@ -191,10 +193,11 @@ def test_two_headers_are_refused_even_after_a_stop() -> None:
     assert server.state is State.STREAMING
 
 
-def test_credit_and_stop_may_cross_the_end() -> None:
+def test_credit_focus_and_stop_may_cross_the_end() -> None:
     client, server = opened()
     end = server.send(End("complete"))
     server.receive(client.send(Credit(5)))
+    server.receive(client.send(Focus()))
     server.receive(client.send(Stop()))
     client.receive(end)
     server.receive(client.send(Bye()))
@@ -249,7 +252,7 @@ def test_every_interleaving_of_honest_peers_ends(data: st.DataObject) -> None:
         if client.state in (State.OPENED, State.STREAMING):
             if client.credit < window:
                 choices.append("grant")
-            choices.append("stop")
+            choices += ["stop", "focus"]
         if client.state is State.ENDED:
             choices.append("bye")
         if server.state is State.OPENED:
@@ -263,6 +266,8 @@ def test_every_interleaving_of_honest_peers_ends(data: st.DataObject) -> None:
         # Stopping is rare, so that whole streams are seen too.
         if "stop" in choices and len(choices) > 1 and data.draw(st.integers(0, 30)):
             choices.remove("stop")
+        if "focus" in choices and len(choices) > 1 and data.draw(st.integers(0, 9)):
+            choices.remove("focus")
         match data.draw(st.sampled_from(choices)):
             case "deliver to server":
                 server.receive(to_server.popleft())
@@ -271,6 +276,8 @@ def test_every_interleaving_of_honest_peers_ends(data: st.DataObject) -> None:
                 if isinstance(event, Segments):
                     received += len(event.data)
                     after_stop += len(event.data) if stopped_at is not None else 0
+            case "focus":
+                to_server.append(client.send(SAMPLES[Focus]))
             case "grant":
                 to_server.append(client.send(Credit(data.draw(st.integers(1, window - client.credit)))))
             case "stop":

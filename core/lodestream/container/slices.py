@@ -5,16 +5,36 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import CorruptStreamError
 from . import sections
 from .frames import Frame, whole_section
 from .model import Index, Piece, Segment
 
-__all__ = ["Slices"]
+__all__ = ["Slices", "State"]
 
-#: number, level, bytes, rms, max_error, complete: what a view is made of; and the level that is whole, or -1.
-State = tuple[int, int, int, float, float, bool, int]
+
+class State(NamedTuple):
+    """What a view is made of.
+
+    ``all_planes`` says that nothing but exactness is missing; ``whole_level`` is the level to which, counted from the
+    coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
+    exactness is missing in the focus.
+    """
+
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+    complete: bool
+    all_planes: bool
+    whole_level: int = -1
+    whole_near: bool = False
 
 
 class Slices:
@@ -42,26 +62,66 @@ class Slices:
         items: list[Segment | Piece] = [*segments, *pieces.values()]
         self._items = sorted(items, key=lambda item: item.range.offset)
         self._starts = [item.range.offset for item in self._items]
+        # What is not whole yet: runs of bytes by the place where each goes on, several where the order has changed.
+        self._runs: dict[int, tuple[int, bytearray]] = {}
         self._run_start = 0
         self._run = bytearray()
         self._metadata = index.metadata
         self._has_metadata = False
         self._seen: set[int] = set()
         self._bytes = index.header.length
+        self._in_file = False
         self._held = 0
+        self._finest = 0
+        self._near_tiles: NDArray[np.bool_] | None = None
+        self._near: tuple[_Groups, ...] = ()
+        self._reached: list[int] | None = None  # None while all comes in order
         self._segments, self._pieces = len(segments), len(pieces)
         self._corrected = 0
         tiles = index.header.layout.tiles
+        self._wanted = segments
         self._levels = [tiles[s.tile].level for s in segments]
         self._layer_level = _running_levels([s.layer for s in segments], self._levels, len(index.layers))
         self._by_layer = _Groups([s.layer for s in segments], len(index.layers))
         self._by_level = _Groups(self._levels, len(index.levels))
 
+    def continue_file(self, position: int) -> None:
+        """Begin where a file was read in its order as far as a section that ends at ``position``.
+
+        All bytes of the surface count from there on, not only those of segments and pieces.
+        """
+        self._in_file, self._bytes = True, position
+        for item in self._items[: bisect_left(self._starts, position)]:
+            self._seen.add(item.range.offset)
+            if isinstance(item, Piece):
+                self._corrected += 1
+            else:
+                self._count(item)
+
+    def focus(self, tiles: NDArray[np.bool_] | None) -> None:
+        """Notice from now on when a layer or level is whole in these tiles too; bool, (tile,); None: in no tiles."""
+        self._near_tiles, self._near = tiles, ()
+        if tiles is not None:
+            missing = [
+                (segment.layer, level)
+                for segment, level in zip(self._wanted, self._levels, strict=True)
+                if tiles[segment.tile] and segment.range.offset not in self._seen
+            ]
+            self._near = (
+                _Groups([layer for layer, _ in missing], len(self._index.layers)),
+                _Groups([level for _, level in missing], len(self._index.levels)),
+            )
+        self._reached = self._groups_reached()
+
     def add(self, offset: int, data: bytes) -> None:
-        """Take bytes; a run of them ends where the next do not follow."""
+        """Take bytes; they continue the run of them that ends where they begin, if one does."""
         if self._run_start + len(self._run) != offset:
-            self._run_start, self._run = offset, bytearray()
+            if self._run:
+                self._runs[self._run_start + len(self._run)] = self._run_start, self._run
+            self._run_start, self._run = self._runs.pop(offset, (offset, bytearray()))
         self._run += data
+        if self._in_file:
+            self._bytes += max(min(offset + len(data), self._index.surface_end) - offset, 0)
 
     def items(self) -> Iterator[tuple[Segment | Piece, bytes]]:
         """Segments and pieces that are whole now, in the order of the file."""
@@ -106,11 +166,20 @@ class Slices:
 
     def hold(self, segment: Segment) -> State | None:
         """Note a segment; the state that it completes, if there is one."""
-        self._held += 1
-        self._bytes += segment.range.length
-        self._by_layer.hold(segment.layer)
-        self._by_level.hold(self._index.header.layout.tiles[segment.tile].level)
+        if not self._in_file:
+            self._bytes += segment.range.length
+        self._count(segment)
         return self.state()
+
+    def _count(self, segment: Segment) -> None:
+        level = self._index.header.layout.tiles[segment.tile].level
+        self._held += 1
+        self._finest = max(self._finest, level)
+        self._by_layer.hold(segment.layer)
+        self._by_level.hold(level)
+        if self._near_tiles is not None and self._near_tiles[segment.tile]:
+            for groups, number in zip(self._near, (segment.layer, level), strict=True):
+                groups.hold(number)
 
     def state(self) -> State | None:
         """The state that is complete now, if it is one; the first ones may need no segment at all."""
@@ -120,29 +189,48 @@ class Slices:
             last = layer == len(self._index.layers) - 1
             if last and not self._pieces:
                 return self._end(layer)
-            return layer, self._layer_level[layer], self._bytes, *self._figures(record.rms, record.max_error), False, -1
+            held = record.end if self._in_file else self._bytes
+            finest = self._layer_level[layer]
+            figures = self._figures(record.rms, record.max_error)
+            return State(layer, finest, held, *figures, False, last and finest == self._index.header.levels)
         level = self._by_level.whole(self._held)
-        if level is not None and level < self._index.header.levels:
-            figures = self._index.levels[level]
-            return level, level, self._bytes, *self._figures(figures.rms, figures.max_error), False, level
-        return None
+        if level is not None and level < self._index.header.levels and not self._in_file:
+            known = self._index.levels[level]
+            figures = self._figures(known.rms, known.max_error)
+            return State(level, level, self._bytes, *figures, False, False, level)
+        # Out of order, what is whole stands beside parts of what comes later.
+        if self._reached is None:
+            return None
+        before, self._reached = self._reached, self._groups_reached()
+        risen = [now for was, now in zip(before, self._reached, strict=True) if now > was]
+        if not risen:
+            return None
+        whole_near = bool(self._near) and self._near[0].reached == len(self._index.layers) - 1
+        return State(max(risen), self._finest, self._bytes, math.nan, math.nan, False, False, whole_near=whole_near)
+
+    def _groups_reached(self) -> list[int]:
+        """How far layers are whole everywhere and in the focus; and levels, where these are what comes in turn."""
+        kinds = 1 if self._in_file else 2
+        return [groups.reached for pair in ((self._by_layer, self._by_level), self._near) for groups in pair[:kinds]]
 
     def _figures(self, rms: float, max_error: float) -> tuple[float, float]:
         return (math.nan, math.nan) if self._partial else (rms, max_error)
 
     def _end(self, number: int) -> State:
         last = self._index.levels[-1]
-        return number, last.level, self._bytes, last.rms, last.max_error, True, -1
+        held = self._index.surface_end if self._in_file else self._bytes
+        return State(number, last.level, held, last.rms, last.max_error, True, True)
 
     def hold_piece(self, piece: Piece) -> State | None:
         """Note a piece of exactness; the complete state, if everything is there."""
         if self._held != self._segments:
             raise CorruptStreamError("expected all segments before exactness, got fewer", piece.range.offset)
         self._corrected += 1
-        self._bytes += piece.range.length
+        if not self._in_file:
+            self._bytes += piece.range.length
         if self._corrected < self._pieces:
             return None
-        if self._whole and self._index.exactness is not None:
+        if self._whole and not self._in_file and self._index.exactness is not None:
             # With the frame of the section.
             self._bytes += self._index.exactness.length - sum(p.range.length for p in self._index.pieces)
         return self._end(len(self._index.layers))
@@ -177,6 +265,11 @@ class _Groups:
     def hold(self, group: int) -> None:
         self._missing[group] -= 1
         self._pass()
+
+    @property
+    def reached(self) -> int:
+        """The last of the groups that are whole with all before them, -1 if there is none."""
+        return self._next - 1
 
     def whole(self, held: int) -> int | None:
         """The last of the groups that are whole, if these are all that is held."""

@@ -1,0 +1,329 @@
+"""The focus of a stream: what a region needs comes first, nothing twice, and the end is the same."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from functools import cache
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lodestream as ls
+from lodestream.container import Index, read_index
+from lodestream.download import Download, Ended
+from lodestream.errors import OptionError
+from lodestream.focus import focused
+from lodestream.messages import MAX_DATA, Focus, Layer, MessageError, Open, Segments
+from lodestream.plan import plan
+from lodestream.ranges import RangeSet
+from lodestream.reception import MemoryStore, Reception
+from lodestream.selection import Wish
+from lodestream.sender import Sender
+from lodestream.target import Region
+from lodestream.view import View
+from lodestream.wire import parse, serialize
+
+SHAPE = (400, 530)
+NEAR: Region = ((0, 60), (0, 70))
+FAR: Region = ((340, 400), (450, 530))
+TARGETS = [
+    ls.Target(),
+    ls.Target(order="level"),
+    ls.Target(level=9),
+    ls.Target(until_rms=ls.Tolerance(5e-4, True)),
+    ls.Target(region=((0, 400), (0, 300))),
+]
+KINDS = ["integers", "floats", "holes"]
+
+
+@cache
+def container(kind: str) -> bytes:
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    heights = 300 * np.sin(rows / 70) * np.cos(columns / 50) + np.random.default_rng(5).normal(size=SHAPE)
+    if kind == "integers":
+        return ls.encode(np.rint(30 * heights).astype(np.int16))
+    if kind == "holes":
+        return ls.encode(np.where(np.hypot(rows - 200, columns - 200) < 50, np.nan, np.rint(30 * heights) + 0.0))
+    return ls.encode((heights / 3).astype(np.float32))
+
+
+@cache
+def index(kind: str) -> Index:
+    data = container(kind)
+    return read_index(lambda offset, length: data[offset : offset + length], len(data))
+
+
+class Link:
+    """A client and a server joined by queues, one step of one of them at a time."""
+
+    def __init__(self, kind: str, target: ls.Target, window: int, reception: Reception | None = None) -> None:
+        self.data = container(kind)
+        self.reception = Reception(target) if reception is None else reception
+        self.client = Download(window=window, reception=self.reception)
+        self.server = Sender(index(kind), hashlib.sha256(self.data).hexdigest())
+        self.to_server: list[bytes] = []
+        self.to_client: list[bytes] = []
+        self.views: list[View] = []
+        self.slices: list[tuple[int, int]] = []
+        self.layers: list[Layer] = []
+        self.flush()
+
+    def flush(self) -> None:
+        self.to_server += self.client.data_to_send()
+
+    def focus(self, region: Region | None) -> None:
+        self.client.focus(region)
+        self.flush()
+
+    def serve(self) -> bool:
+        message = self.server.next_message()
+        if message is not None:
+            self.to_client.append(message)
+        elif (wanted := self.server.wanted()) is not None:
+            self.server.provide(wanted, self.data[wanted.offset : wanted.end])
+        else:
+            return False
+        return True
+
+    def hear(self) -> None:
+        self.server.receive(self.to_server.pop(0))
+
+    def take(self) -> None:
+        event = parse(self.to_client[0])
+        if isinstance(event, Segments):
+            self.slices.append((event.offset, len(event.data)))
+        elif isinstance(event, Layer):
+            self.layers.append(event)
+        self.views += [made for made in self.client.receive(self.to_client.pop(0)) if not isinstance(made, Ended)]
+        self.flush()
+
+    def step(self, random: Random) -> bool:
+        choices = ["serve", *["hear"] * bool(self.to_server), *["take"] * bool(self.to_client)]
+        choice = random.choice(choices)
+        if choice == "serve":
+            return self.serve() or len(choices) > 1
+        self.hear() if choice == "hear" else self.take()
+        return True
+
+    def run(self, until: int = 2**60) -> None:
+        """Deliver everything in turns, until so many bytes have come or nothing is left to do."""
+        while self.reception.data_bytes < until and (self.serve() or self.to_server or self.to_client):
+            while self.to_server:
+                self.hear()
+            while self.to_client and self.reception.data_bytes < until:
+                self.take()
+
+
+def check_end(reception: Reception, kind: str, target: ls.Target) -> None:
+    """All that was promised has come, nothing twice, and shows what the target says."""
+    chosen = plan(index(kind), target)
+    assert reception.ended == chosen.ended
+    assert reception.data_bytes == reception.held.total
+    assert reception.received == chosen.bytes
+    view = reception.decoder.view()
+    assert (view.bytes, view.rms, view.max_error) == (chosen.bytes, chosen.rms, chosen.max_error)
+    expected = ls.Decoder(Wish(target.region))
+    for place in chosen.slices:
+        expected.feed_at(place.offset, container(kind)[place.offset : place.end])
+    assert np.array_equal(view.surface(target.level).points, expected.surface(target.level).points, equal_nan=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40, deadline=None)
+@given(
+    target=st.sampled_from(TARGETS),
+    window=st.sampled_from([900, 5000, 60_000]),
+    turns=st.lists(st.tuples(st.integers(0, 120), st.sampled_from([NEAR, FAR, None])), max_size=4),
+    cuts=st.lists(st.integers(0, 150), max_size=2),
+    seed=st.integers(0, 2**32),
+    stored=st.booleans(),
+)
+def test_whenever_one_looks_elsewhere_and_the_link_breaks(
+    kind: str,
+    target: ls.Target,
+    window: int,
+    turns: list[tuple[int, Region | None]],
+    cuts: list[int],
+    seed: int,
+    stored: bool,
+) -> None:
+    random, reception = Random(seed), Reception(target, store=MemoryStore() if stored else None)
+    todo = list(turns)
+    for steps in [*cuts, 10**6]:
+        link = Link(kind, target, window, reception)
+        pause = 0
+        for _ in range(steps):
+            if todo and pause >= todo[0][0]:
+                link.focus(todo.pop(0)[1])
+                pause = 0
+            pause += 1
+            if not link.step(random):
+                break
+        if reception.ended is not None:
+            break
+    check_end(reception, kind, target)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("target", TARGETS, ids=repr)
+def test_what_the_region_needs_comes_within_the_credit_that_is_outstanding(kind: str, target: ls.Target) -> None:
+    total = plan(index(kind), target).bytes
+    window = total // 50
+    link = Link(kind, target, window)
+    link.run(until=total // 8)
+    before = link.reception.data_bytes
+    link.focus(NEAR)
+    link.run()
+    near = Wish(NEAR).tiles(index(kind).header)
+    wanted = RangeSet((s.range.offset, s.range.length) for s in index(kind).segments if near[s.tile])
+    chosen = plan(index(kind), target)
+    planned = RangeSet((place.offset, place.length) for place in chosen.ranges)
+    order = [  # of what comes after the change: is it needed there?
+        any(length for place in planned.overlap(*slice_) for _, length in wanted.overlap(*place))
+        for slice_ in after(link.slices, before + window)
+        if slice_[0] < index(kind).surface_end
+    ]
+    assert order == sorted(order, reverse=True)
+    assert order.count(True) > 3
+    # A level that is small has its tiles near everything.
+    assert target.level is not None or order.count(False) > 3
+    check_end(link.reception, kind, target)
+
+
+def after(slices: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """What of these slices comes after so many bytes."""
+    left = []
+    for offset, length in slices:
+        skipped = min(length, max(count, 0))
+        count -= length
+        if length > skipped:
+            left.append((offset + skipped, length - skipped))
+    return left
+
+
+@pytest.mark.parametrize("kind", ["integers", "holes"])
+def test_the_region_is_exact_long_before_the_rest(kind: str) -> None:
+    whole = ls.decode(container(kind)).points
+    link = Link(kind, ls.Target(), 2000)
+    link.focus(NEAR)
+    link.run()
+    place = tuple(slice(*span) for span in NEAR)
+    first = next(view for view in link.views if np.array_equal(view.window(NEAR).points, whole[place]))
+    assert first.bytes < 0.5 * index(kind).surface_end
+    assert not np.array_equal(first.points, whole)
+
+
+def test_errors_that_are_told_are_those_of_the_picture() -> None:
+    link = Link("integers", ls.Target(), 2000)
+    link.run(until=9000)
+    link.focus(NEAR)
+    link.run()
+    whole = ls.decode(container("integers")).points
+    known = [view for view in link.views if not math.isnan(view.rms)]
+    assert len(known) > 2
+    assert len(known) < len(link.views)
+    for view in known:
+        error = view.points.astype(float) - whole
+        assert math.isclose(view.rms, np.sqrt(np.mean(error**2)), rel_tol=1e-9, abs_tol=1e-12)
+        assert view.max_error == np.abs(error).max()
+
+
+def test_a_window_of_a_view_is_what_a_receiver_of_that_region_sees() -> None:
+    target = ls.Target(region=FAR)
+    decoder = ls.Decoder(Wish(FAR))
+    for place in plan(index("holes"), target).slices:
+        decoder.feed_at(place.offset, container("holes")[place.offset : place.end])
+    whole = ls.Decoder()
+    whole.feed(container("holes"))
+    window = whole.view().window(FAR)
+    assert np.array_equal(window.points, decoder.surface().points)
+    inner = (FAR[0], (500, 520))
+    assert np.array_equal(decoder.view().window(inner).points, window.points[:, 50:70])
+    with pytest.raises(OptionError, match="inside the one received"):
+        decoder.view().window(NEAR)
+    with pytest.raises(OptionError, match="expected rows within"):
+        whole.view().window(((0, 500), (0, 10)))
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=repr)
+def test_what_the_server_says_of_layers_is_what_the_client_sees(target: ls.Target) -> None:
+    link = Link("floats", target, 2000)
+    link.run(until=20_000)
+    link.focus(FAR)
+    link.run(until=60_000)
+    link.focus(None)
+    link.run()
+    told = [(layer.level, layer.bytes, layer.rms, layer.max) for layer in link.layers]
+    seen = [(view.level, view.bytes, view.rms, view.max_error) for view in link.views]
+    certain = [figures for figures in told if not math.isnan(figures[2])]
+    assert certain
+    assert set(certain) <= set(seen)
+    assert [layer.bytes for layer in link.layers] == sorted(layer.bytes for layer in link.layers)
+
+
+def test_many_changes_cost_as_much_as_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def counted(*arguments: object) -> object:
+        calls.append(arguments)
+        return focused(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("lodestream.sender.focused", counted)
+    server = Sender(index("integers"), hashlib.sha256(container("integers")).hexdigest())
+    server.receive(serialize(Open(credit=0)))
+    assert server.next_message() is not None
+    for number in range(1000):
+        server.receive(serialize(Focus(((number % 300, 350), (0, 10)))))
+        assert server.next_message() is None
+        assert server.wanted() is None
+    assert not calls
+    server._connection.credit = MAX_DATA
+    assert server.wanted() is not None
+    assert len(calls) == 1
+
+
+def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
+    link = Link("integers", ls.Target(), MAX_DATA)
+    link.hear()
+    while (wanted := link.server.wanted()) is None or link.server.layers < 3:
+        link.serve()
+    link.focus(FAR)
+    link.hear()
+    assert link.server.wanted() != wanted
+    link.server.provide(wanted, container("integers")[wanted.offset : wanted.end])
+    link.run()
+    check_end(link.reception, "integers", ls.Target())
+
+
+@pytest.mark.parametrize("region", [((0, 401), (0, 5)), ((0, 5), (530, 531))])
+def test_a_region_outside_is_refused_on_either_side(region: Region) -> None:
+    link = Link("integers", ls.Target(), 2000)
+    link.run(until=5000)
+    with pytest.raises(OptionError, match=r"expected (rows|columns) within"):
+        link.client.focus(region)
+    with pytest.raises(MessageError, match=r"expected (rows|columns) within") as refused:
+        link.server.receive(serialize(Focus(region)))
+    assert refused.value.code == "bad-target"
+    link.run()
+    check_end(link.reception, "integers", ls.Target())
+
+
+@pytest.mark.parametrize("region", [((5, 5), (0, 5)), ((0, 5), (7, 6)), ((-1, 5), (0, 5))])
+def test_a_region_without_a_point_is_refused_before_anything_is_known(region: Region) -> None:
+    with pytest.raises(OptionError, match="at least one row and column"):
+        Reception().focus(region)
+    with pytest.raises(OptionError, match="at least one row and column"):
+        Focus(region)
+
+
+def test_a_focus_after_the_end_does_nothing() -> None:
+    link = Link("integers", ls.Target(max_bytes=9000), 3000)
+    link.run()
+    link.focus(NEAR)
+    assert not link.to_server
+    check_end(link.reception, "integers", ls.Target(max_bytes=9000))
