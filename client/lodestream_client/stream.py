@@ -96,7 +96,7 @@ class BaseStream:
         # The download is told things by whoever iterates and by whoever stops, which may be two threads.
         self._lock = threading.RLock()
         self._stopped = False
-        self._turned = False  # a focus has come, and the next part is to obey it
+        self._turns = 0  # how often the focus has changed
         self._abandoned = False
         self._close_by: float | None = None
         self._connections = 0
@@ -230,9 +230,9 @@ class BaseStream:
                 return
 
     def _by_socket(self) -> Way:
-        download = Download(window=self._window, reception=self._reception)
         with self._lock:
-            self._download = None
+            turns, self._download = self._turns, None
+            download = Download(window=self._window, reception=self._reception)
         began = time.monotonic()
         subprotocol = yield self._dial(addresses.stream_url(self.url, to_address(download.opening)))
         self._connections += 1
@@ -246,6 +246,8 @@ class BaseStream:
             self._download = download
             if self._stopped:
                 download.stop()
+            elif self._turns != turns:
+                download.focus(self._reception.region)
         self._roads.met = True
         while self.ended is None:
             left = self._tick()
@@ -270,6 +272,7 @@ class BaseStream:
             left = self._tick_parts(download)
             if self.ended is not None:
                 break
+            turns = self._turns
             request = self._next_part(download)
             if request is None:
                 break
@@ -283,7 +286,7 @@ class BaseStream:
                     yield from self._pace(len(piece))
                     self._take(lambda piece=piece: download.receive(piece))  # type: ignore[misc]
                     self._tick_parts(download)
-                    if self.ended is not None or (self._turned and download.left > MIN_WINDOW):
+                    if self.ended is not None or (self._turns != turns and download.left > MIN_WINDOW):
                         break
             except SilenceError:
                 self._tick_parts(download)
@@ -291,7 +294,7 @@ class BaseStream:
                     raise
             if self.ended is not None:
                 break
-            if self._turned and download.left > MIN_WINDOW:
+            if self._turns != turns and download.left > MIN_WINDOW:
                 download.leave()
                 yield self._hang_up()
             else:
@@ -300,7 +303,6 @@ class BaseStream:
 
     def _next_part(self, download: RangeDownload) -> Any:
         made: list[Any] = []
-        self._turned = False
 
         def ask() -> list[DownloadEvent]:
             request, events = download.request(time.monotonic())
@@ -359,7 +361,7 @@ class BaseStream:
                 self._download.focus(region)
             else:
                 self._reception.focus(region)
-                self._turned = True
+            self._turns += 1
 
     def _over(self) -> bool:
         """Whether a connection that broke is not to be replaced, since nothing more is wanted."""

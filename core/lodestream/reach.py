@@ -85,9 +85,9 @@ def _coefficients(samples: Mask, step: AxisStep) -> Mask:
     table = step.extension(_UPDATE)
     inside = (around >= 0) & (around < step.midpoints)
     details[around[inside]] = True
-    details[table[around[around < 0] + _UPDATE, 0]] = True
-    beyond = around[around >= step.midpoints] - step.midpoints + _UPDATE
-    details[table[beyond, 0]] = True
+    beyond = np.concatenate([around[around < 0], around[around >= step.midpoints] - step.midpoints]) + _UPDATE
+    mirrored, sign = table[beyond].T
+    details[mirrored[sign != 0]] = True
     places = (np.flatnonzero(details)[:, None] + _PREDICT).ravel()
     if step.wraps:
         nodes[places % step.run] = True

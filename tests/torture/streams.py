@@ -26,6 +26,7 @@ from tenacity import wait_random_exponential
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
+from lodestream.target import Region
 from lodestream_client import aio, roads, sync
 from lodestream_server import running_server
 from tests.links import Link, faults_of
@@ -45,6 +46,7 @@ _TARGETS = (
     ls.Target(max_bytes=2500),
     ls.Target(until_rms=ls.Tolerance(1e-2, relative=True)),
 )
+_REGIONS: tuple[Region | None, ...] = (None, ((0, 5), (0, 5)), ((20, 31), (10, 27)))
 _TOGETHER = 16
 _SILENCE = 0.5
 _MEMORY_EACH = 500
@@ -174,13 +176,15 @@ async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, 
     path = ""
     if options["transport"] == "http" and random.random() < 0.5:
         path = f"/v1/containers/{hashlib.sha256(container).hexdigest()}.lode"
+    turning = random.random() < 0.3
     async with Link(url, faults_of(random, len(container))) as link:
         address = link.url if not path else link.url.partition("/v1/")[0] + path
         stream = aio.connect(address, target=target, silence=_SILENCE, deadline=20.0, close_timeout=_SILENCE, **options)
         try:
             async with stream:
                 async for _ in stream:
-                    pass
+                    if turning and random.random() < 0.2:
+                        await stream.focus(random.choice(_REGIONS))
         except LodestreamError as error:
             report.errors[type(error).__name__] += 1
             if not str(error):

@@ -27,7 +27,7 @@ from lodestream.container import read_index
 from lodestream.container.frames import section_extent
 from lodestream.container.sections import FOOTER_LENGTH, MAGIC
 from lodestream.errors import FormatWarning, InputError, LodestreamError, StreamError, UnsupportedVersionError
-from lodestream.messages import Bye, Credit, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+from lodestream.messages import Bye, Credit, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
@@ -223,6 +223,8 @@ def _messages() -> tuple[bytes, ...]:
         Open(held=((0, 10), (90, 7))),
         Credit(1),
         Credit(2**40),
+        Focus(((0, 9), (3, 5))),
+        Focus(),
         Stop(),
         Bye(),
         Header("ab" * 32, 1000, 900, 1.5, (950, 40), (900, 50), True),
