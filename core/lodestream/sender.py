@@ -61,7 +61,7 @@ class Sender:
         self._slices: deque[ByteRange] = deque()
         self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
         self._provided = 0
-        self._held = RangeSet()  # by the client, soon or already
+        self._held = RangeSet()  # that, and what has been provided
         self._focus: Region | None = None
         self._changed = False  # the focus, and the order has not followed yet
         self._ended = "complete"
