@@ -210,13 +210,13 @@ def channel_picture(
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
-    canvases: Sequence[NDArray[np.int32]] | None = None,
+    canvases: list[NDArray[np.int32]] | None = None,
 ) -> Picture:
     """One channel of the grids of ``level`` in a state.
 
     Parameters
     ----------
-    canvases : int32 arrays from `allocate`, optional
+    canvases : list of int32 arrays, optional
         Of the shapes of the level, one for each grid, where the picture is made; new ones otherwise.
 
     Returns
@@ -229,10 +229,9 @@ def channel_picture(
     while whole < level and not state[layout.tiles_of(whole + 1)].any():
         whole += 1
     fraction = header.fraction if whole < level else 0
-    coefficients = [
-        allocate(layout.shape(number, level)) if canvases is None else canvases[number]
-        for number in range(len(layout.grids))
-    ]
+    for canvas in canvases or ():
+        canvas.fill(0)
+    coefficients = canvases or [allocate(layout.shape(number, level)) for number in range(len(layout.grids))]
     tiles.spread_levels(level, state, coefficients, whole, fraction)
     inverse(coefficients, layout, header.predictors[channel], level, whole, fraction, channel < header.geometric)
     return coefficients, fraction

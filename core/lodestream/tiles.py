@@ -122,12 +122,15 @@ class Tiles:
     ) -> None:
         """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
 
-        ``coefficients`` are arrays of the grids. Those of levels above ``whole`` are multiplied by 2**fraction.
+        ``coefficients`` are arrays of the grids, zeros so far: tiles that were not announced are passed over. Those of
+        levels above ``whole`` are multiplied by 2**fraction.
         """
         tiles_of = self.table.layout.tiles_of
         last = self.table.first[tiles_of(level).stop]
         for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
-            self._spread(numbers[numbers < last], state, array, tiles_of(whole).stop, fraction)
+            chosen = numbers[numbers < last]
+            chosen = chosen[state[self.table.windows[chosen, 0]] < UNANNOUNCED]
+            self._spread(chosen, state, array, tiles_of(whole).stop, fraction)
 
     def _spread(
         self, numbers: NDArray[np.int64], state: NDArray[np.int8], array: NDArray[np.int32], finer: int, fraction: int
