@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lodestream.seams import restore
-from tests.core.test_real_surfaces import DATA, ROWS, Row, of, read, valid_of
+from tests.core.test_real_surfaces import DATA, ROWS, Row, needed, of, read, valid_of
 
 from .conftest import Run
 
@@ -18,6 +18,7 @@ NAMES = ("SainteHelens.dem", "lidar_dsm_2m.tif", "topobathy.npz", "fuji.png", "c
 
 
 def push(run: Run, server: str, row: Row) -> str:
+    needed(row)
     options = [word for key, value in row.options.items() if key != "closed" for word in ("-o", f"{key}={value}")]
     closed = ["--closed", row.options["closed"]] if "closed" in row.options else []
     code, out, err = run("push", *(DATA / name for name in row.files), server, *closed, *options)

@@ -81,10 +81,15 @@ names = [row.files[0] for row in ROWS]
 rows = pytest.mark.parametrize("row", ROWS, ids=names)
 
 
-def read(row: Row, **options: Any) -> Surface:
+def needed(row: Row) -> None:
+    """Skip the test where the files are not there."""
     for name in row.files:
         if not (DATA / name).exists():
             pytest.skip(f"the real file {name} is not beside this project")
+
+
+def read(row: Row, **options: Any) -> Surface:
+    needed(row)
     for suffix, library in ((".tif", "rasterio"), (".dem", "rasterio"), (".asc", "rasterio"), (".png", "PIL")):
         if row.files[0].endswith(suffix):
             pytest.importorskip(library)
