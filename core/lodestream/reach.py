@@ -15,7 +15,7 @@ from .errors import OptionError
 from .layout import Layout
 from .target import Region
 
-__all__ = ["check_region", "needed_tiles"]
+__all__ = ["check_region", "coefficients_needed", "needed_tiles"]
 
 #: Details that an update takes on either side of a node.
 _UPDATE = 10
@@ -51,7 +51,7 @@ def needed_tiles(layout: Layout, region: Region) -> Mask:
         samples[axis][start:stop] = True
     for level in range(layout.levels, 0, -1):
         # Coefficients along each axis: nodes first, details after them.
-        lines = [_coefficients(s, step) for s, step in zip(samples, layout.steps(0, level), strict=True)]
+        lines = [coefficients_needed(s, step) for s, step in zip(samples, layout.steps(0, level), strict=True)]
         for number in layout.tiles_of(level):
             for band in layout.tiles[number].bands:
                 if lines[0][slice(*band.rows)].any() and lines[1][slice(*band.columns)].any():
@@ -63,8 +63,8 @@ def needed_tiles(layout: Layout, region: Region) -> Mask:
     return needed
 
 
-def _coefficients(samples: Mask, step: AxisStep) -> Mask:
-    """Which nodes and details of a step give the samples back."""
+def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
+    """Which nodes (first) and details (after them) of a step give samples of an axis back; bool, shape (length,)."""
     if not step.midpoints:
         return samples.copy()
     line = np.zeros(step.length, np.bool_)

@@ -14,10 +14,12 @@ from . import exactness
 from .bitplanes import pass_count
 from .container.model import Header
 from .container.pieces import Window, windows
+from .crop import window_picture
 from .errors import CorruptStreamError
 from .parts import assemble, level_masks
 from .picture import store_values
 from .predictors import COEFFICIENT_BITS
+from .target import Region
 from .tiles import UNANNOUNCED, Tiles, TileTable
 from .transform import allocate, inverse
 
@@ -115,10 +117,51 @@ class Reconstruction:
                 block.clear(~mask, header.hole)
         return blocks
 
-    def _correct(self, blocks: list[Values]) -> None:
+    def window(
+        self,
+        length: int,
+        state: NDArray[np.int8],
+        region: Region,
+        corrected: bool,
+        chosen: NDArray[np.bool_],
+    ) -> Values:
+        """A window of the surface, of one grid, when the first ``length`` segments are known.
+
+        Takes memory for what the window is made of, not for the surface. See `blocks`.
+        """
+        header = self.header
+        with self._lock:
+            self._decode(length)
+            pictures = [
+                window_picture(header, channel, tiles, state[:, channel], region) if chosen[channel] else None
+                for channel, tiles in enumerate(self._tiles)
+            ]
+        shape = region[0][1] - region[0][0], region[1][1] - region[1][0]
+        arrays, channel = [], 0
+        for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
+            array = np.zeros((*shape, count), header.dtypes[channel])
+            for component in range(count):
+                if (picture := pictures[channel]) is not None:
+                    store_values(header.lattices[channel], picture, array, component)
+                channel += 1
+            arrays.append(array)
+        values = Values(arrays)
+        if corrected:
+            self._correct([values], region)
+        if (mask := header.masks[0]) is not None:
+            values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
+        return values
+
+    def _correct(self, blocks: list[Values], region: Region | None = None) -> None:
+        """Restore all windows of exactness that there are, or of a region of the only block those inside."""
+        top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
         for number, window in enumerate(windows(self.header)):
-            if number in self._pieces:
-                values = blocks[window.block].window(window)
+            inside = region is None or all(
+                a <= start and stop <= b
+                for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
+            )
+            if number in self._pieces and inside:
+                values = blocks[window.block].window(window, top, left)
                 mask = self.header.masks[window.block]
                 chosen = slice(None) if mask is None else mask[slice(*window.rows), slice(*window.columns)]
                 known = values[chosen]
@@ -243,12 +286,16 @@ class Values:
 
     arrays: list[NDArray[Any]]
 
-    def window(self, window: Window) -> NDArray[Any]:
-        """One channel in a window, a view."""
+    def window(self, window: Window, top: int = 0, left: int = 0) -> NDArray[Any]:
+        """One channel in a window, a view; the arrays begin at row ``top`` and column ``left`` of the block."""
         channel = window.channel
+        rows, columns = (
+            slice(start - first, stop - first)
+            for (start, stop), first in zip((window.rows, window.columns), (top, left), strict=True)
+        )
         for array in self.arrays:
             if channel < array.shape[2]:
-                return array[slice(*window.rows), slice(*window.columns), channel]
+                return array[rows, columns, channel]
             channel -= array.shape[2]
         raise IndexError(window.channel)
 

@@ -13,7 +13,7 @@ from .errors import OptionError
 from .reach import check_region, needed_tiles
 from .target import Region, Target
 
-__all__ = ["Selection", "Wish", "select", "wish_of"]
+__all__ = ["Selection", "Wish", "restored", "select", "wish_of"]
 
 
 @dataclass(frozen=True)
@@ -51,19 +51,22 @@ class Wish:
         """Which tiles are wanted."""
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
-        region = self.region
-        if header.corrected:
-            # A piece of exactness restores a window as a whole.
-            sizes = [2 << exponent for exponent in header.tile]
-            (top, bottom), (left, right) = (
-                (start // size * size, min(-(-stop // size) * size, length))
-                for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
-            )
-            region = (top, bottom), (left, right)
         if header.arrangement is not None:
             # A block that meets itself: what is shared may lie on the other side.
             return np.ones(len(header.layout.tiles), np.bool_)
-        return needed_tiles(header.layout, region)
+        return needed_tiles(header.layout, restored(header, self.region))
+
+
+def restored(header: Header, region: Region) -> Region:
+    """What has to be decoded for a region of the only block: a piece of exactness restores all of its own window."""
+    if not header.corrected:
+        return region
+    sizes = [2 << exponent for exponent in header.tile]
+    rows, columns = (
+        (start // size * size, min(-(-stop // size) * size, length))
+        for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
+    )
+    return rows, columns
 
 
 def wish_of(target: Target) -> Wish:

@@ -132,14 +132,28 @@ class Tiles:
             chosen = chosen[state[self.table.windows[chosen, 0]] < UNANNOUNCED]
             self._spread(chosen, state, array, tiles_of(whole).stop, fraction)
 
+    def band(self, number: int, state: NDArray[np.int8], fraction: int) -> NDArray[np.int32]:
+        """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column)."""
+        height, width = (int(n) for n in self.table.bands[number, 2:4])
+        array = np.zeros((height, width), np.int32)
+        tile, top, left = (int(n) for n in self.table.windows[number])
+        self._spread(np.array([number]), state, array, tile, fraction, (top, left))
+        return array
+
     def _spread(
-        self, numbers: NDArray[np.int64], state: NDArray[np.int8], array: NDArray[np.int32], finer: int, fraction: int
+        self,
+        numbers: NDArray[np.int64],
+        state: NDArray[np.int8],
+        array: NDArray[np.int32],
+        finer: int,
+        fraction: int,
+        origin: tuple[int, int] = (0, 0),
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows
         rows, columns = array.shape
         pitch = array.strides[0] // array.itemsize
         line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch)
+        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
@@ -192,9 +206,11 @@ def _spread(
     fraction: int,
     out: NDArray[np.int32],
     pitch: int,
+    first_row: int,
+    first_column: int,
 ) -> None:
     for band in numbers:
-        tile, top, left = windows[band, 0], windows[band, 1], windows[band, 2]
+        tile, top, left = windows[band, 0], windows[band, 1] - first_row, windows[band, 2] - first_column
         passes, shift = int(state[tile]), fraction if tile >= finer else 0
         width = bands[band, 3]
         for i in range(bands[band, 2]):

@@ -14,11 +14,11 @@ from .digest import DIGEST, values_digest
 from .errors import CorruptStreamError, InputError, OptionError
 from .heights import level_metadata, to_xyz
 from .parts import level_masks
-from .reconstruction import Reconstruction
-from .selection import Wish
-from .surface import Block, Surface
+from .reconstruction import Reconstruction, Values
+from .selection import Wish, restored
+from .surface import Block, Closed, Surface
 from .target import Region
-from .windows import window_of
+from .windows import window_closed, window_grid, window_metadata
 
 __all__ = ["View"]
 
@@ -142,25 +142,35 @@ class View:
         if asked:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
         digest = self._digest.get(DIGEST)
-        if not finest and self._wish.region is not None:
+        region = self._wish.region
+        if not finest and region is not None:
             raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")
         chosen = self._wish.channels(header)
-        grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
-        masks = level_masks(header.parts, header.layout, level, header.masks)
+        if region is None:
+            grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
+            masks = level_masks(header.parts, header.layout, level, header.masks)
+            closures: tuple[Closed, ...] = tuple(closed for _, closed in header.blocks)
+        else:
+            grids, masks = [self._window(region, chosen)], [header.masks[0]]
+            if masks[0] is not None:
+                masks = [masks[0][slice(*region[0]), slice(*region[1])]]
+            closures = (window_closed(header.closed, header.shape, region),)
         blocks = []
-        for grid, mask, (_, closed) in zip(grids, masks, header.blocks, strict=True):
+        for grid, mask, closed in zip(grids, masks, closures, strict=True):
             points, *attributes = grid.arrays
             named = {
                 kind.name: array if kind.components else array[..., 0]
                 for kind, array in zip(header.attributes, attributes, strict=True)
                 if self._wish.attributes is None or kind.name in self._wish.attributes
             }
-            if mask is not None and not mask.any():
+            if mask is not None and region is None and not mask.any():
                 mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
             points = points[..., 0] if header.flat else points
             try:
                 blocks.append(Block(points, closed, mask=mask, attributes=named))
             except InputError as error:
+                if region is not None:
+                    raise  # nothing of this window is valid
                 raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
         surface = Surface(blocks=blocks)
         if not finest and len(blocks) == 1 and header.point_channels == 1:
@@ -172,19 +182,35 @@ class View:
             values = coarse
         else:
             surface.metadata.update(_plane(header))
+            if header.plane is not None and region is not None:
+                surface.metadata.update(window_grid(header.plane["grid"], header.shape, region))
         if header.plane is not None:
             try:
                 surface = to_xyz(surface)
             except InputError as error:
                 raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
-        if self._wish.region is not None:
-            surface, values = window_of(surface, values, self._wish.region)
+        if region is not None:
+            values = window_metadata(values, header.shape, region)
         elif self.complete and finest and header.exact and digest is not None and chosen.all():
             found = values_digest(surface.blocks)
             if digest != found:
                 raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
         surface.metadata = values
         return surface
+
+    def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
+        """Points and attributes of a window of the only block."""
+        header, known = self._reconstruction.header, (self._length, self._state)
+        if header.arrangement is not None:
+            # A block that meets itself: what its sides share may lie anywhere in it.
+            whole = self._reconstruction.blocks(*known, header.levels, self._corrected, chosen)[0]
+            first = 0, 0
+        else:
+            taken = restored(header, region)
+            whole = self._reconstruction.window(*known, taken, self._corrected, chosen)
+            first = taken[0][0], taken[1][0]
+        rows, columns = (slice(a - at, b - at) for (a, b), at in zip(region, first, strict=True))
+        return Values([array[rows, columns] for array in whole.arrays])
 
 
 def _plane(header: Header) -> dict[str, Any]:
