@@ -61,7 +61,7 @@ class Sender:
         self._slices: deque[ByteRange] = deque()
         self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
         self._provided = 0
-        self._held = RangeSet()  # that, and what has been provided
+        self._given: list[tuple[int, int]] = []  # what has been provided, as runs of (offset, length)
         self._focus: Region | None = None
         self._changed = False  # the focus, and the order has not followed yet
         self._ended = "complete"
@@ -148,7 +148,11 @@ class Sender:
         if slice_.length > wanted.length:
             self._slices.appendleft(ByteRange(wanted.end, slice_.length - wanted.length))
         self._outbox.append(Segments(wanted.offset, data))
-        self._held.add(wanted.offset, wanted.length)
+        start, length = self._given[-1] if self._given else (wanted.offset, 0)
+        if start + length == wanted.offset:
+            self._given[-1:] = [(start, length + wanted.length)]
+        else:
+            self._given.append((wanted.offset, wanted.length))
         self._provided += wanted.length
         self._mark()
         self._end_if_done()
@@ -160,7 +164,7 @@ class Sender:
             chosen = plan(index, event.target, self.held)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
-        self._target, self._held = event.target, self.held.copy()
+        self._target = event.target
         self._follow(chosen.slices, chosen.marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
@@ -186,7 +190,8 @@ class Sender:
 
     def _reorder(self) -> None:
         self._changed = False
-        slices, marks = focused(self._index, plan(self._index, self._target), self._held, self._focus)
+        known = RangeSet((*self.held, *self._given))
+        slices, marks = focused(self._index, plan(self._index, self._target), known, self._focus)
         self._follow(slices, marks, 0)
 
     def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:

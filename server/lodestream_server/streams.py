@@ -9,8 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Coroutine
+from typing import Any
 
 from fastapi import APIRouter, WebSocket
 from fastapi.responses import JSONResponse
@@ -208,8 +208,8 @@ class _Session:
         while self._sender.state is not State.CLOSED:
             message = self._sender.next_message()
             if message is not None:
-                async with self._patience(self._settings.idle_seconds, "the client to take what was sent"):
-                    await self._socket.send_bytes(message)
+                sending = self._socket.send_bytes(message)
+                await _within(self._settings.idle_seconds, sending, "the client to take what was sent")
                 if self._sender.layers and self.first_surface is None:
                     self.first_surface = time.monotonic() - self._opened
                     self.metrics.first_surface(self.first_surface)
@@ -234,16 +234,7 @@ class _Session:
                 self._settings.idle_seconds,
                 "open" if self._sender.state is State.IDLE else "credit or stop",
             )
-        async with self._patience(patience, what):
-            await self._heard.wait()
-
-    @asynccontextmanager
-    async def _patience(self, seconds: float, what: str) -> AsyncIterator[None]:
-        try:
-            async with asyncio.timeout(seconds):
-                yield
-        except TimeoutError:
-            raise _SilentError(f"expected {what} within {seconds:g} s") from None
+        await _within(patience, self._heard.wait(), what)
 
     async def _fail(self, code: str, detail: str) -> None:
         self.result = code
@@ -257,6 +248,14 @@ class _Session:
             except (TimeoutError, WebSocketDisconnect, RuntimeError):
                 return
         await _close(self._socket, CODES[code].close, f"{code}: {detail}")
+
+
+async def _within(seconds: float, work: Coroutine[Any, Any, object], what: str) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await work
+    except TimeoutError:
+        raise _SilentError(f"expected {what} within {seconds:g} s") from None
 
 
 def _code(error: Exception) -> str:
