@@ -21,6 +21,10 @@ __all__ = ["Sender"]
 _SHARES = 4
 _LEAST = 4096
 
+# A change of order takes milliseconds, and asking for it a few bytes: so many are free, the others are earned.
+_FREE_TURNS = 16
+_BYTES_A_TURN = 4096
+
 
 class Sender:
     """One surface being sent.
@@ -64,6 +68,7 @@ class Sender:
         self._given: list[tuple[int, int]] = []  # what has been provided, as runs of (offset, length)
         self._focus: Region | None = None
         self._changed = False  # the focus, and the order has not followed yet
+        self._turns = 0
         self._ended = "complete"
 
     @property
@@ -118,7 +123,7 @@ class Sender:
         """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
         if self.state is not State.STREAMING or self._outbox or not self._slices or not self._connection.credit:
             return None
-        if self._changed:
+        if self._changed and self._turns < _FREE_TURNS + self._provided // _BYTES_A_TURN:
             # Not before now: of many changes, only the last one costs anything.
             self._reorder()
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
@@ -190,6 +195,7 @@ class Sender:
 
     def _reorder(self) -> None:
         self._changed = False
+        self._turns += 1
         known = RangeSet((*self.held, *self._given))
         slices, marks = focused(self._index, plan(self._index, self._target), known, self._focus)
         self._follow(slices, marks, 0)

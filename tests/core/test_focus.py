@@ -287,6 +287,25 @@ def test_many_changes_cost_as_much_as_the_last_one(monkeypatch: pytest.MonkeyPat
     assert len(calls) == 1
 
 
+def test_changes_without_end_are_earned_by_taking_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def counted(*arguments: object) -> object:
+        calls.append(arguments)
+        return focused(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("lodestream.sender.focused", counted)
+    link = Link("integers", ls.Target(), 20)
+    for number in range(200):
+        link.focus(((0, 1 + number), (0, 10)))
+        link.run(until=link.reception.data_bytes + 10)
+    assert 15 < len(calls) <= 16 + link.reception.data_bytes // 4096
+    before = len(calls)
+    link.run()
+    assert before < len(calls), "the last one is obeyed in the end"
+    check_end(link.reception, "integers", ls.Target())
+
+
 def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
     link = Link("integers", ls.Target(), MAX_DATA)
     link.hear()
