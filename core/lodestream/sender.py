@@ -17,7 +17,7 @@ from .target import Region, Target
 
 __all__ = ["Sender"]
 
-# A message takes a quarter of the credit that there is, but not so little that its framing counts.
+# A message takes a quarter of the most credit that there was, but not so little that its framing counts.
 _SHARES = 4
 _LEAST = 4096
 
@@ -69,6 +69,7 @@ class Sender:
         self._focus: Region | None = None
         self._changed = False  # the focus, and the order has not followed yet
         self._turns = 0
+        self._window = 0
         self._ended = "complete"
 
     @property
@@ -130,7 +131,8 @@ class Sender:
         until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
         # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
         credit = self._connection.credit
-        share = min(credit, max(credit // _SHARES, _LEAST))
+        self._window = max(self._window, credit)
+        share = min(credit, max(self._window // _SHARES, _LEAST))
         slice_ = self._slices[0]
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
 
