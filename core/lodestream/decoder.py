@@ -55,7 +55,7 @@ class Decoder:
         self._focus: Region | None = None
         self._turned = False
         self._early: list[tuple[int, bytes]] = []
-        self._loose: tuple[int, bytearray] | None = None
+        self._loose: dict[int, tuple[int, bytearray]] = {}  # unfinished service sections, by where each goes on
         self._footer = bytearray()
 
     def feed(self, chunk: bytes | bytearray | memoryview) -> list[View]:
@@ -294,20 +294,17 @@ class Decoder:
 
     def _take_loose(self, offset: int, data: Bytes) -> None:
         """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
-        start, run = self._loose or (offset, bytearray())
-        if start + len(run) != offset:
-            raise CorruptStreamError(f"expected bytes that continue at {start + len(run)}, got others", offset)
+        start, run = self._loose.pop(offset, (offset, bytearray()))
         run += data
-        self._loose = start, run
         kind, place = run[0], ByteRange(start, len(run))
         if kind not in (sections.INDEX, sections.METADATA):
             raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
         extent = section_extent(run, start)
         if extent is None or len(run) < extent[1]:
+            self._loose[start + len(run)] = start, run
             return
         if len(run) > extent[1]:
             raise CorruptStreamError("expected a section by itself, got bytes after it", start + extent[1])
-        self._loose = None
         if kind == sections.METADATA:
             self._take_metadata(read_metadata(bytes(run), place))
         elif self.header is not None:
@@ -320,6 +317,8 @@ class Decoder:
                 self._slices.continue_file(self._frames.position)
                 self._follow_focus()
                 self._take_slice(self._frames.position, self._frames.rest())
+                for begun, part in self._loose.values():
+                    self._take_slice(begun, bytes(part))
             else:
                 self._follow_focus()
                 if (state := self._slices.state()) is not None:

@@ -346,3 +346,24 @@ def test_a_focus_after_the_end_does_nothing() -> None:
     link.focus(NEAR)
     assert not link.to_server
     check_end(link.reception, "integers", ls.Target(max_bytes=9000))
+
+
+def test_an_index_that_came_in_part_does_not_stand_in_the_way_of_metadata() -> None:
+    target = ls.Target(max_bytes=9000)
+    first = Link("integers", target, 300)
+    first.run(until=3000)
+    first.focus(NEAR)
+    place = index("integers").index
+    while not any(place.offset <= offset < place.end for offset, _ in first.slices):
+        first.run(until=first.reception.data_bytes + 1)
+    assert not first.reception.held.covers(place.offset, place.length)
+    second = Link("integers", target, MAX_DATA, first.reception)
+    second.hear()  # the focus is under way until all has been sent
+    while second.serve():
+        while second.to_client:
+            second.take()
+    while second.to_server:
+        second.hear()
+    second.run()
+    check_end(first.reception, "integers", target)
+    assert first.reception.decoder.metadata is not None
