@@ -223,8 +223,6 @@ def _messages() -> tuple[bytes, ...]:
         Open(held=((0, 10), (90, 7))),
         Credit(1),
         Credit(2**40),
-        Focus(((0, 9), (3, 5))),
-        Focus(),
         Stop(),
         Bye(),
         Header("ab" * 32, 1000, 900, 1.5, (950, 40), (900, 50), True),
@@ -232,11 +230,14 @@ def _messages() -> tuple[bytes, ...]:
         Layer(1, 2, 3, 0.5, 0.25),
         End("complete"),
         Error("idle", "title", "detail"),
+        Focus(((0, 9), (3, 5))),
+        Focus(),
     ]
     # Several in a row, each after its length, as a stranger would send them.
     single = [serialize(event) for event in (*opens, *others)]
     talks = [[message] for message in single]
     talks += [[single[1], single[4], single[6]], [single[2], single[4], single[5], single[6], single[7]]]
+    talks += [[single[1], single[-2], single[4], single[-1], single[6]]]
     return tuple(map(_join, talks))
 
 
