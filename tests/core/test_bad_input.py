@@ -19,6 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream import formats
+from lodestream.decoder import decode
+from lodestream.encoder import encode
 from lodestream.errors import FormatError, InputError, OptionError, TooLargeError
 from lodestream.surface import Surface
 
@@ -359,3 +361,25 @@ def test_damaged_files_give_a_surface_or_a_refusal(kind: str, edits: list[tuple[
     else:
         assert "expected" in str(outcome)
         assert str(outcome).isprintable()
+
+
+def test_a_signalling_nan_is_a_hole_like_any_other(tmp_path: Path) -> None:
+    heights = np.add.outer(np.arange(9.0), np.arange(7.0)).astype(np.float32) ** 2
+    heights.view(np.uint32)[3, 3] = 0xFFA00000
+    for points in (heights, np.stack([heights, heights, heights], axis=2)):
+        back = decode(encode(points)).points
+        assert np.array_equal(back, points, equal_nan=True)
+    triangles = np.array([[i, i + 1, i + 8] for i in range(56)] + [[i, i + 8, i + 7] for i in range(56)])
+    triangles = triangles[np.tile(np.arange(56) % 7 != 6, 2)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {heights.size}"]
+    lines += [f"property float {name}" for name in "xyz"]
+    lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    rows, columns = np.mgrid[:9, :7].astype(np.float32)
+    vertices = np.stack([columns, rows, heights], axis=2).astype("<f4")
+    vertices.view(np.uint32)[3, 3, 2] = 0xFFA00000
+    faces = b"".join(b"\x03" + triangle.astype("<i4").tobytes() for triangle in triangles)
+    path = tmp_path / "mesh.ply"
+    path.write_bytes("\n".join(lines).encode() + vertices.tobytes() + faces)
+    surface = formats.read(path)
+    assert sorted(surface.shape) == [7, 9]
+    assert np.isnan(surface.points).any(axis=2).sum() == 1

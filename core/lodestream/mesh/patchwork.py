@@ -129,7 +129,8 @@ def _poles_and_pairs(
             f"expected quads, or triangles only in fans round a vertex (a pole), got triangles elsewhere: "
             f"{name_faces(mesh, polygons.origin[misfits])}; make quads of them, or all faces triangles"
         )
-    points = mesh.vertices.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        points = mesh.vertices.astype(np.float64)
     halves = triangle & ~mixed
     open_faces = halves & ~polygons.folded
     # First as they are, where every inner vertex has six triangles; then without poles; then in the order of the file.
