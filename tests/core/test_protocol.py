@@ -231,7 +231,7 @@ def test_each_error_code_has_a_close_code_that_an_application_may_use() -> None:
         assert code.title
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_every_interleaving_of_honest_peers_ends(data: st.DataObject) -> None:
     """Messages cross in any order; nobody is ever accused, credit is never negative, and `stop` always ends."""
