@@ -233,6 +233,24 @@ def test_errors_that_are_told_are_those_of_the_picture() -> None:
         assert view.max_error == np.abs(error).max()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_layers_that_come_whole_after_all_are_shown_once(kind: str) -> None:
+    data, table = container(kind), index(kind).index
+    decoder = ls.Decoder()
+    expected = decoder.feed(data)
+    decoder = ls.Decoder()
+    decoder.focus(None)
+    for start in range(0, index(kind).surface_end, 3000):
+        if start == 9000:
+            decoder.feed_at(table.offset, data[table.offset : table.end])
+        decoder.feed_at(start, data[start : min(start + 3000, index(kind).surface_end)])
+    assert figures(decoder.layers) == figures(expected)
+
+
+def figures(views: Sequence[View]) -> list[tuple[float, ...]]:
+    return [(view.number, view.level, view.bytes, view.rms, view.max_error) for view in views]
+
+
 def test_a_window_of_a_view_is_what_a_receiver_of_that_region_sees() -> None:
     target = ls.Target(region=FAR)
     decoder = ls.Decoder(Wish(FAR))

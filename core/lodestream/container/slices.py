@@ -183,6 +183,7 @@ class Slices:
 
     def state(self) -> State | None:
         """The state that is complete now, if it is one; the first ones may need no segment at all."""
+        risen = self._risen()
         layer = self._by_layer.whole(self._held)
         if layer is not None:
             record = self._index.layers[layer]
@@ -199,14 +200,17 @@ class Slices:
             figures = self._figures(known.rms, known.max_error)
             return State(level, level, self._bytes, *figures, False, False, level)
         # Out of order, what is whole stands beside parts of what comes later.
-        if self._reached is None:
-            return None
-        before, self._reached = self._reached, self._groups_reached()
-        risen = [now for was, now in zip(before, self._reached, strict=True) if now > was]
         if not risen:
             return None
         whole_near = bool(self._near) and self._near[0].reached == len(self._index.layers) - 1
         return State(max(risen), self._finest, self._bytes, math.nan, math.nan, False, False, whole_near=whole_near)
+
+    def _risen(self) -> list[int]:
+        """What has become whole since this was asked last; nothing while all comes in order."""
+        if self._reached is None:
+            return []
+        before, self._reached = self._reached, self._groups_reached()
+        return [now for was, now in zip(before, self._reached, strict=True) if now > was]
 
     def _groups_reached(self) -> list[int]:
         """How far layers are whole everywhere and in the focus; and levels, where these are what comes in turn."""
