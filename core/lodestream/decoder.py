@@ -53,6 +53,7 @@ class Decoder:
         self._frames = FrameReader()
         self._slices: Slices | None = None
         self._focus: Region | None = None
+        self._near: NDArray[np.bool_] | None = None  # the tiles of the focus, once slices come by the index
         self._turned = False
         self._early: list[tuple[int, bytes]] = []
         self._loose: dict[int, tuple[int, bytearray]] = {}  # unfinished service sections, by where each goes on
@@ -268,9 +269,8 @@ class Decoder:
             # The index says that there is nothing more of these levels.
             levels = state[: self.header.layout.tiles_of(made.whole_level).stop]
             levels[levels == UNANNOUNCED] = 0
-        if self.header is not None and made.whole_near and self._focus is not None:
-            near = state[Wish(self._focus).tiles(self.header)]
-            state[Wish(self._focus).tiles(self.header)] = np.where(near == UNANNOUNCED, 0, near)
+        if made.whole_near and self._near is not None:
+            state[self._near[:, None] & (state == UNANNOUNCED)] = 0
         if self.header is not None and self._wish.region is not None:
             # What lies outside has no part in the window.
             state[~self._wanted] = 0
@@ -326,8 +326,8 @@ class Decoder:
 
     def _follow_focus(self) -> None:
         if self._turned and self._slices is not None and self.header is not None:
-            region = self._focus
-            self._slices.focus(None if region is None else Wish(region).tiles(self.header))
+            self._near = None if self._focus is None else Wish(self._focus).tiles(self.header)
+            self._slices.focus(self._near)
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
         assert self._slices is not None

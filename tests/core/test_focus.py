@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.container import Index, read_index
+from lodestream.container import Header, Index, read_index
 from lodestream.download import Download, Ended
 from lodestream.errors import OptionError
 from lodestream.focus import focused
@@ -303,6 +304,24 @@ def test_many_changes_cost_as_much_as_the_last_one(monkeypatch: pytest.MonkeyPat
     server._connection.credit = MAX_DATA
     assert server.wanted() is not None
     assert len(calls) == 1
+
+
+def test_a_view_does_not_look_again_for_the_tiles_of_the_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = []
+
+    def counted(wish: Wish, header: Header) -> NDArray[np.bool_]:
+        looked.append(wish)
+        return tiles(wish, header)
+
+    tiles = Wish.tiles
+    link = Link("integers", ls.Target(), 2000)
+    link.focus(NEAR)
+    link.run(until=60_000)
+    monkeypatch.setattr(Wish, "tiles", counted)
+    views = len(link.views)
+    link.run()
+    assert len(link.views) > views + 3
+    assert not looked
 
 
 def test_changes_without_end_are_earned_by_taking_something(monkeypatch: pytest.MonkeyPatch) -> None:
