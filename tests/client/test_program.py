@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +116,15 @@ def test_a_closed_pipe_is_quiet(container_file: Path, arguments: tuple[str, ...]
     assert done.stderr == b""
 
 
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """Programs that are started heed them, also where these tests run in the background and ignore them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interrupts")
 def test_an_interrupt_ends_quietly(tmp_path: Path) -> None:
     heard = threading.Event()
 
