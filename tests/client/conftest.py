@@ -1,4 +1,4 @@
-"""A server on a real socket with one surface, shared by the tests of a file."""
+"""A server on a real socket with one surface, shared by all tests of the client."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def container_file(terrain_file: Path) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with running_server(tmp_path_factory.mktemp("server") / "data", workers=1) as url:
         yield url
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def surface(server: str, terrain_file: Path) -> str:
     return upload(server, terrain_file).url
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
@@ -19,7 +18,6 @@ from lodestream.errors import OptionError
 from lodestream.reception import MemoryStore
 from lodestream.target import Region
 from lodestream_client import aio, roads, sync
-from lodestream_server import running_server
 from tests.links import Fault, linked
 
 NEAR: Region = ((0, 50), (0, 60))
@@ -41,9 +39,8 @@ def heights() -> Heights:
 
 
 @pytest.fixture(scope="module")
-def surface(heights: Heights, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with running_server(tmp_path_factory.mktemp("server") / "data", workers=1) as server:
-        yield sync.upload(server, ls.Surface(heights)).url
+def surface(server: str, heights: Heights) -> str:
+    return sync.upload(server, ls.Surface(heights)).url
 
 
 def container(surface: str) -> bytes:
@@ -161,12 +158,11 @@ def test_a_region_that_is_not_there(surface: str, transport: roads.Transport) ->
         assert next(stream)
 
 
-def test_a_surface_of_several_blocks_has_no_regions(tmp_path: Path) -> None:
+def test_a_surface_of_several_blocks_has_no_regions(server: str, tmp_path: Path) -> None:
     sheet = np.random.default_rng(1).normal(size=(30, 30, 3))
     ls.write(ls.Surface(blocks=[ls.Block(sheet), ls.Block(sheet + 9)]), tmp_path / "sheets.obj")
-    with running_server(tmp_path / "data", workers=1) as server:
-        blocks = sync.upload(server, tmp_path / "sheets.obj").url
-        with sync.connect(blocks, window=500) as stream:
-            next(stream)
-            with pytest.raises(OptionError, match="expected no region of a surface of 2 blocks"):
-                stream.focus(NEAR)
+    blocks = sync.upload(server, tmp_path / "sheets.obj").url
+    with sync.connect(blocks, window=500) as stream:
+        next(stream)
+        with pytest.raises(OptionError, match="expected no region of a surface of 2 blocks"):
+            stream.focus(NEAR)

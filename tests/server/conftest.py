@@ -8,7 +8,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from lodestream_server import running_server
+from lodestream_server import running_server, worker
+from tests.server import slow
 
 
 @pytest.fixture(scope="module")
@@ -26,3 +27,11 @@ def server(data: Path) -> Iterator[str]:
 def http(server: str) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server, trust_env=False, timeout=60) as client:
         yield client
+
+
+@pytest.fixture
+def unwarmed() -> Iterator[None]:
+    """Servers whose processes load the kernels that a build needs when it needs them, not all at their start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "warm", slow.number)
+        yield
