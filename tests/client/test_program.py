@@ -154,7 +154,13 @@ def test_no_colours_and_no_bars_where_there_is_no_terminal(container_file: Path,
 
 def test_the_demo(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the demo draws with matplotlib")
-    done = call("demo", "--out", tmp_path / "demo", "--json")
+    # As the command does it, over a link that is ten times as fast.
+    code = (
+        "import importlib, sys; from lodestream_client.__main__ import main;"
+        "importlib.import_module('lodestream_client.demo.show')._LINK *= 10; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "demo", "--out", str(tmp_path / "demo"), "--json"]
+    done = subprocess.run(command, capture_output=True, env=environment(), timeout=120, check=False)
     assert done.returncode == 0, done.stderr.decode()
     shown = json.loads(done.stdout)
     assert [it["name"] for it in shown["surfaces"]] == ["jacksboro", "torus"]
