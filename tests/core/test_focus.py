@@ -135,7 +135,7 @@ def check_end(reception: Reception, kind: str, target: ls.Target) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     target=st.sampled_from(TARGETS),
     window=st.sampled_from([900, 5000, 60_000]),

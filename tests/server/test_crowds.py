@@ -10,7 +10,7 @@ from tests.server.programs import server
 from tests.torture import crowd
 from tests.torture.parts import sent
 
-COUNT = 20
+COUNT = 10
 
 
 def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from tests.server.helpers import eventually, hills, npy, push, settled
 from tests.server.test_builds import running
 from tests.torture import small_disk
 
+pytestmark = pytest.mark.usefixtures("unwarmed")
+
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,5 +137,5 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.skipif(not small_disk.can_mount(), reason="no small disk can be mounted on this machine")
 def test_a_disk_that_is_really_small(tmp_path: Path) -> None:
-    done = small_disk.run(tmp_path, 40)
+    done = small_disk.run(tmp_path, 20, size="300k")
     assert min(done.uploads, done.refused, done.deletes, done.kept) > 0

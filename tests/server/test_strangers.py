@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from tests.torture.targets import EDGES, KINDS, TARGETS, Edit, edit
 
-#: Enough to be thousands together, few enough for every run; `make torture` does a million of each.
-CASES = {"containers": 700, "messages": 2000, "uploads": 700}
+#: Few enough for every run; `make torture` does a million of each.
+CASES = {"containers": 400, "messages": 800, "uploads": 400}
 
 EDITS = st.builds(
     Edit,
