@@ -21,6 +21,10 @@ _FIRST_LAYER = 48  # bytes of coefficients in the first layer
 _LEAST_GROWTH = 1.3
 _LEAST_LAYER = 160  # bytes: a layer's frame takes about 30
 _LAST_LOSSY = 0.92
+# Of streams made for one error.
+_FEWEST = 3
+_SECOND = 16.0  # times the first layer
+_BYTES_FOR_A_LAYER = 12000
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ def hull_slopes(curve: TileCurve) -> NDArray[np.float64]:
     return np.array(slopes[::-1])
 
 
-def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> list[NDArray[np.int8]]:
+def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
     """The state after each layer.
 
     Parameters
@@ -64,6 +68,8 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> lis
     layout : Layout
     channels : int
         Of the surface; one whose coefficients are all 0 has no curve.
+    few : bool
+        Only so many layers that their frames are a small part of the bytes.
 
     Returns
     -------
@@ -84,7 +90,7 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int) -> lis
     )
     sizes = np.cumsum([known[tile, channel].bits[-number] / 8 for _, tile, number, channel in order])
     gains = np.cumsum([known[tile, channel].gains[-number] for _, tile, number, channel in order])
-    ends = _layer_ends(sizes, gains)
+    ends = _layer_ends(sizes, gains, few)
     states, state = [], top.copy()
     start = 0
     for end in ends:
@@ -126,7 +132,13 @@ def _targets(first: float, last: float) -> NDArray[np.float64]:
     return np.array(targets)
 
 
-def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64]) -> list[int]:
+def _few_targets(first: float, last: float) -> NDArray[np.float64]:
+    """Bytes after each layer but the complete one, where that is what was asked for."""
+    count = min(max(int(last / _BYTES_FOR_A_LAYER), _FEWEST), MOST_LAYERS)
+    return np.append(first, np.geomspace(min(_SECOND * first, last), last, count - 1)[:-1])
+
+
+def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64], few: bool) -> list[int]:
     """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
 
     Within a bit-plane the error falls faster at first than later, so some places between passes are better to stop at
@@ -138,7 +150,7 @@ def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64]) -> list[
     total = float(sizes[-1])
     first = min(_FIRST_LAYER, total)
     # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
-    targets = _targets(first, max(first, _LAST_LOSSY * total))
+    targets = _few_targets(first, total) if few else _targets(first, max(first, _LAST_LOSSY * total))
     borders = np.sqrt(targets[1:] * targets[:-1])
     starts = np.searchsorted(sizes, borders)
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))

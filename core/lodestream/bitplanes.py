@@ -35,6 +35,7 @@ from .kernels import inlined, kernel
 
 __all__ = [
     "BAND_FIELDS",
+    "BLOCK",
     "CONTEXTS",
     "code_passes",
     "new_model",
@@ -57,6 +58,9 @@ BAND_FIELDS = 10
     _COLUMN_SHIFT,
     _KIND,
 ) = range(BAND_FIELDS)
+
+#: Rows and columns of a block.
+BLOCK = 8
 
 _KINDS = 4
 _ACROSS_CONTEXTS = 4 * 5 * 5 * _KINDS

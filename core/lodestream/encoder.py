@@ -21,7 +21,9 @@ from .errors import OptionError
 from .lattice import LATTICE_BITS, Lattice
 from .picture import coordinate_distances
 from .predictors import COEFFICIENT_BITS, default_predictors
-from .preparation import Preparation
+from .preparation import FINENESS, Preparation
+from .quantiser import Quantiser
+from .rate_distortion import Chooser, longest_base
 from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
 from .surface import Block, Surface
 from .target import Tolerance
@@ -37,6 +39,9 @@ _ROUNDING = 0.2
 #: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
 _COARSER = (8, 4, 0)
 
+#: Bits of a coefficient from which on a trellis takes fewer bytes than none.
+_TRELLIS_PAYS = 0.7
+
 Figures = tuple[float, float]
 State = NDArray[np.int8]
 
@@ -45,6 +50,7 @@ def encode(
     surface: Surface | ArrayLike,
     precision: float | str | Tolerance | None = None,
     *,
+    rms: float | str | Tolerance | None = None,
     attribute_precision: Mapping[str, float | str | Tolerance] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> bytes:
@@ -58,6 +64,9 @@ def encode(
         Largest distance allowed between a point and what comes back, in the surface's unit or, as ``"1e-4d"``, times
         the range of the heights or the diagonal of the box. None: every value comes back bit for bit. Attributes come
         back bit for bit in any case, but for those with a precision of their own.
+    rms : float, str, Tolerance or None
+        Make the shortest stream whose root mean square error is at most this, in place of one that ends exactly or
+        within a precision: steps of quantisation are chosen for this error alone, and layers before the last are few.
     attribute_precision : mapping of str to float, str or Tolerance, optional
         Largest distance allowed between the values of an attribute, by its name.
     progress : callable, optional
@@ -73,7 +82,7 @@ def encode(
     InputError
         When the surface cannot be encoded, or not with this precision.
     OptionError
-        When there is no such attribute.
+        When there is no such attribute, or both a precision and an error are given.
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
@@ -83,6 +92,12 @@ def encode(
     if unknown:
         known = ", ".join(surface.blocks[0].attributes) or "none"
         raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
+    if precision is not None and rms is not None:
+        raise OptionError("expected either a precision or a root mean square error, got both")
+    if rms is not None:
+        container = _made_for(surface, _tolerance(rms), precisions, progress)
+        if container is not None:
+            return container
     prepared = Preparation(surface, (None if precision is None else _tolerance(precision), precisions))
     container = _Encoding(prepared, progress).run()
     raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
@@ -100,9 +115,31 @@ def _tolerance(precision: float | str | Tolerance) -> Tolerance:
     return precision if isinstance(precision, Tolerance) else Tolerance(float(precision))
 
 
+def _made_for(
+    surface: Surface, rms: Tolerance, precisions: Mapping[str, Tolerance], progress: Callable[[float], None]
+) -> bytes | None:
+    """The stream for this root mean square error; None where exact values are the way to meet it."""
+    prepared = Preparation(surface, (None, precisions), rms)
+    if prepared.rms is None or (lattices := prepared.fine_lattices()) is None:
+        return None
+    encoding = _Encoding(prepared, progress, lattices=lattices)
+    try:
+        container = encoding.run()
+    except Unreachable:
+        return None
+    if prepared.holds_itself():
+        exact = Preparation(surface, (None, precisions))
+        container = min(container, _Encoding(exact, progress).run(), key=len)
+    return container
+
+
 def longest(raw: int) -> int:
     """Most bytes that a container takes which restores so many bytes of values."""
     return raw + raw // 100 + 1024
+
+
+class Unreachable(Exception):
+    """No step is short enough for the error: the type of the values itself rounds by more."""
 
 
 @dataclass
@@ -117,13 +154,20 @@ class _Channel:
 class _Encoding:
     """One run of the encoder; the methods stand in the order in which they are called."""
 
-    def __init__(self, prepared: Preparation, progress: Callable[[float], None], bits: int | None = None) -> None:
+    def __init__(
+        self,
+        prepared: Preparation,
+        progress: Callable[[float], None],
+        bits: int | None = None,
+        lattices: list[Lattice] | None = None,
+    ) -> None:
         self.prepared, self.progress = prepared, progress
+        self.quantiser: Quantiser | None = None
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
         self.bits = 0
-        self.lattices = prepared.lattices(bits)
+        self.lattices = prepared.lattices(bits) if lattices is None else lattices
 
     def run(self) -> bytes:
         prepared = self.prepared
@@ -133,12 +177,31 @@ class _Encoding:
             channel, predictors[number] = self._transform(number, lattice)
             channels.append(channel)
         self.channels = channels
+        self.predictors = predictors
         self.progress(0.1)
-        states = assign_layers(self._curves(), self.layout, len(channels))
+        if prepared.rms is not None:
+            self._quantise(prepared.rms)
+        curves = self._curves()
+        self.header = self._header()
+        states = assign_layers(curves, self.layout, len(channels), self.quantiser is not None)
         self.progress(0.4)
-        surface = prepared.surface
+        states, figures = self._measured(states)
+        self.progress(0.7)
+        pieces, exact, lossless = self._pieces()
+        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
+        self.progress(0.8)
+        metadata = dict(prepared.surface.metadata)
+        if lossless:
+            metadata[DIGEST] = values_digest(_as_returned(prepared.given, self.header.hole))
+        coded = self._coded(states, figures)
+        container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
+        self.progress(1.0)
+        return container
+
+    def _header(self) -> Header:
+        prepared, surface = self.prepared, self.prepared.surface
         masks = [block.mask for block in surface.blocks]
-        self.header = Header(
+        return Header(
             dtype=surface.dtype,
             blocks=tuple((block.shape, block.closed) for block in surface.blocks),
             arrangement=prepared.arrangement,
@@ -146,10 +209,10 @@ class _Encoding:
             flat=surface.blocks[0].points.ndim == 2,
             attributes=prepared.kinds,
             lattices=tuple(self.lattices),
-            predictors=predictors,
+            predictors=self.predictors,
             extent=prepared.extent,
-            empty=tuple(self._empty_levels(channel.top) for channel in channels),
-            fraction=max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes())),
+            empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
+            fraction=self._fraction(),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
@@ -158,20 +221,52 @@ class _Encoding:
             masked=any(mask is not None for mask in masks),
             hole=_hole(surface),
             holes=tuple(block.holes for block in surface.blocks),
+            quantiser=self.quantiser,
             mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
         )
-        states, figures = self._measured(states)
-        self.progress(0.7)
-        pieces, exact, lossless = self._pieces()
-        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
-        self.progress(0.8)
-        metadata = dict(surface.metadata)
-        if lossless:
-            metadata[DIGEST] = values_digest(_as_returned(prepared.given, self.header.hole))
-        coded = self._coded(states, figures)
-        container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
-        self.progress(1.0)
-        return container
+
+    def _fraction(self) -> int:
+        """Binary places between lattice steps, which are fine enough as they are where there is a quantiser."""
+        if self.quantiser is not None:
+            return 0
+        return max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes()))
+
+    def _quantise(self, wanted: float) -> None:
+        """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
+        table, channels = self.tables[0], self.channels[: self.geometric]
+        choosers = [Chooser(table, channel.true) for channel in channels]
+        samples = self.geometric * int((table.bands[:, 2] * table.bands[:, 3]).sum())
+        state, canvases = np.zeros_like(self._all_passes()), self._canvases()
+        kept: dict[int, list[NDArray[np.int32]]] = {}
+        trellis, bits = False, 0.0
+
+        def error(base: int) -> float:
+            nonlocal bits
+            self.quantiser = Quantiser(base, trellis)
+            found = [chooser.indices(self.quantiser) for chooser in choosers]
+            bits = sum(used for _, used in found)
+            self.tiles = [Tiles(table, self.quantiser) for _ in choosers]
+            for tiles, (indices, _) in zip(self.tiles, found, strict=True):
+                tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
+            self.header = self._header()
+            rms = self._figures(state, canvases)[0]
+            if rms <= wanted:
+                kept.clear()
+                kept[base] = [indices for indices, _ in found]
+            return rms
+
+        first = error(guess := 4 * FINENESS)
+        if first > 0.0 and bits > _TRELLIS_PAYS * samples:
+            trellis = True
+            kept.clear()
+        base = longest_base(error, wanted, guess)
+        if base is None:
+            raise Unreachable
+        self.quantiser = Quantiser(base, trellis)
+        squares = table.steps(self.quantiser).astype(np.float64) ** 2
+        for channel, indices in zip(channels, kept[base], strict=True):
+            channel.true, channel.weights = indices, channel.weights * squares
+            channel.top = np.array([_top(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
 
     def _transform(self, number: int, lattice: Lattice) -> tuple[_Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
@@ -218,7 +313,8 @@ class _Encoding:
 
     def _curves(self) -> list[TileCurve]:
         """Cost and gain of every pass, by coding each tile once as a whole."""
-        coder = self._whole = _TileCoder(self._tables_of_channels(), self.channels)
+        coder = _TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        self.tiles = coder.tiles
         curves = []
         for tile in range(len(self.layout.tiles)):
             for number, channel in enumerate(self.channels):
@@ -235,7 +331,8 @@ class _Encoding:
                     rows = table.of_tile(tile)
                     pass_gains(rows, weights, passes, channel.true, early, errors)
                     gains = np.diff(errors)
-                    gains[0] += _ROUNDING * float((weights * rows[:, 2] * rows[:, 3]).sum())
+                    rounding = _ROUNDING if self.quantiser is None else 0.0
+                    gains[0] += rounding * float((weights * rows[:, 2] * rows[:, 3]).sum())
                     curves.append(TileCurve(tile, number, bits, gains))
         return curves
 
@@ -253,8 +350,7 @@ class _Encoding:
         return coordinate_distances(self.prepared.originals, lattices, canvases[curves:], fractions)
 
     def _picture(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Picture:
-        tiles = self._whole.tiles[number]
-        return channel_picture(self.header, number, tiles, state[:, number], self.layout.levels, canvases)
+        return channel_picture(self.header, number, self.tiles[number], state[:, number], self.layout.levels, canvases)
 
     def _canvases(self) -> list[NDArray[np.int32]]:
         """Room for a picture of each channel that is a coordinate, one array for each grid."""
@@ -300,7 +396,7 @@ class _Encoding:
         A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit.
         """
         prepared, pieces = self.prepared, []
-        kept = [prepared.precision is not None] * self.geometric
+        kept = [prepared.precision is not None or prepared.rms is not None] * self.geometric
         kept += [False] * (prepared.point_channels - self.geometric)
         for kind in prepared.kinds:
             kept += [kind.name in prepared.attribute_precisions] * kind.channels
@@ -331,8 +427,8 @@ class _Encoding:
 
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
-        del self._whole, self._last  # as large as what takes their place
-        coder = _TileCoder(self._tables_of_channels(), self.channels)
+        del self.tiles, self._last  # as large as what takes their place
+        coder = _TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
         before = start = self._all_passes()
         layers = []
         for state, (rms, worst) in zip(states, figures, strict=True):
@@ -350,9 +446,11 @@ class _Encoding:
 class _TileCoder:
     """Codes the tiles of all channels, plane after plane, as a reader will meet them."""
 
-    def __init__(self, tables: list[TileTable], channels: list[_Channel]) -> None:
+    def __init__(
+        self, tables: list[TileTable], channels: list[_Channel], geometric: int, quantiser: Quantiser | None
+    ) -> None:
         self._channels = channels
-        self.tiles = [Tiles(table) for table in tables]
+        self.tiles = [Tiles(table, quantiser if k < geometric else None) for k, table in enumerate(tables)]
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""

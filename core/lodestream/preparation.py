@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,18 +14,21 @@ from .arrangement import VertexCounter, grids_of
 from .container.headers import TILE_BITS
 from .container.model import AttributeKind
 from .heights import to_heights
-from .lattice import Lattice, find_lattice, offset_lattice
+from .lattice import Lattice, find_lattice, offset_lattice, precision_lattice
 from .layout import Layout
 from .measure import extent_of
 from .picture import Original
-from .quantise import DEFAULT_STEPS, attribute_lattices, choose_lattices
+from .quantise import DEFAULT_STEPS, attribute_lattices, channel_of, choose_lattices
 from .sides import Arrangement, Curve, LatticeBlock, Part, Side, arrange, stored, whole_part
 from .steps import default_steps
 from .surface import Block, Surface
 from .target import Tolerance
 from .transform import allocate
 
-__all__ = ["Precisions", "Preparation"]
+__all__ = ["FINENESS", "Precisions", "Preparation"]
+
+#: Lattice steps in the error of a coordinate that a stream is made for.
+FINENESS = 32
 
 Arrays = list[NDArray[Any]]
 #: Of the coordinates, and of attributes by name.
@@ -49,6 +53,8 @@ class Preparation:
         Range of the heights or diagonal of the box, of valid points.
     precision : float or None
         Largest distance allowed, in the surface's unit.
+    rms : float or None
+        Largest root mean square error of a stream that is made for it.
     layout : Layout
     arrangement : Arrangement or None
         None where the surface is one block that shares no side.
@@ -56,7 +62,7 @@ class Preparation:
     originals : list of Original, one for each part
     """
 
-    def __init__(self, surface: Surface, precisions: Precisions) -> None:
+    def __init__(self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None) -> None:
         self.given = surface
         surface, self.plane = _heights(surface)
         self.surface = surface
@@ -79,9 +85,11 @@ class Preparation:
         if precision is not None and precision.relative and not self.extent:
             precision = None  # a fraction of nothing: one point, which a lattice holds exactly
         self.precision = None if precision is None else precision.absolute(self.extent)
+        # Of a surface that is one point, or so near to it, every value is exact.
+        self.rms = (rms.absolute(self.extent) or None) if rms is not None and self.extent else None
         largest = max(self.arrays, key=lambda arrays: arrays[0].size)[0]
         self._steps = DEFAULT_STEPS
-        if self.precision is None:
+        if self.precision is None and self.rms is None:
             self._steps = default_steps([largest[..., channel] for channel in range(self.geometric)])
         self.arrangement = self._arranged()
         if self.arrangement is None:
@@ -105,6 +113,25 @@ class Preparation:
             values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in self.arrays])
             found += attribute_lattices(values, self.attribute_precisions.get(kind.name), bits)
         return found
+
+    def fine_lattices(self) -> list[Lattice] | None:
+        """Lattices whose steps are small beside `rms`; None where they would be too many."""
+        lattices = self.lattices(None)
+        assert self.rms is not None
+        step = self.rms / math.sqrt(self.geometric) / FINENESS
+        for channel in range(self.geometric):
+            values = channel_of(self._valid, channel)
+            low, high = float(values.min()), float(values.max())
+            lattices[channel] = precision_lattice(low, high, step)
+            if lattices[channel].step > 2 * step:
+                return None
+        return lattices
+
+    def holds_itself(self) -> bool:
+        """Whether the coordinates lie on lattices of their own as coarse as `rms`: exact streams may then be shorter."""
+        found = find_lattice(self._valid)
+        spacing = 0.0 if found is None else 1.0 / found.step if found.rule == "decimal" else found.step
+        return self.rms is not None and spacing >= self.rms
 
     def channel(self, block: int, channel: int) -> NDArray[Any]:
         """One channel of a block, shape (row, column), a view."""

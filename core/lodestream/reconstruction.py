@@ -172,7 +172,10 @@ class Reconstruction:
             header = self.header
             table = TileTable.of(header.layout)
             other = TileTable.of(header.layout, False) if header.layout.shared else table
-            self._tiles = [Tiles(table if c < header.geometric else other) for c in range(header.channels)]
+            self._tiles = [
+                Tiles(table, header.quantiser) if channel < header.geometric else Tiles(other)
+                for channel in range(header.channels)
+            ]
         return self._tiles
 
     def _decode(self, length: int) -> None:

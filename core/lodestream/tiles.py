@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .bitplanes import BAND_FIELDS, code_passes, new_model, reconstruction_point
 from .kernels import inlined, kernel
 from .layout import Band, Layout
+from .quantiser import Quantiser, spread_quantised, step_of
 
 __all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
 
@@ -82,16 +83,37 @@ class TileTable:
         described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
         return cls(layout, members, described, first, size + 8, blocks, places, of)
 
+    def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
+        """The step of each band, in lattice steps; int64, shape (band,)."""
+        found: dict[tuple[int, int, tuple[bool, bool]], int] = {}  # many tiles have bands of the same kind
+        for tile, bands in zip(self.layout.tiles, self.members, strict=True):
+            for band in bands:
+                key = tile.level, band.grid, band.kind
+                if key not in found:
+                    found[key] = step_of(band, tile.level, self.layout, quantiser)
+        return np.array(
+            [
+                found[tile.level, band.grid, band.kind]
+                for tile, bands in zip(self.layout.tiles, self.members, strict=True)
+                for band in bands
+            ],
+            np.int64,
+        )
+
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, a view."""
         return self.bands[self.first[tile] : self.first[tile + 1]]
 
 
 class Tiles:
-    """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`."""
+    """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`.
 
-    def __init__(self, table: TileTable) -> None:
-        self.table = table
+    Where there is a quantiser, they are those of indices.
+    """
+
+    def __init__(self, table: TileTable, quantiser: Quantiser | None = None) -> None:
+        self.table, self.quantiser = table, quantiser
+        self.steps = np.zeros(len(table.bands), np.int64) if quantiser is None else table.steps(quantiser)
         self.known = np.zeros(table.size, np.int32)
         self.sign = np.zeros(table.size, np.int8)
         self.flags = np.zeros(table.blocks, np.uint8)
@@ -149,11 +171,12 @@ class Tiles:
         fraction: int,
         origin: tuple[int, int] = (0, 0),
     ) -> None:
-        arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows
+        arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
+        trellis = self.quantiser is not None and self.quantiser.trellis
         rows, columns = array.shape
         pitch = array.strides[0] // array.itemsize
         line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
+        _spread(*arrays, trellis, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
@@ -200,6 +223,8 @@ def _spread(
     early: NDArray[np.uint8],
     bands: NDArray[np.int64],
     windows: NDArray[np.int64],
+    steps: NDArray[np.int64],
+    trellis: bool,
     numbers: NDArray[np.int64],
     state: NDArray[np.int8],
     finer: int,
@@ -213,6 +238,10 @@ def _spread(
         tile, top, left = windows[band, 0], windows[band, 1] - first_row, windows[band, 2] - first_column
         passes, shift = int(state[tile]), fraction if tile >= finer else 0
         width = bands[band, 3]
+        if steps[band] and passes < UNANNOUNCED:
+            place, row, step = top * pitch + left, bands[band], steps[band]
+            spread_quantised(known, sign, early, row, step, trellis, passes, out, place, pitch)
+            continue
         for i in range(bands[band, 2]):
             start = bands[band, 0] + i * bands[band, 1]
             target = (top + i) * pitch + left

@@ -12,6 +12,7 @@ from ..errors import CorruptStreamError
 from ..lattice import Lattice
 from ..layout import Layout
 from ..predictors import CURVES, default_predictors, fitted_steps
+from ..quantiser import MOST_BASE, Quantiser
 from .fields import FieldReader, FieldWriter
 from .model import Header
 from .sections import HEADER, MAGIC, MASKS, VERSION, section
@@ -31,6 +32,8 @@ TILE_BITS = 14
 #: Most binary places between lattice steps.
 MOST_FRACTION = 6
 _RULES = ("affine", "decimal")
+# Beside the binary places in their byte.
+_QUANTISED, _TRELLIS = 16, 32
 
 
 def serialize_header(header: Header) -> bytes:
@@ -43,7 +46,10 @@ def serialize_header(header: Header) -> bytes:
     out.varint(header.point_channels)
     out.varint(header.layer_count)
     out.byte(header.tile[0] | header.tile[1] << 4)
-    out.byte(header.fraction)
+    quantiser = header.quantiser
+    out.byte(header.fraction | (0 if quantiser is None else _QUANTISED | (_TRELLIS if quantiser.trellis else 0)))
+    if quantiser is not None:
+        out.varint(quantiser.base)
     out.pack("d", header.extent)
     if header.arrangement is None:
         out.varint(header.shape[0])
@@ -99,8 +105,15 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
     point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
-    exponents, fraction = fields.byte(), fields.byte()
+    exponents, how = fields.byte(), fields.byte()
     tile = exponents & 15, exponents >> 4
+    fraction, quantiser = how & 15, None
+    if how >> 6 or how & (_QUANTISED | _TRELLIS) == _TRELLIS:
+        raise CorruptStreamError(f"expected a known way of quantising, got {how >> 4}", offset)
+    if how & _QUANTISED:
+        quantiser = Quantiser(fields.varint(MOST_BASE), bool(how & _TRELLIS))
+        if quantiser.base == 0:
+            raise CorruptStreamError("expected steps of 1 or more, got 0", offset)
     (extent,) = fields.unpack("d")
     arrangement = None
     if flags & 64:
@@ -120,8 +133,9 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
     if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
-    if fraction > MOST_FRACTION:
-        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
+    most = MOST_FRACTION if quantiser is None else 0
+    if fraction > most:
+        raise CorruptStreamError(f"expected at most {most} binary places, got {fraction}", offset)
     if not (math.isfinite(extent) and extent >= 0):
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = []
@@ -160,5 +174,6 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         layer_count=layer_count,
         plane=plane,
         masked=bool(flags & 32),
+        quantiser=quantiser,
         length=length,
     )

@@ -14,6 +14,7 @@ from ..arrangement import grids_of
 from ..lattice import Lattice
 from ..layout import Layout
 from ..parts import level_shapes
+from ..quantiser import Quantiser
 from ..sides import Arrangement, Part, whole_part
 from ..surface import Closed
 
@@ -89,6 +90,8 @@ class Header:
         Points that are not valid.
     mask_data : tuple of bytes, one for each block
         Coded masks; empty where all points are valid.
+    quantiser : Quantiser or None
+        How the coefficients of coordinates are quantised; None: in whole lattice steps.
     length : int
         Bytes from the start of the container to the end of the header and the masks.
     """
@@ -113,6 +116,7 @@ class Header:
     hole: int = 0
     holes: tuple[int, ...] = ()
     mask_data: tuple[bytes, ...] = ()
+    quantiser: Quantiser | None = None
     length: int = 0
 
     @property
