@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import exactness
 from .allocation import TileCurve, assign_layers
-from .bitplanes import code_passes, pass_count, pass_gains
+from .bitplanes import pass_count, pass_gains
 from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.pieces import Window, windows
@@ -27,6 +26,7 @@ from .rate_distortion import Chooser, longest_base
 from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
 from .surface import Block, Surface
 from .target import Tolerance
+from .tile_coder import Channel, TileCoder, planes_of
 from .tiles import Tiles, TileTable, gather
 from .transform import PADDING, forward, synthesis_norms
 
@@ -125,7 +125,7 @@ def _made_for(
     encoding = _Encoding(prepared, progress, lattices=lattices)
     try:
         container = encoding.run()
-    except Unreachable:
+    except _UnreachableError:
         return None
     if prepared.holds_itself():
         exact = Preparation(surface, (None, precisions))
@@ -138,17 +138,8 @@ def longest(raw: int) -> int:
     return raw + raw // 100 + 1024
 
 
-class Unreachable(Exception):
+class _UnreachableError(Exception):
     """No step is short enough for the error: the type of the values itself rounds by more."""
-
-
-@dataclass
-class _Channel:
-    """One channel on its way: coefficients with signs, flat, and what they weigh."""
-
-    true: NDArray[np.int32]
-    weights: NDArray[np.float64]  # a band
-    top: NDArray[np.int8]  # a tile
 
 
 class _Encoding:
@@ -261,14 +252,14 @@ class _Encoding:
             kept.clear()
         base = longest_base(error, wanted, guess)
         if base is None:
-            raise Unreachable
+            raise _UnreachableError
         self.quantiser = Quantiser(base, trellis)
         squares = table.steps(self.quantiser).astype(np.float64) ** 2
         for channel, indices in zip(channels, kept[base], strict=True):
             channel.true, channel.weights = indices, channel.weights * squares
-            channel.top = np.array([_top(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
+            channel.top = np.array([planes_of(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
 
-    def _transform(self, number: int, lattice: Lattice) -> tuple[_Channel, NDArray[np.int8]]:
+    def _transform(self, number: int, lattice: Lattice) -> tuple[Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
@@ -291,8 +282,8 @@ class _Encoding:
                 for band in bands
             ]
         )
-        top = np.array([_top(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
-        return _Channel(true, weights, top), predictors
+        top = np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
+        return Channel(true, weights, top), predictors
 
     def _table(self, channel: int) -> TileTable:
         return self.tables[0 if channel < self.geometric else 1]
@@ -313,7 +304,7 @@ class _Encoding:
 
     def _curves(self) -> list[TileCurve]:
         """Cost and gain of every pass, by coding each tile once as a whole."""
-        coder = _TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
         self.tiles = coder.tiles
         curves = []
         for tile in range(len(self.layout.tiles)):
@@ -428,7 +419,7 @@ class _Encoding:
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self.tiles, self._last  # as large as what takes their place
-        coder = _TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
         before = start = self._all_passes()
         layers = []
         for state, (rms, worst) in zip(states, figures, strict=True):
@@ -441,48 +432,6 @@ class _Encoding:
             layers.append(CodedLayer(rms, worst, segments))
             before = state
         return layers
-
-
-class _TileCoder:
-    """Codes the tiles of all channels, plane after plane, as a reader will meet them."""
-
-    def __init__(
-        self, tables: list[TileTable], channels: list[_Channel], geometric: int, quantiser: Quantiser | None
-    ) -> None:
-        self._channels = channels
-        self.tiles = [Tiles(table, quantiser if k < geometric else None) for k, table in enumerate(tables)]
-
-    def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
-        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
-        tiles = self.tiles[channel]
-        rows = tiles.table.of_tile(tile)
-        coefficients = int((rows[:, 2] * rows[:, 3]).sum())
-        # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
-        data = np.empty(64 + 3 * passes * coefficients, np.uint8)
-        length = code_passes(
-            False,
-            rows,
-            first - 1,
-            first - passes,
-            tiles.known,
-            tiles.sign,
-            tiles.flags,
-            tiles.early,
-            self._channels[channel].true,
-            tiles.models[tile],
-            data,
-            np.zeros(0, np.float64) if costs is None else costs,
-        )
-        return data[:length].tobytes()
-
-
-def _top(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
-    """Bit-planes of a tile."""
-    largest = 0
-    for place, stride, height, _ in table.of_tile(tile)[:, :4]:
-        frame = true[place - stride - 1 : place + (height + 1) * stride - 1]
-        largest = max(largest, int(frame.max()), -int(frame.min()))
-    return largest.bit_length()
 
 
 def _largest(values: NDArray[np.int32]) -> int:

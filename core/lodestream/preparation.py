@@ -128,7 +128,7 @@ class Preparation:
         return lattices
 
     def holds_itself(self) -> bool:
-        """Whether the coordinates lie on lattices of their own as coarse as `rms`: exact streams may then be shorter."""
+        """Whether the coordinates lie on a lattice as coarse as `rms`: an exact stream may then be shorter."""
         found = find_lattice(self._valid)
         spacing = 0.0 if found is None else 1.0 / found.step if found.rule == "decimal" else found.step
         return self.rms is not None and spacing >= self.rms

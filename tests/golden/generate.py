@@ -27,15 +27,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Original:
-    """A surface, and with what precision it is encoded."""
+    """A surface, and with what precision or for what error it is encoded."""
 
     surface: ls.Surface
     precision: str | None = None
     attribute_precision: Mapping[str, str] = field(default_factory=dict)
+    rms: str | None = None
 
     def encode(self) -> bytes:
         """Its container."""
-        return ls.encode(self.surface, self.precision, attribute_precision=dict(self.attribute_precision))
+        precisions = dict(self.attribute_precision)
+        return ls.encode(self.surface, self.precision, rms=self.rms, attribute_precision=precisions)
 
 
 def _wave(rows: int, columns: int) -> Floats:
@@ -257,9 +259,28 @@ def _arrangements() -> dict[str, Original]:
     }
 
 
+def _made_for_an_error() -> dict[str, Original]:
+    rng = np.random.default_rng(2005)
+    rough = _wave(95, 261) + 0.3 * rng.normal(size=(95, 261))
+    lake = np.hypot(*(np.mgrid[:60, :90] - np.array([30, 40])[:, None, None])) < 14
+    metres = np.rint(3000 * _wave(60, 90)).astype(np.int16)
+    metres[lake] = -9999
+    colors: dict[str, NDArray[Any]] = {"color": rng.integers(0, 256, (48, 51, 3)).astype(np.uint8)}
+    globe = np.concatenate([_sphere(17, 24), _sphere(17, 24)[:, :1]], axis=1)
+    return {
+        "error-smooth": Original(ls.Surface(_wave(120, 141).astype(np.float32)), rms="1e-3d"),
+        "error-trellis": Original(ls.Surface(rough), rms="1e-2d"),
+        "error-trellis-tiles": Original(ls.Surface(np.concatenate([rough, rough[::-1]])), rms="5e-3d"),
+        "error-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -9999}), rms="5"),
+        "error-attributes": Original(ls.Surface(_torus(48, 51), (True, True), attributes=colors), rms="2e-3d"),
+        "error-blocks": Original(_blocks(_cut(globe, [0, 16], [0, 9, 24])), rms="1e-3d"),
+        "error-curve": Original(ls.Surface(_torus(1, 90)[0][:, None], (True, False)), rms="1e-3d"),
+    }
+
+
 def originals() -> dict[str, Original]:
     """All that there is a golden file of."""
-    return {**_simple(), **_with_holes(), **_with_attributes(), **_planes(), **_arrangements()}
+    return {**_simple(), **_with_holes(), **_with_attributes(), **_planes(), **_arrangements(), **_made_for_an_error()}
 
 
 def digest(arrays: Sequence[NDArray[Any]]) -> str:

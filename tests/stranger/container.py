@@ -12,7 +12,7 @@ from tests.stranger.fields import DamagedError, Fields
 from tests.stranger.header import Header, read_header
 
 MAGIC = b"\x89LODE\r\n"
-VERSION = 2
+VERSION = 3
 FOOTER_MAGIC = b"LODEEND\n"
 HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
 

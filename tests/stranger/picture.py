@@ -12,6 +12,7 @@ from tests.stranger.coder import MARGIN, Unit, clamp
 from tests.stranger.header import Header, Lattice, Part
 from tests.stranger.layout import Grid, Levels
 from tests.stranger.lifting import details, undo
+from tests.stranger.quantised import known_parts, step
 
 Values = NDArray[Any]
 Lines = list[list[int]]
@@ -36,6 +37,8 @@ class Arrays:
         self.level = level
         self.is_coordinate = channel < header.coordinates
         self.fraction = header.fraction
+        self.base = header.base if self.is_coordinate else 0
+        self.trellis = header.trellis
         self.grids = [grid for grid in levels.grids if grid.part >= 0 or self.is_coordinate]
         self.numbers: dict[int, Lines] = {}  # by the number of the grid among all
         for number, grid in enumerate(levels.grids):
@@ -46,9 +49,16 @@ class Arrays:
         """The known part of a unit's coefficients."""
         for band in unit.bands:
             numbers = self.numbers[band.grid]
+            quantised = None
+            if self.base:
+                size = step(self.levels, self.levels.grids[band.grid], band.kind, unit.level, self.base)
+                quantised = known_parts(band, remaining, size, self.trellis)
             for r in range(band.rows):
                 for c in range(band.columns):
-                    shown = known_part(band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c], remaining)
+                    if quantised is None:
+                        shown = known_part(band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c], remaining)
+                    else:
+                        shown = quantised[r][c]
                     numbers[band.place[0] + r][band.place[1] + c] = band.sign[r + MARGIN][c + MARGIN] * shown * factor
 
     def to_points(self, whole: int) -> None:

@@ -41,7 +41,7 @@ __all__ = [
     "serialize_pieces",
 ]
 
-VERSION = 2
+VERSION = 3
 MAGIC = b"\x89LODE\r\n"  # a byte that is no text, the name, a line end that text transfer would damage
 HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
 #: Kinds from here on may be skipped by a reader that does not know them.

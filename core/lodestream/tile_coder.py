@@ -1,0 +1,85 @@
+"""The writing end of the tiles: coefficients or indices into runs of coding passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bitplanes import code_passes
+from .quantiser import Quantiser
+from .tiles import Tiles, TileTable
+
+__all__ = ["Channel", "TileCoder", "planes_of"]
+
+
+@dataclass
+class Channel:
+    """One channel on its way.
+
+    Attributes
+    ----------
+    true : int32, flat, see `tiles.gather`
+        Coefficients, or indices, with their signs.
+    weights : float64, shape (band,)
+        What a unit of one is worth, in squared error.
+    top : int8, shape (tile,)
+        Bit-planes.
+    """
+
+    true: NDArray[np.int32]
+    weights: NDArray[np.float64]  # a band
+    top: NDArray[np.int8]  # a tile
+
+
+class TileCoder:
+    """Codes the tiles of all channels, plane after plane, as a reader will meet them.
+
+    Parameters
+    ----------
+    tables : list of TileTable, one a channel
+    channels : list of Channel
+    geometric : int
+        The first so many channels are coordinates.
+    quantiser : Quantiser or None
+        Of the coordinates.
+    """
+
+    def __init__(
+        self, tables: list[TileTable], channels: list[Channel], geometric: int, quantiser: Quantiser | None
+    ) -> None:
+        self._channels = channels
+        self.tiles = [Tiles(table, quantiser if k < geometric else None) for k, table in enumerate(tables)]
+
+    def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
+        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
+        tiles = self.tiles[channel]
+        rows = tiles.table.of_tile(tile)
+        coefficients = int((rows[:, 2] * rows[:, 3]).sum())
+        # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
+        data = np.empty(64 + 3 * passes * coefficients, np.uint8)
+        length = code_passes(
+            False,
+            rows,
+            first - 1,
+            first - passes,
+            tiles.known,
+            tiles.sign,
+            tiles.flags,
+            tiles.early,
+            self._channels[channel].true,
+            tiles.models[tile],
+            data,
+            np.zeros(0, np.float64) if costs is None else costs,
+        )
+        return data[:length].tobytes()
+
+
+def planes_of(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
+    """Bit-planes of a tile's largest magnitude."""
+    largest = 0
+    for place, stride, height, _ in table.of_tile(tile)[:, :4]:
+        frame = true[place - stride - 1 : place + (height + 1) * stride - 1]
+        largest = max(largest, int(frame.max()), -int(frame.min()))
+    return largest.bit_length()

@@ -1,0 +1,199 @@
+"""Streams made for one root mean square error: the error is kept and told, whatever the surface."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.container import read_index
+from lodestream.container.headers import parse_header, serialize_header
+from lodestream.errors import CorruptStreamError, OptionError
+from lodestream.quantiser import MOST_BASE, ODD, TRANSITIONS
+from lodestream.rate_distortion import _choose, _laplace, longest_base
+
+
+def waves(rows: int, columns: int) -> NDArray[np.float64]:
+    y, x = np.mgrid[:rows, :columns] / 8.0
+    return np.asarray(np.sin(0.3 * x) * np.cos(0.2 * y) + 0.1 * np.sin(0.9 * x + 0.4 * y))
+
+
+def _rms(original: NDArray[np.generic], found: NDArray[np.generic]) -> float:
+    difference = original.astype(np.float64) - found.astype(np.float64)
+    squares = difference**2 if difference.ndim == 2 else (difference[..., :3] ** 2).sum(axis=2)
+    return math.sqrt(squares.mean())
+
+
+def _extent(points: NDArray[np.generic]) -> float:
+    flat = points.reshape(len(points) * points.shape[1], -1)[:, :3].astype(np.float64)
+    return float(np.linalg.norm(flat.max(axis=0) - flat.min(axis=0)))
+
+
+def _ragged(rng: np.random.Generator, shape: tuple[int, int], channels: int, dtype: str, scale: float) -> NDArray:  # type: ignore[type-arg]
+    rough = np.stack([np.cumsum(rng.normal(size=shape), axis=1) for _ in range(max(channels, 1))], axis=-1)
+    points = scale * (rough if channels else rough[..., 0])
+    if np.dtype(dtype).kind == "i":
+        return np.rint(np.clip(100 * points / scale, -30000, 30000)).astype(dtype)
+    return points.astype(dtype)
+
+
+@settings(max_examples=60)
+@given(
+    shape=st.tuples(st.integers(1, 40), st.integers(2, 40)),
+    channels=st.sampled_from([0, 0, 2, 3, 5]),
+    closed=st.tuples(st.booleans(), st.booleans()),
+    dtype=st.sampled_from(["float64", "float32", "int16"]),
+    scale=st.sampled_from([1e-30, 1.0, 1e30]),
+    rms=st.floats(1e-6, 0.5),
+    seed=st.integers(0, 99),
+)
+def test_the_error_is_kept_and_told(
+    shape: tuple[int, int],
+    channels: int,
+    closed: tuple[bool, bool],
+    dtype: str,
+    scale: float,
+    rms: float,
+    seed: int,
+) -> None:
+    points = _ragged(np.random.default_rng(seed), shape, channels, dtype, scale)
+    container = ls.encode(ls.Surface(points, closed), rms=f"{rms}d")
+    decoder = ls.Decoder()
+    decoder.feed(container)
+    decoder.finish()
+    found = decoder.surface().points
+    wanted, told = rms * _extent(points), decoder.layers[-1].rms
+    assert found.dtype == points.dtype
+    assert found.shape == points.shape
+    assert told <= wanted * (1 + 1e-12)
+    assert told == pytest.approx(_rms(points, found), rel=1e-6, abs=1e-12 * _extent(points))
+    if channels == 5:
+        assert found[..., 3:].tobytes() == points[..., 3:].tobytes()
+    errors = [layer.rms for layer in decoder.layers]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_it_takes_fewer_bytes_than_what_else_meets_the_error() -> None:
+    points = waves(129, 170).astype(np.float64) + 0.02 * np.random.default_rng(5).normal(size=(129, 170))
+    wanted = 2e-3 * _extent(points)
+    made = ls.encode(points, rms="2e-3d")
+    index = read_index(lambda offset, length: made[offset : offset + length], len(made))
+    exact = ls.encode(points)
+    layers = read_index(lambda offset, length: exact[offset : offset + length], len(exact)).layers
+    assert index.surface_end < 0.95 * next(layer.end for layer in layers if layer.rms <= wanted)
+    assert index.surface_end < 0.95 * len(ls.encode(points, precision=math.sqrt(3) * wanted))
+    assert index.header.quantiser is not None
+    assert index.header.quantiser.trellis
+    assert 0.99 * wanted < index.layers[-1].rms <= wanted
+
+
+def test_a_smooth_surface_at_a_large_error_needs_no_trellis() -> None:
+    made = ls.encode(waves(200, 180), rms="1e-2d")
+    header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
+    assert header.quantiser is not None
+    assert not header.quantiser.trellis
+
+
+def test_windows_are_those_of_the_whole() -> None:
+    points = waves(300, 310) + 0.05 * np.random.default_rng(6).normal(size=(300, 310))
+    container = ls.encode(points, rms="5e-3d")
+    whole = ls.decode(container).points
+    region = ((130, 190), (7, 60))
+    decoder = ls.Decoder()
+    decoder.feed(container)
+    window = decoder.view().window(region)
+    assert np.array_equal(window.points, whole[130:190, 7:60])
+
+
+@pytest.mark.parametrize("wanted", [0, "0d", 1e-9])
+def test_no_error_at_all_is_an_exact_stream(wanted: float | str) -> None:
+    points = waves(30, 20).astype(np.float32)
+    container = ls.encode(points, rms=wanted)
+    assert ls.decode(container).points.tobytes() == points.tobytes()
+
+
+def test_whole_numbers_stay_whole_where_that_is_shorter() -> None:
+    terraces = np.repeat(np.repeat(np.arange(64, dtype=np.uint8).reshape(8, 8), 20, axis=0), 20, axis=1)
+    container = ls.encode(terraces, rms=0.4)
+    assert len(container) <= len(ls.encode(terraces))
+
+
+def test_a_constant_is_a_constant() -> None:
+    assert (ls.decode(ls.encode(np.full((4, 7), 2.5), rms="1e-3d")).points == 2.5).all()
+
+
+def test_either_a_precision_or_an_error() -> None:
+    with pytest.raises(OptionError, match="got both"):
+        ls.encode(waves(9, 9), 0.1, rms=0.1)
+
+
+@pytest.mark.parametrize(("how", "base"), [(0x20, None), (0x40, None), (0x91, 5), (0x10, 0), (0x11, 5)])
+def test_an_unknown_way_of_quantising_is_refused(how: int, base: int | None) -> None:
+    made = ls.encode(waves(33, 40), rms="1e-2d")
+    header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
+    payload = bytearray(serialize_header(header)[10:-4])
+    place = 5  # flags, type, channels, layers, tile
+    assert payload[place] == 0x10
+    length = 1
+    while payload[place + length] & 0x80:
+        length += 1
+    parse_header(memoryview(bytes(payload)), 0, 0)
+    payload[place : place + 1 + length] = bytes([how]) if base is None else bytes([how, base])
+    with pytest.raises(CorruptStreamError):
+        parse_header(memoryview(bytes(payload)), 0, 0)
+
+
+@settings(max_examples=60)
+@given(
+    sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
+    classes=st.lists(st.integers(0, 29), min_size=5, max_size=5),
+    trellis=st.booleans(),
+)
+def test_the_cheapest_way_through_the_trellis_is_found(sizes: list[float], classes: list[int], trellis: bool) -> None:
+    bits, worth, count = _laplace(trellis), 0.05, len(sizes)
+    transitions, odd = (TRANSITIONS, ODD) if trellis else (np.zeros((1, 2), np.int64), np.zeros(1, np.int64))
+    band = np.zeros(10, np.int64)
+    band[:4] = 0, count, 1, count
+    chosen, counts = np.zeros(count, np.int32), np.zeros(bits.shape)
+    groups = np.array(classes[:count], np.int8)
+    _choose(band, np.array(sizes), groups, bits, worth, transitions, odd, chosen, counts)
+
+    def cost(indices: tuple[int, ...]) -> float:
+        state, total = 0, 0.0
+        for size, group, k in zip(sizes, classes, indices, strict=False):
+            o = int(odd[state])
+            error = abs(size) - (k - 0.5 * o if k else 0.0)
+            total += error**2 + worth * (bits[o, group, k] + (1.0 if k else 0.0))
+            state = int(transitions[state, k & 1])
+        return total
+
+    nearest = [sorted({0, int(abs(size)), int(abs(size)) + 1, int(abs(size) + 0.5) + 1}) for size in sizes]
+    best = min(cost(way) for way in itertools.product(*nearest))
+    assert cost(tuple(abs(int(k)) for k in chosen)) <= best + 1e-9
+    assert counts.sum() == count
+    assert all(k == 0 or (k > 0) == (size >= 0) for k, size in zip(chosen, sizes, strict=True))
+
+
+@given(power=st.floats(0.3, 2.0), scale=st.floats(1e-3, 1e3), wanted=st.floats(1e-2, 1e2), guess=st.integers(1, 5000))
+def test_the_longest_base_keeps_the_error(power: float, scale: float, wanted: float, guess: int) -> None:
+    def error(base: int) -> float:
+        assert 1 <= base <= MOST_BASE
+        return float(scale * base**power)
+
+    base = longest_base(error, wanted, guess)
+    if base is None:
+        assert error(1) > wanted or error(guess) > wanted
+    else:
+        assert error(base) <= wanted
+
+
+def test_the_longest_base_is_close_to_the_error() -> None:
+    found = longest_base(lambda base: 0.5 * base**0.8, 100.0, 128)
+    assert found is not None
+    assert 0.99 * 100.0 <= 0.5 * found**0.8 <= 100.0
