@@ -294,6 +294,7 @@ async def upload(
     url: str,
     *sources: Source,
     precision: Tolerance | float | str | None = None,
+    rms: Tolerance | float | str | None = None,
     closed: Closure = "auto",
     name: str | None = None,
     options: Mapping[str, str] | None = None,
@@ -303,7 +304,7 @@ async def upload(
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`."""
-    parameters = surface_parameters(sources, precision, closed, name, options, attribute_precision)
+    parameters = surface_parameters(sources, precision, rms, closed, name, options, attribute_precision)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(sources, sent) as body:
         return await _run(requests.upload(url, parameters, body, wait, progress), url, token)

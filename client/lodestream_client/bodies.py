@@ -142,6 +142,7 @@ def _as_npy(surface: Surface) -> BinaryIO:
 def surface_parameters(
     sources: Sequence[Source],
     precision: Tolerance | float | str | None,
+    rms: Tolerance | float | str | None,
     closed: Closure,
     name: str | None,
     options: Mapping[str, str] | None,
@@ -154,28 +155,33 @@ def surface_parameters(
     Raises
     ------
     OptionError
-        When the precision is not a tolerance, or an option of the format has the name of one of the query's own.
+        When the precision or the error is not a tolerance, both are given, or an option of the format has the name of
+        one of the query's own.
     """
     parameters: dict[str, str | list[str]] = {}
     for source in sources:
         if _is_surface(source):
             closed = _CLOSURES[source.closed] if closed == "auto" else closed
             name = name or source.metadata.get("name")
+    if precision is not None and rms is not None:
+        raise OptionError("expected either a precision or a root mean square error, got both")
     precisions = [] if precision is None else [_tolerance(precision)]
     precisions += [f"{attribute}={_tolerance(value)}" for attribute, value in (attribute_precision or {}).items()]
     if precisions:
         parameters["precision"] = precisions
+    if rms is not None:
+        parameters["rms"] = _tolerance(rms)
     if closed != "auto":
         parameters["closed"] = closed
     if name:
         parameters["name"] = name
     for key, value in (options or {}).items():
-        if key in ("precision", "closed", "name", "filename"):
+        if key in ("precision", "rms", "closed", "name", "filename"):
             raise OptionError(f"{key} is not an option of a format")
         parameters[key] = value
     return parameters
 
 
-def _tolerance(precision: Tolerance | float | str) -> str:
-    tolerance = precision if isinstance(precision, Tolerance) else Tolerance.parse(str(precision))
+def _tolerance(error: Tolerance | float | str) -> str:
+    tolerance = error if isinstance(error, Tolerance) else Tolerance.parse(str(error))
     return f"{tolerance.value!r}{'d' if tolerance.relative else ''}"

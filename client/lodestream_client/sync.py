@@ -327,6 +327,7 @@ def upload(
     url: str,
     *sources: Source,
     precision: Tolerance | float | str | None = None,
+    rms: Tolerance | float | str | None = None,
     closed: Closure = "auto",
     name: str | None = None,
     options: Mapping[str, str] | None = None,
@@ -345,6 +346,8 @@ def upload(
         One file, or several that make one surface; one that is open; the bytes of one; a surface in memory.
     precision : Tolerance, float, str or None
         Greatest error of the complete surface; None for a lossless one.
+    rms : Tolerance, float, str or None
+        Make the shortest stream whose root mean square error is at most this, instead; excludes `precision`.
     closed : "auto", "none", "rows", "cols" or "both"
         Which axes of the grid wrap.
     name : str or None
@@ -367,6 +370,8 @@ def upload(
 
     Raises
     ------
+    OptionError
+        When an option has a value that it does not take, or both `precision` and `rms` are given.
     InputError, TooLargeError
         When the server cannot use the file, or will not take one so large.
     RemoteError
@@ -374,7 +379,7 @@ def upload(
     UnreachableError
         When there is no connection.
     """
-    parameters = surface_parameters(sources, precision, closed, name, options, attribute_precision)
+    parameters = surface_parameters(sources, precision, rms, closed, name, options, attribute_precision)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(sources, sent) as body:
         return _run(requests.upload(url, parameters, body, wait, progress), url, token)

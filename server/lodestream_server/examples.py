@@ -76,6 +76,13 @@ UPLOAD: dict[str, Any] = {
                 None,
                 "1e-4d",
             ),
+            (
+                "rms",
+                "root mean square error, in the same words: the shortest stream that has it at most, made for nothing "
+                "else; not beside a precision of the points",
+                None,
+                "1e-3d",
+            ),
             ("closed", "axes that wrap", ["auto", "none", "rows", "cols", "both"], None),
             ("name", "what to call the surface", None, "Jacksboro"),
             ("filename", "name of a raw body's file", None, "jacksboro.npy"),

@@ -33,8 +33,8 @@ class SurfaceOptions:
     filename : str or None
         Name of the file, where the body does not tell it.
     chosen : mapping of str to str
-        ``precision`` in one spelling, ``precision=NAME`` for attributes, ``closed`` unless it is auto, and options of
-        the format as they came: what makes another surface of the same bytes.
+        ``precision`` and ``rms`` in one spelling, ``precision=NAME`` for attributes, ``closed`` unless it is auto, and
+        options of the format as they came: what makes another surface of the same bytes.
     """
 
     name: str | None
@@ -48,7 +48,8 @@ class SurfaceOptions:
         Raises
         ------
         OptionError
-            When a value is not one that its option takes, or an option stands there twice.
+            When a value is not one that its option takes, an option stands there twice, or both a precision and a root
+            mean square error of the points do.
         """
         values: dict[str, str] = {}
         for key, value in query:
@@ -57,12 +58,14 @@ class SurfaceOptions:
             if key == "precision":
                 # A name may hold an equals sign, a tolerance does not.
                 attribute, equals, value = value.rpartition("=")
-                key += equals + attribute
-                tolerance = Tolerance.parse(value)
-                value = f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
+                key, value = key + equals + attribute, _spelled(value)
+            elif key == "rms":
+                value = _spelled(value)
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value
+        if "precision" in values and "rms" in values:
+            raise OptionError("expected either a precision or a root mean square error, got both")
         name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
         closed = values.pop("closed", "auto")
         if closed not in CLOSED:
@@ -90,8 +93,8 @@ def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -
             readable = ", ".join(item.name for item in formats() if item.read)
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
     for key in options.chosen:
-        if key not in ("precision", "closed", *found[0].options) and not key.startswith(ATTRIBUTE):
-            known = ", ".join(("precision", "closed", "name", "filename", *found[0].options))
+        if key not in ("precision", "rms", "closed", *found[0].options) and not key.startswith(ATTRIBUTE):
+            known = ", ".join(("precision", "rms", "closed", "name", "filename", *found[0].options))
             raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
     return found[0]
 
@@ -105,6 +108,11 @@ def identify(digest: hashlib._Hash, format_: Format, filename: str | None, optio
     whole = digest.copy()
     whole.update(json.dumps([format_.name, sorted({**told, **options.chosen}.items())], ensure_ascii=True).encode())
     return whole.hexdigest()[:20]
+
+
+def _spelled(text: str) -> str:
+    tolerance = Tolerance.parse(text)
+    return f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
 
 
 def plain_name(text: str) -> str | None:

@@ -31,7 +31,7 @@ class Record:
         Names of the uploaded files, as they were told.
     upload_bytes : int
     options : mapping
-        ``precision``, ``precision=NAME`` of attributes, ``closed`` and options of the format, as text.
+        ``precision`` or ``rms``, ``precision=NAME`` of attributes, ``closed`` and options of the format, as text.
     state : "queued", "building", "ready" or "failed"
         On disk a build that has begun is still queued: after a restart it begins again.
     reason : str or None

@@ -41,7 +41,7 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
 async def upload(request: Request, parts: Parts) -> Response:
     """Take a file, raw or as parts called ``file`` of a form, and build the surface in the background.
 
-    What is neither precision, closed, name nor filename in the query is an option of the file's format. Bytes and
+    What is neither precision, rms, closed, name nor filename in the query is an option of the file's format. Bytes and
     options that are known already give the surface that is there, even where there is no room for others.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())

@@ -64,6 +64,8 @@ class Job:
         What the surface is to be called.
     precision : str or None
         As on the command line: a number, or a number and ``d``.
+    rms : str or None
+        In the same words; one of the two at most.
     closed : str
         One of `CLOSED`.
     options : mapping of str to str
@@ -77,6 +79,7 @@ class Job:
     filename: str | None
     name: str | None
     precision: str | None
+    rms: str | None
     closed: str
     options: dict[str, str]
     max_vertices: int
@@ -137,9 +140,13 @@ def warm() -> None:
 
     rows, columns = np.mgrid[0:37, 0:41].astype(np.float64)
     xyz = np.stack((rows, columns, np.sin(rows * columns / 99)), axis=-1)
-    for points in (np.sin(rows / 5) * columns, xyz):
+    heights = np.sin(rows / 5) * columns
+    for points in (heights, xyz):
         if not np.array_equal(decode(encode(points)).points, points):
             raise RuntimeError("expected the surface that was encoded, got another one")
+    errors = decode(encode(heights, rms="1e-2d")).points - heights
+    if np.sqrt(np.mean(np.square(errors))) > 0.01 * np.ptp(heights):
+        raise RuntimeError("expected a surface within the error that it was encoded for, got another one")
     number = np.arange(rows.size, dtype=np.int32).reshape(rows.shape)
     a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     none = np.full_like(a, -1)
@@ -155,13 +162,13 @@ def _build(job: Job) -> Built:
     from lodestream.container import describe, read_index
 
     surface = _read(job)
-    precision = None if job.precision is None else Tolerance.parse(job.precision)
+    precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
     precisions = {
         key.removeprefix(ATTRIBUTE): Tolerance.parse(value)
         for key, value in job.options.items()
         if key.startswith(ATTRIBUTE)
     }
-    container = encode(surface, precision, attribute_precision=precisions, progress=_reporter(job.folder))
+    container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
     path = job.folder / _CONTAINER
     with NewFile(path) as file:
         file.write(container)

@@ -213,6 +213,23 @@ def test_encode_with_a_precision(run: Run, terrain_file: Path, terrain: Terrain,
     assert json.loads(run("info", tmp_path / "p.lode", "--json")[1])["exact"] is False
 
 
+def test_encode_for_a_root_mean_square_error(
+    run: Run, terrain_file: Path, terrain: Terrain, container_file: Path, tmp_path: Path
+) -> None:
+    made, out = tmp_path / "r.lode", tmp_path / "r.npy"
+    assert run("encode", terrain_file, made, "--rms", "1e-2d")[0] == 0
+    assert run("decode", made, out)[0] == 0
+    described = json.loads(run("info", made, "--json")[1])
+    assert described["exact"] is False
+    told = described["layers"][-1]["rms"]
+    assert 0 < told <= 0.01 * float(np.ptp(terrain.astype(float)))
+    assert error_of(np.load(out), terrain) == pytest.approx(told, rel=1e-9)
+    assert "no, within the error asked for" in run("info", made)[1]
+    assert run("encode", terrain_file, tmp_path / "zero.lode", "--rms", "0")[0] == 0
+    zero, exact = (ls.decode(path.read_bytes()).points for path in (tmp_path / "zero.lode", container_file))
+    assert np.array_equal(zero, exact)
+
+
 @pytest.mark.parametrize(
     "options", [("-o", "nonsense=1"), ("-o", "path=x"), ("-o", "max_vertices=3"), ("--precision", "0")]
 )
@@ -234,6 +251,8 @@ def test_encode_refuses_options(run: Run, terrain_file: Path, tmp_path: Path, op
         ("encode", "a.npy", "b.npy"),
         ("encode", "a.npy", "b.lode", "--closed", "perhaps"),
         ("encode", "a.npy", "b.lode", "--precision", "much"),
+        ("encode", "a.npy", "b.lode", "--rms", "much"),
+        ("encode", "a.npy", "b.lode", "--rms", "1", "--precision", "1"),
         ("encode", "a.npy", "b.lode", "-o", "key"),
         ("encode", "a.npy", "b.lode", "-o", "k=1", "-o", "k=2"),
         ("encode", "a.npy", "-", "--json"),
@@ -248,6 +267,7 @@ def test_encode_refuses_options(run: Run, terrain_file: Path, tmp_path: Path, op
         ("pull", "http://host/v1/surfaces", "b.npy"),
         ("pull", "http://host/v1/surfaces/ab", "b.npy", "--limit-rate", "fast"),
         ("push", "a.npy", "host:8000"),
+        ("push", "a.npy", "http://host", "--precision", "1", "--precision", "a=1", "--rms", "1"),
         ("list", "file:///tmp"),
         ("rm", "http://host"),
     ],

@@ -218,6 +218,28 @@ def test_upload_for_asyncio(server: str, terrain_file: Path) -> None:
     assert asyncio.run(everything()) == (True, False)
 
 
+def test_uploads_for_a_root_mean_square_error(server: str, terrain_file: Path) -> None:
+    wanted = 0.01 * float(np.ptp(np.load(terrain_file).astype(float)))
+    surface = sync.upload(server, terrain_file, rms="1e-2d")
+    assert surface.details["exact"] is False
+    assert 0 < surface.details["layers"][-1]["rms"] <= wanted
+    again = asyncio.run(client.upload(server, terrain_file, rms=ls.Tolerance(0.01, relative=True)))
+    assert again.url == surface.url
+    assert again.details["options"] == {"rms": "0.01d"}
+
+
+def test_an_upload_has_one_error_at_most() -> None:
+    nowhere = "http://127.0.0.1:1"  # refused before anything is sent
+    with pytest.raises(ls.OptionError, match="got both"):
+        sync.upload(nowhere, b"", precision=1.0, rms=1.0)
+    with pytest.raises(ls.OptionError, match="got both"):
+        asyncio.run(client.upload(nowhere, b"", precision="1", rms="1"))
+    with pytest.raises(ls.OptionError, match="expected a number"):
+        sync.upload(nowhere, b"", rms="much")
+    with pytest.raises(ls.OptionError, match="rms is not an option of a format"):
+        sync.upload(nowhere, b"", options={"rms": "1"})
+
+
 def test_a_bad_upload_is_the_core_s_error(server: str) -> None:
     with pytest.raises(ls.FormatError, match="expected a file of format"):
         sync.upload(server, b"not a surface")

@@ -214,21 +214,23 @@ def test_blocks_are_listed_and_removed(run: Run, server: str, files: Path) -> No
     assert copy not in run("list", server)[1]
 
 
-def test_attributes_have_precisions_of_their_own(run: Run, server: str, files: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["precision", "rms"])
+def test_attributes_have_precisions_of_their_own(run: Run, server: str, files: Path, tmp_path: Path, kind: str) -> None:
     given = ls.read(files / "scan.pcd")
-    words = ("--precision", "0.001", "--precision", "intensity=0.5")
+    words = (f"--{kind}", "0.001", "--precision", "intensity=0.5")
     assert run("encode", files / "scan.pcd", tmp_path / "scan.lode", *words)[0] == 0
     code, out, err = run("push", files / "scan.pcd", server, *words)
     assert code == 0, err
     url = out.strip()
-    assert json.loads(run("info", url, "--json")[1])["options"] == {"precision": "0.001", "precision=intensity": "0.5"}
+    assert json.loads(run("info", url, "--json")[1])["options"] == {kind: "0.001", "precision=intensity": "0.5"}
     for back in (ls.decode((tmp_path / "scan.lode").read_bytes()), pulled(url)):
         valid = given.mask
         assert valid is not None
         off = np.abs(back.attributes["intensity"] - given.attributes["intensity"])[valid]
         assert 0 < off.max() <= 0.5
         assert np.array_equal(back.attributes["ring"][valid], given.attributes["ring"][valid])
-        assert 0 < np.linalg.norm((back.points - given.points)[valid], axis=1).max() <= 0.001
+        distances = np.linalg.norm((back.points - given.points)[valid], axis=1)
+        assert 0 < (distances.max() if kind == "precision" else np.sqrt(np.mean(distances**2))) <= 0.001
 
 
 def test_precisions_that_cannot_be(run: Run, server: str, files: Path, tmp_path: Path) -> None:

@@ -58,6 +58,10 @@ def test_a_look_at_the_first_bytes_refuses_at_once(
         ({"precision": "fine"}, "'fine'"),
         ({"precision": "-1"}, "'-1'"),
         ({"precision": "nan"}, "'nan'"),
+        ({"rms": "fine"}, "'fine'"),
+        ({"rms": "a=1"}, "'a=1'"),
+        ({"rms": "1", "precision": "1"}, "got both"),
+        ([("rms", "1"), ("rms", "2")], "twice"),
         ([("closed", "rows"), ("closed", "cols")], "twice"),
     ],
 )

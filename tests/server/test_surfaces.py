@@ -58,6 +58,18 @@ def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> 
     assert len({first["id"], *others}) == 4
 
 
+def test_a_root_mean_square_error_is_part_of_the_surface(http: httpx.Client) -> None:
+    body = npy(hills(seed=2))
+    first = push(http, body, rms="1e-2d")
+    assert first["options"] == {"rms": "0.01d"}
+    assert first["exact"] is False
+    assert 0 < first["layers"][-1]["rms"] <= 0.01 * float(np.ptp(hills(seed=2).astype(float)))
+    again = http.post("/v1/surfaces", content=body, params={"rms": "0.010d"})
+    assert (again.status_code, again.json()["id"]) == (200, first["id"])
+    others = [push(http, body, **{key: "0.02d"})["id"] for key in ("rms", "precision")]
+    assert len({first["id"], *others}) == 3
+
+
 def test_options_reach_the_surface(http: httpx.Client) -> None:
     surface = push(http, npy(hills(seed=3)), closed="both", precision="1e-2d")
     assert surface["closed"] == [True, True]
@@ -227,7 +239,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     }
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
-    assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "closed", "name", "filename"}
+    assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "rms", "closed", "name", "filename"}
     assert set(post["responses"]) == {"200", "202", "401", "403", "408", "413", "422", "503", "507"}
     example = post["responses"]["202"]["content"]["application/json"]["example"]
     real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()

@@ -193,6 +193,13 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "NAME=P is for the attribute NAME, which is lossless otherwise; may be repeated",
     )
     group.add_argument(
+        "--rms",
+        type=parse_tolerance,
+        metavar="R",
+        help="make the shortest stream whose root mean square error is at most R, in the surface's unit or as <x>d "
+        "times its extent; not with a --precision of the points",
+    )
+    group.add_argument(
         "--closed",
         choices=("auto", "none", "rows", "cols", "both"),
         default="auto",
@@ -226,7 +233,8 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
 def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
     """The precision of the points, and those of attributes by their names.
 
-    One that is given twice ends the program: the command line alone shows it to be wrong.
+    One that is given twice, or for the points beside ``--rms``, ends the program: the command line alone shows it to be
+    wrong.
     """
     found: dict[str | None, Tolerance] = {}
     for name, tolerance in args.precisions:
@@ -234,6 +242,8 @@ def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, To
             args.parser.error(f"argument --precision: {'P' if name is None else name} given twice")
         found[name] = tolerance
     points = found.pop(None, None)
+    if points is not None and args.rms is not None:
+        args.parser.error("argument --rms: not allowed with a --precision of the points")
     return points, {str(name): tolerance for name, tolerance in found.items()}
 
 

@@ -25,7 +25,7 @@ def register(subparsers: Subparsers) -> None:
         "encode",
         run,
         "turn a file, or several of one surface, into a container",
-        "The content of a file decides about its format. Without --precision the container is lossless.",
+        "The content of a file decides about its format. Without --precision and --rms the container is lossless.",
     )
     parser.add_argument("files", nargs="+", metavar="FILE", help="what to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")
@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
         container = ls.encode(
             surface,
             precision,
+            rms=args.rms,
             attribute_precision=attribute_precision,
             progress=lambda fraction: progress.update(task, completed=fraction),
         )

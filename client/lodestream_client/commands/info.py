@@ -103,7 +103,7 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "bytes" in details:
         facts.append(("size", f"{human_size(details['bytes'])} ({details['bytes']} bytes)"))
     if "exact" in details:
-        facts.append(("exact", "yes, bit for bit" if details["exact"] else "no, to the precision asked for"))
+        facts.append(("exact", "yes, bit for bit" if details["exact"] else "no, within the error asked for"))
     if details.get("sha256"):
         facts.append(("sha256", str(details["sha256"])))
     return facts + [(str(name), _short(value)) for name, value in metadata.items()]

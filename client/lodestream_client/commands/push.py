@@ -67,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
             args.url,
             *sources,
             precision=precision,
+            rms=args.rms,
             attribute_precision=attribute_precision,
             closed=args.closed,
             name=args.name,
