@@ -15,8 +15,8 @@ __all__ = ["EACH", "SMALL", "Cell", "Results", "bytes_at", "envelope", "family",
 #: Cells where the best peer needs fewer bytes do not enter means.
 SMALL = 4096
 
-#: The ends of our streams with a precision, one stream for each error: a curve of settings, like a peer's.
-EACH = "a precision"
+#: The ends of our streams that are made for one error: a curve of settings, like a peer's.
+EACH = "each error"
 
 Row = dict[str, Any]
 
@@ -98,7 +98,7 @@ class Results:
         return found
 
     def streams(self, surface: str) -> dict[str, list[Row]]:
-        """Our rows, by stream, and the ends of the streams with a precision."""
+        """Our rows, by stream, and the ends of the streams made for one error."""
         found: dict[str, list[Row]] = {}
         for row in self.rows(surface, OURS):
             found.setdefault(row["stream"], []).append(row)

@@ -22,7 +22,7 @@ __all__ = ["draw"]
 
 _LEAST, _MOST = 3e-6, 5e-2
 _COLUMNS = 3
-_EXACT, _EACH = f"{OURS}, one exact stream", f"{OURS}, a precision for each error"
+_EXACT, _EACH = f"{OURS}, one exact stream", f"{OURS}, one stream for each error"
 
 
 def draw(results: Results, folder: Path) -> dict[str, Path]:

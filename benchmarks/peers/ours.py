@@ -1,4 +1,4 @@
-"""This project: one exact stream with all its layers, and a stream for each error with the precision that meets it."""
+"""This project: one exact stream with all its layers, and for each error the streams that are made for it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from lodestream.plan import Mark, plan
 
 from .trial import TARGETS, Trial
 
-#: Of a stream with a precision, layers count whose error is at most this many times the one it is made for.
+#: Of a stream made for one error, layers count whose error is at most this many times the one it is made for.
 _BESIDE = 10.0
 #: Chance puts the RMS a little above or below what an even spread foretells.
 _JUST_BELOW = 0.999
-#: What large surfaces are tried at, as peers are tried at fewer settings there.
-_LARGE = (("rms", 1e-4), ("rms", 1e-5), ("max", 1e-4))
+#: What large surfaces are tried at, as peers are tried at fewer settings there; and with a precision only at the last.
+_LARGE = (("rms", 1e-3), ("rms", 1e-4), ("rms", 1e-5), ("max", 1e-4))
 
 
 def ours(trial: Trial) -> None:
     """Pictures of all layers of each stream, measured here and not as told; what is told is checked against them."""
     warm = np.arange(289.0, dtype=np.float64).reshape(17, 17) % 7
     for points in (warm, np.stack([warm, warm, warm], -1).astype(np.float32)):  # compiles the kernels
-        for precision in (None, 0.01):
-            lodestream.decode(lodestream.encode(points, precision=precision))
+        for rough in (points, points + np.random.default_rng(1).normal(size=points.shape).astype(points.dtype)):
+            for precision, rms in ((None, None), (0.01, None), (None, 0.01), (None, 1.0)):
+                lodestream.decode(lodestream.encode(rough, precision=precision, rms=rms))
     trial.peak = type(trial.peak)()
     surface = lodestream.Surface(trial.surface.points, trial.surface.closed)
     _stream(trial, surface, "exact", None)
@@ -35,13 +36,17 @@ def ours(trial: Trial) -> None:
         for target in TARGETS:
             if trial.surface.large and (kind, target) not in _LARGE:
                 continue
+            if kind == "rms":
+                _stream(trial, surface, f"rms {target:.0e}", None, (kind, target))
+                if trial.surface.large:
+                    continue
             precision = precision_for(trial, kind, target)
             if precision is None:
                 continue
-            reached = _stream(trial, surface, f"for {kind} {target:.0e}", precision, (kind, target))
+            reached = _stream(trial, surface, f"precision for {kind} {target:.0e}", precision, (kind, target))
             if reached > target and not (trial.surface.large or points_are_whole(trial)):
                 finer = 0.999 * precision * target / reached
-                _stream(trial, surface, f"for {kind} {target:.0e}, again", finer, (kind, target))
+                _stream(trial, surface, f"precision for {kind} {target:.0e}, again", finer, (kind, target))
 
 
 def points_are_whole(trial: Trial) -> bool:
@@ -74,8 +79,9 @@ def _stream(
     precision: float | None,
     made_for: tuple[str, float] | None = None,
 ) -> float:
-    """Measure a stream; returns the error of its end that it was made for."""
-    container, encode_seconds, encode_peak = trial.timed(lambda: lodestream.encode(surface, precision=precision))
+    """Measure a stream, of this precision or else made for an RMS error; returns the error of its end."""
+    rms = None if made_for is None or precision is not None else made_for[1] * trial.surface.extent
+    container, encode_seconds, encode_peak = trial.timed(lambda: lodestream.encode(surface, precision, rms=rms))
     decoded, whole_seconds, decode_peak = trial.timed(lambda: lodestream.decode(container).points)
     marks = plan(read_index(lambda offset, length: container[offset : offset + length], len(container))).marks
     near = min(range(len(marks)), key=lambda number: abs(math.log(max(marks[number].rms, 1e-300) / _near(trial))))

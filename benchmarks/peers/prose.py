@@ -9,11 +9,12 @@ RULES = """\
   distances in space for x, y, z, and measured on what was decoded, ours like the peers'.
 - A peer counts at the best of its settings and modes, and the best peer of each cell is compared.
 - Ours stands there twice. *One exact stream* is made once, without naming an error, and stopped where its error is
-  small enough: what Lodestream is made for. *At its best setting* is the better of that and of streams made for one
-  error, whose precision meets it as the peers' steps do: sqrt(3) times the RMS error, or the maximum error itself;
-  whole heights of integer type go in steps of odd size instead. The aims are held against the best setting, since
-  that is what the peers have; the figures of one exact stream stand beside them everywhere. `a precision` among the
-  settings: interpolated between the ends of such streams, as a peer's settings are.
+  small enough: what Lodestream is made for. *At its best setting* is the best of that and of streams made for one
+  error, as the peers' are: `rms`, the stream for that RMS error (`lodestream encode --rms`), and `precision`, which is
+  sqrt(3) times the RMS error, or the maximum error itself (whole heights of integer type go in steps of odd size
+  instead). The aims are held against the best setting, since that is what the peers have; the figures of one exact
+  stream stand beside them everywhere. `each error` among the settings: interpolated between the ends of such streams,
+  as a peer's settings are.
 - Bytes are interpolated between settings, or between the layers of one stream, in log-log on the lower envelope. An
   error below the last lossy one costs the lossless stream. A peer's stream that does not itself say shape, type and how
   its numbers become values counts 32 bytes more.

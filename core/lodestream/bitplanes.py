@@ -20,6 +20,8 @@ contexts, in this order (`binary_coder` says what they are and learn, `initial_c
   four times the parent plus its four neighbours, at most 5.
 - *Signs*, a 1 is negative: (3 (x + 1) + y + 1) 4 + kind. x is the sign of the sum of the signs known of the neighbours
   in the row, y of those in the column.
+- With a trellis, in plane 0, *across* and *around* for m = 0 and 1 are other ones, of the quantiser that the coefficient
+  is taken from: that follows from the parity of all before it, so plane 0 has no first pass there.
 - *Flags*: (3 b + a) 3 + f. b counts the blocks to the left and above that have a significant coefficient, a those to
   the right and below; f is the largest of the parents of the block's coefficients, at most 2.
 """
@@ -32,6 +34,7 @@ from numpy.typing import NDArray
 from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
 from .initial_contexts import CHANCES, SURENESS
 from .kernels import inlined, kernel
+from .trellis import ODD, TRANSITIONS
 
 __all__ = [
     "BAND_FIELDS",
@@ -72,6 +75,11 @@ _FIRST_AROUND = _ACROSS_CONTEXTS
 _FIRST_SIGN = _FIRST_AROUND + _AROUND_CONTEXTS
 _FIRST_FLAG = _FIRST_SIGN + _SIGN_CONTEXTS
 CONTEXTS = _FIRST_FLAG + _FLAG_CONTEXTS
+# Of a trellis, behind the weights: across and around for either quantiser and m = 0 and 1, and their weights.
+_TRELLIS_ACROSS = CONTEXTS + 4
+_TRELLIS_AROUND = _TRELLIS_ACROSS + 2 * _ACROSS_CONTEXTS // 2
+_TRELLIS_WEIGHTS = _TRELLIS_AROUND + 2 * _AROUND_CONTEXTS
+_LEAST_SURE = 2
 
 #: Class of a sum; 17 stands for all that is more.
 _CLASS = np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 6], np.uint8)
@@ -87,9 +95,21 @@ _START = np.array(
 )
 
 
-def new_model() -> NDArray[np.int32]:
+def _trellis_start() -> NDArray[np.int32]:
+    """Contexts of a trellis start where those without one do, but less sure."""
+    across, around = _START[: _ACROSS_CONTEXTS // 2], _START[_FIRST_AROUND:_FIRST_SIGN]
+    contexts = np.concatenate([across, across, around, around])
+    sure = np.minimum(contexts & 255, _LEAST_SURE)
+    weights = np.full(8, WEIGHT, np.int32)
+    return np.concatenate([_START, contexts & ~255 | sure, weights])
+
+
+_TRELLIS_START = _trellis_start()
+
+
+def new_model(trellis: bool = False) -> NDArray[np.int32]:
     """The contexts of a tile before its first plane, see `binary_coder`, and the weights: int32, flat."""
-    return _START.copy()
+    return (_TRELLIS_START if trellis else _START).copy()
 
 
 @inlined
@@ -163,6 +183,7 @@ def code_passes(
     model: NDArray[np.int32],
     data: NDArray[np.uint8],
     costs: NDArray[np.float64],
+    trellis: bool,
 ) -> int:
     """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
 
@@ -191,6 +212,8 @@ def code_passes(
         Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
     costs : float64, at least ``first + 1`` long
         Where writing, the bits written when each pass ended. May be empty.
+    trellis : bool
+        The coefficients are indices with a trellis, see `trellis`; ``model`` is one of a trellis.
 
     Returns
     -------
@@ -204,7 +227,13 @@ def code_passes(
     for number in range(first, last - 1, -1):
         plane, begins = number >> 1, (number & 1) == 1
         unit = 1 << plane
+        dependent = trellis and plane == 0
+        if dependent and begins:
+            if costs.size:
+                costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
+            continue
         for band in range(bands.shape[0]):
+            state = 0
             offset, stride, kind = bands[band, _OFFSET], bands[band, _STRIDE], bands[band, _KIND]
             rows, columns = bands[band, _ROWS], bands[band, _COLUMNS]
             parent, parent_stride = bands[band, _PARENT], bands[band, _PARENT_STRIDE]
@@ -234,6 +263,9 @@ def code_passes(
                             bit = 1 if seen >= unit else 0
                         bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
                         if bit == 0:
+                            if dependent:
+                                for _ in range((bottom - top) * (right - left)):
+                                    state = TRANSITIONS[state, 0]
                             continue
                         flags[block & INDEX] = 1
                     for i in range(top, bottom):
@@ -263,6 +295,12 @@ def code_passes(
                                 across_slot = (
                                     (slot * 5 + min(side >> plane, 4)) * 5 + min(rise >> plane, 4)
                                 ) * 4 + kind
+                                first_around, weights = _FIRST_AROUND, CONTEXTS + 2 * slot
+                                if dependent and slot < 2:
+                                    odd = ODD[state]
+                                    across_slot += _TRELLIS_ACROSS + odd * (_ACROSS_CONTEXTS // 2)
+                                    first_around = _TRELLIS_AROUND + odd * _AROUND_CONTEXTS
+                                    weights = _TRELLIS_WEIGHTS + 4 * odd + 2 * slot
                                 if slot > 1:
                                     bit, low, width, place = code_bit(
                                         decoding, bit, low, width, place, data, model, across_slot
@@ -281,8 +319,8 @@ def code_passes(
                                         data,
                                         model,
                                         across_slot,
-                                        _FIRST_AROUND + around,
-                                        CONTEXTS + 2 * slot,
+                                        first_around + around,
+                                        weights,
                                     )
                                 if bit:
                                     value += unit
@@ -297,6 +335,8 @@ def code_passes(
                                             decoding, bit, low, width, place, data, model, _FIRST_SIGN + 4 * slot + kind
                                         )
                                         sign[at & INDEX] = -1 if bit else 1
+                            if dependent:
+                                state = TRANSITIONS[state, value & 1]
                             far_west, west, value, east = west, value, east, far_east
                             at += 1
         if costs.size:

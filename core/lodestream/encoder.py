@@ -39,9 +39,6 @@ _ROUNDING = 0.2
 #: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
 _COARSER = (8, 4, 0)
 
-#: Bits of a coefficient from which on a trellis takes fewer bytes than none.
-_TRELLIS_PAYS = 0.7
-
 Figures = tuple[float, float]
 State = NDArray[np.int8]
 
@@ -226,34 +223,26 @@ class _Encoding:
         """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
         table, channels = self.tables[0], self.channels[: self.geometric]
         choosers = [Chooser(table, channel.true) for channel in channels]
-        samples = self.geometric * int((table.bands[:, 2] * table.bands[:, 3]).sum())
         state, canvases = np.zeros_like(self._all_passes()), self._canvases()
         kept: dict[int, list[NDArray[np.int32]]] = {}
-        trellis, bits = False, 0.0
 
         def error(base: int) -> float:
-            nonlocal bits
-            self.quantiser = Quantiser(base, trellis)
+            self.quantiser = Quantiser(base)
             found = [chooser.indices(self.quantiser) for chooser in choosers]
-            bits = sum(used for _, used in found)
             self.tiles = [Tiles(table, self.quantiser) for _ in choosers]
-            for tiles, (indices, _) in zip(self.tiles, found, strict=True):
+            for tiles, indices in zip(self.tiles, found, strict=True):
                 tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
             self.header = self._header()
             rms = self._figures(state, canvases)[0]
             if rms <= wanted:
                 kept.clear()
-                kept[base] = [indices for indices, _ in found]
+                kept[base] = found
             return rms
 
-        first = error(guess := 4 * FINENESS)
-        if first > 0.0 and bits > _TRELLIS_PAYS * samples:
-            trellis = True
-            kept.clear()
-        base = longest_base(error, wanted, guess)
+        base = longest_base(error, wanted, 6 * FINENESS)
         if base is None:
             raise _UnreachableError
-        self.quantiser = Quantiser(base, trellis)
+        self.quantiser = Quantiser(base)
         squares = table.steps(self.quantiser).astype(np.float64) ** 2
         for channel, indices in zip(channels, kept[base], strict=True):
             channel.true, channel.weights = indices, channel.weights * squares

@@ -2,9 +2,7 @@
 
 Each band has a step, so that one step of any coefficient changes the surface by about as much. What is coded, plane by
 plane, are the *indices*: a coefficient is its index times its band's step. A *trellis* halves the distance between the
-values that are within reach without longer indices (dependent quantisation, as in JPEG 2000 part 2 and H.266): there
-are two quantisers, of the even and of the odd multiples of half a step, 0 in both, and which of them a coefficient is
-taken from follows from whether the indices before it are odd.
+values that are within reach without longer indices, see `trellis`.
 """
 
 from __future__ import annotations
@@ -17,8 +15,9 @@ from numpy.typing import NDArray
 from .bitplanes import BLOCK
 from .kernels import inlined, kernel
 from .layout import Band, Layout
+from .trellis import ODD, TRANSITIONS
 
-__all__ = ["MOST_BASE", "ODD", "STATES", "TRANSITIONS", "Quantiser", "spread_quantised", "step_of"]
+__all__ = ["MOST_BASE", "Quantiser", "spread_quantised", "step_of"]
 
 #: Largest `Quantiser.base`.
 MOST_BASE = (1 << 24) - 1
@@ -29,12 +28,6 @@ _LARGEST = 1 << 28
 #: the axis's steps from there to the finest level; further steps halve it for each two of them.
 _ALONG = np.array([[65536, 53303, 39201, 27993, 19842, 14039], [65536, 77936, 69201, 52586, 37885, 26915]], np.int64)
 
-#: The trellis: the state after an even and after an odd index, by the state before; and the states in which a
-#: coefficient is one of the odd multiples.
-STATES = 8
-TRANSITIONS = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]], np.int64)
-ODD = np.array([0, 1, 0, 1, 0, 1, 0, 1], np.int64)
-
 
 @dataclass(frozen=True)
 class Quantiser:
@@ -44,11 +37,9 @@ class Quantiser:
     ----------
     base : int
         The step of a coefficient that changes one point alone, in lattice steps; 1 to 2**24 - 1.
-    trellis : bool
     """
 
     base: int
-    trellis: bool
 
 
 def step_of(band: Band, level: int, layout: Layout, quantiser: Quantiser) -> int:
@@ -85,7 +76,6 @@ def spread_quantised(
     early: NDArray[np.uint8],
     band: NDArray[np.int64],
     step: int,
-    trellis: bool,
     remaining: int,
     out: NDArray[np.int32],
     place: int,
@@ -109,8 +99,8 @@ def spread_quantised(
     plane = begun + (remaining & 1)
     state = 0
     # Between whole planes the middle of what is possible, nearer to zero; of the two quantisers, their mean.
-    middle = 7 * ((1 << plane) - 1) - (4 if trellis else 0)
-    found = 16 * (1 << begun) + 7 * ((1 << begun) - 1) - (4 if trellis else 0)
+    middle = 7 * ((1 << plane) - 1) - 4
+    found = 16 * (1 << begun) + 7 * ((1 << begun) - 1) - 4
     for top in range(0, rows, BLOCK):
         for left in range(0, columns, BLOCK):
             for i in range(top, min(top + BLOCK, rows)):
@@ -118,7 +108,7 @@ def spread_quantised(
                     at = offset + i * stride + j
                     magnitude = int(known[at])
                     high = magnitude >> plane
-                    if trellis and remaining == 0:
+                    if remaining == 0:
                         sixteenths = 16 * magnitude - (8 * ODD[state] if magnitude else 0)
                         state = TRANSITIONS[state, magnitude & 1]
                     elif high:

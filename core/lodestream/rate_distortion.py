@@ -2,12 +2,12 @@
 
 What an index costs in bits is not known before everything is coded, so it is estimated: coefficients are put into
 classes by the size of what is around them, and the share of each index in its class gives its bits; a few turns
-settle both. With a trellis the indices of a band depend on each other, and the cheapest of all ways through it is
-found by the Viterbi algorithm.
+settle both. The indices of a band depend on each other by the trellis: the cheapest of all ways through it is taken.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from .bitplanes import BLOCK
 from .kernels import kernel
-from .quantiser import MOST_BASE, ODD, TRANSITIONS, Quantiser
+from .quantiser import MOST_BASE, Quantiser
 from .tiles import TileTable
+from .trellis import ODD, TRANSITIONS
 
 __all__ = ["Chooser", "longest_base"]
 
-#: Squared error that a bit is worth, in squared steps: without a trellis, and with one.
-_WORTH = (0.08, 0.045)
+#: Squared error that a bit is worth, in squared steps.
+_WORTH = 0.05
 _CLASSES = 30
 _FIRST_CLASS = 8.0  # number of the class whose coefficients are about a step
 _INDICES = 16  # the last stands for all that are larger
@@ -29,7 +30,7 @@ _TURNS = 2
 #: How many coefficients the Laplace distribution counts for among those that were seen of a class.
 _PRIOR = 8.0
 #: The search for a base: how often, how close to the error wanted, and by which power steps grow with it.
-_TRIES = 8
+_TRIES = 10
 _CLOSE = 0.997
 _ERROR_TO_STEP = 1.2
 
@@ -45,33 +46,26 @@ class Chooser:
 
     def __init__(self, table: TileTable, coefficients: NDArray[np.int32]) -> None:
         self._table, self._coefficients = table, coefficients
-        self._bits = {trellis: _laplace(trellis) for trellis in (False, True)}
+        self._bits = _laplace()
 
-    def indices(self, quantiser: Quantiser) -> tuple[NDArray[np.int32], float]:
-        """The index of every coefficient, flat, and about how many bits they take."""
-        table, trellis = self._table, quantiser.trellis
-        steps = table.steps(quantiser)
+    def indices(self, quantiser: Quantiser) -> NDArray[np.int32]:
+        """The index of every coefficient, flat."""
+        table = self._table
         relative = np.zeros(table.size)
         classes = np.zeros(table.size, np.int8)
-        _divide(table.bands, steps, self._coefficients, relative)
+        _divide(table.bands, table.steps(quantiser), self._coefficients, relative)
         _classify(table.bands, relative, classes)
         chosen = np.zeros(table.size, np.int32)
-        transitions, odd = (TRANSITIONS, ODD) if trellis else (np.zeros((1, 2), np.int64), np.zeros(1, np.int64))
-        prior = np.exp2(-_laplace(trellis))
-        total = 0.0
         for _ in range(_TURNS):
-            bits = self._bits[trellis]
-            counts = np.zeros(bits.shape)
-            total = 0.0
+            counts = _PRIOR * np.exp2(-_laplace())
             for band in table.bands:
-                total += _choose(band, relative, classes, bits, _WORTH[trellis], transitions, odd, chosen, counts)
-            counts += _PRIOR * prior
+                _choose(band, relative, classes, self._bits, _WORTH, chosen, counts)
             # What is learned of one choice serves the next one, with other steps, too.
-            self._bits[trellis] = -np.log2(counts / counts.sum(axis=2, keepdims=True))
-        return chosen, total
+            self._bits = -np.log2(counts / counts.sum(axis=2, keepdims=True))
+        return chosen
 
 
-def _laplace(trellis: bool) -> NDArray[np.float64]:
+def _laplace() -> NDArray[np.float64]:
     """Bits of each index (without its sign) by class, of coefficients with a Laplace distribution.
 
     float64, shape (quantiser, class, index).
@@ -80,7 +74,7 @@ def _laplace(trellis: bool) -> NDArray[np.float64]:
     for odd in range(2):
         for number in range(_CLASSES):
             scale = 2.0 ** ((number - _FIRST_CLASS + 0.5) / 2) + 0.01
-            places = np.arange(_INDICES) - 0.5 * (odd if trellis else 0) * (np.arange(_INDICES) > 0)
+            places = np.arange(_INDICES) - 0.5 * odd * (np.arange(_INDICES) > 0)
             borders = np.append((places[1:] + places[:-1]) / 2, np.inf)
             beyond = np.exp(-np.append(0.0, borders) / scale)
             found[odd, number] = -np.log2(np.maximum(beyond[:-1] - beyond[1:], 1e-7))
@@ -132,18 +126,15 @@ def _choose(
     classes: NDArray[np.int8],
     bits: NDArray[np.float64],
     worth: float,
-    transitions: NDArray[np.int64],
-    odd: NDArray[np.int64],
     chosen: NDArray[np.int32],
     counts: NDArray[np.float64],
-) -> float:
-    """The cheapest indices of a band in the order of its blocks, from state 0 on; returns about the bits they take.
+) -> None:
+    """The cheapest indices of a band in the order of its blocks, from state 0 on (Viterbi's algorithm).
 
-    ``transitions`` and ``odd`` have a row for each state of the trellis, or one where there is none. ``counts``, of the
-    shape of ``bits``, are increased.
+    ``counts``, of the shape of ``bits``, are increased by what was chosen.
     """
     offset, stride, rows, columns = band[0], band[1], band[2], band[3]
-    states, length = odd.size, rows * columns
+    states, length = ODD.size, rows * columns
     places = np.empty(length, np.int64)
     before = np.zeros((length, states), np.int8)
     index = np.zeros((length, states), np.int32)
@@ -161,7 +152,7 @@ def _choose(
                     for state in range(states):
                         if cost[state] == np.inf:
                             continue
-                        half = 0.5 * odd[state]
+                        half = 0.5 * ODD[state]
                         least = int(size + half)
                         for candidate in range(3):
                             # The nearest below, the nearest above, and none.
@@ -169,29 +160,23 @@ def _choose(
                             if candidate == 2 and least == 0:
                                 continue
                             error = size - (k - half if k else 0.0)
-                            rate = bits[odd[state], group, min(k, _INDICES - 1)]
+                            rate = bits[ODD[state], group, min(k, _INDICES - 1)]
                             if k:
                                 rate += 1.0  # the sign
                             if k >= _INDICES - 1:
                                 rate += 2.0 * np.log2(k - _INDICES + 3.0)
                             total = cost[state] + error * error + worth * rate
-                            after = transitions[state, k & 1]
+                            after = TRANSITIONS[state, k & 1]
                             if total < new[after]:
                                 new[after], before[number, after], index[number, after] = total, state, k
                     cost[:] = new
                     number += 1
     state = int(np.argmin(cost))
-    used = 0.0
     for number in range(length - 1, -1, -1):
         k, at = index[number, state], places[number]
         state = before[number, state]
         chosen[at] = k if relative[at] >= 0 else -k
-        shown = min(k, _INDICES - 1)
-        counts[odd[state], int(classes[at]), shown] += 1.0
-        used += bits[odd[state], int(classes[at]), shown] + (1.0 if k else 0.0)
-        if k >= _INDICES - 1:
-            used += 2.0 * np.log2(k - _INDICES + 3.0)
-    return used
+        counts[ODD[state], int(classes[at]), min(k, _INDICES - 1)] += 1.0
 
 
 def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) -> int | None:
@@ -204,23 +189,25 @@ def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) ->
     guess : int
         Tried first.
     """
-    below, above = (0, 0.0), (MOST_BASE + 1, np.inf)
+    below, above = 0, MOST_BASE + 1
+    aim = (1.0 + _CLOSE) / 2 * wanted
+    known: list[tuple[float, float]] = []  # logarithms of error over aim and of base, nearest to the aim first
     base = guess
     for _ in range(_TRIES):
         error = error_of(base)
         if error <= wanted:
-            below = max(below, (base, error))
+            below = max(below, base)
         else:
-            above = min(above, (base, error))
-        if error <= wanted and error >= _CLOSE * wanted:
+            above = min(above, base)
+        if _CLOSE * wanted <= error <= wanted:
             break
-        aim = (1.0 + _CLOSE) / 2 * wanted
-        if below[1] > 0.0 and above[1] < np.inf and below[1] < above[1]:
-            share = np.log(aim / below[1]) / np.log(above[1] / below[1])
-            factor = float((above[0] / below[0]) ** share) * below[0] / base
-        else:
-            factor = min(max((aim / max(error, 1e-300)) ** _ERROR_TO_STEP, 0.25), 4.0)
-        base = min(max(round(base * factor), below[0] + 1), above[0] - 1)
-        if not below[0] < base < above[0]:
+        known.append((math.log(max(error, 1e-300) / aim), math.log(base)))
+        known.sort(key=lambda point: abs(point[0]))
+        (near, at), (far, further) = known[0], known[min(1, len(known) - 1)]
+        slope = (further - at) / (far - near) if far != near else _ERROR_TO_STEP
+        base = round(math.exp(min(max(at - near * min(max(slope, 0.5), 4.0), at - 1.4), at + 1.4)))
+        if not below < base < above:
+            base = round(math.sqrt(max(below, 1) * above))
+        if not below < base < above:
             break
-    return below[0] or None
+    return below or None

@@ -72,6 +72,7 @@ class TileCoder:
             tiles.models[tile],
             data,
             np.zeros(0, np.float64) if costs is None else costs,
+            tiles.trellis,
         )
         return data[:length].tobytes()
 

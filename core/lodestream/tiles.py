@@ -112,13 +112,14 @@ class Tiles:
     """
 
     def __init__(self, table: TileTable, quantiser: Quantiser | None = None) -> None:
-        self.table, self.quantiser = table, quantiser
+        self.table = table
         self.steps = np.zeros(len(table.bands), np.int64) if quantiser is None else table.steps(quantiser)
         self.known = np.zeros(table.size, np.int32)
         self.sign = np.zeros(table.size, np.int8)
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
-        self.models = np.tile(new_model(), (len(table.members), 1))
+        self.trellis = quantiser is not None
+        self.models = np.tile(new_model(self.trellis), (len(table.members), 1))
 
     def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
         """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
@@ -127,7 +128,8 @@ class Tiles:
         data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
         table = self.table
         first_bands = np.array(table.first)
-        _read(table.bands, first_bands, places, self.known, self.sign, self.flags, self.early, self.models, data)
+        arrays = self.known, self.sign, self.flags, self.early, self.models
+        _read(table.bands, first_bands, places, *arrays, data, self.trellis)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
@@ -172,11 +174,10 @@ class Tiles:
         origin: tuple[int, int] = (0, 0),
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
-        trellis = self.quantiser is not None and self.quantiser.trellis
         rows, columns = array.shape
         pitch = array.strides[0] // array.itemsize
         line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        _spread(*arrays, trellis, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
+        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
@@ -204,6 +205,7 @@ def _read(
     early: NDArray[np.uint8],
     models: NDArray[np.int32],
     data: NDArray[np.uint8],
+    trellis: bool,
 ) -> None:
     truth, costs = np.zeros(0, np.int32), np.zeros(0, np.float64)
     start = 0
@@ -211,7 +213,19 @@ def _read(
         tile, stop = runs[run, 0], runs[run, 3]
         rows, coded = bands[first[tile] : first[tile + 1]], data[start:stop]
         code_passes(
-            True, rows, runs[run, 1], runs[run, 2], known, sign, flags, early, truth, models[tile], coded, costs
+            True,
+            rows,
+            runs[run, 1],
+            runs[run, 2],
+            known,
+            sign,
+            flags,
+            early,
+            truth,
+            models[tile],
+            coded,
+            costs,
+            trellis,
         )
         start = stop
 
@@ -224,7 +238,6 @@ def _spread(
     bands: NDArray[np.int64],
     windows: NDArray[np.int64],
     steps: NDArray[np.int64],
-    trellis: bool,
     numbers: NDArray[np.int64],
     state: NDArray[np.int8],
     finer: int,
@@ -240,7 +253,7 @@ def _spread(
         width = bands[band, 3]
         if steps[band] and passes < UNANNOUNCED:
             place, row, step = top * pitch + left, bands[band], steps[band]
-            spread_quantised(known, sign, early, row, step, trellis, passes, out, place, pitch)
+            spread_quantised(known, sign, early, row, step, passes, out, place, pitch)
             continue
         for i in range(bands[band, 2]):
             start = bands[band, 0] + i * bands[band, 1]

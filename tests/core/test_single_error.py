@@ -15,8 +15,9 @@ import lodestream as ls
 from lodestream.container import read_index
 from lodestream.container.headers import parse_header, serialize_header
 from lodestream.errors import CorruptStreamError, OptionError
-from lodestream.quantiser import MOST_BASE, ODD, TRANSITIONS
+from lodestream.quantiser import MOST_BASE
 from lodestream.rate_distortion import _choose, _laplace, longest_base
+from lodestream.trellis import ODD, TRANSITIONS
 
 
 def waves(rows: int, columns: int) -> NDArray[np.float64]:

@@ -96,6 +96,21 @@ def model_of_unit() -> Model:
     return Model([256 * c + 128 for c in START_CHANCE], START_SURENESS, 2)
 
 
+#: Where the contexts of plane 0 begin, by whether the index is odd-sided: across, around.
+ACROSS, AROUND = len(START_CHANCE), len(START_CHANCE) + 400
+
+
+def model_of_indices() -> Model:
+    """The same of a unit of indices: behind all others the contexts of plane 0."""
+    more = [*range(200), *range(200), *range(400, 484), *range(400, 484)]
+    chances = [*START_CHANCE, *(START_CHANCE[number] for number in more)]
+    surenesses = [*START_SURENESS, *(min(START_SURENESS[number], 2) for number in more)]
+    return Model([256 * c + 128 for c in chances], surenesses, 6)
+
+
+NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
+
+
 def new_contexts(count: int, pairs: int = 0) -> Model:
     """Contexts that know nothing yet."""
     return Model([2**19] * count, [1] * count, pairs)
@@ -126,6 +141,7 @@ class Band:
         self.sign = _zeros(self.rows, self.columns, MARGIN)
         self.born = _zeros(self.rows, self.columns, 0, -1)  # the pass in which a coefficient became significant
         self.visited = _zeros(self.rows, self.columns, 0, -1)  # the plane whose first pass was here last
+        self.state = _zeros(self.rows, self.columns, 0)  # of indices, once plane 0 is known
         self.blocks = _zeros(-(-self.rows // BLOCK), -(-self.columns // BLOCK), 1)
 
     def at(self, row: int, column: int) -> int:
@@ -164,9 +180,13 @@ class Unit:
 
     level: int
     bands: list[Band]
+    indices: bool
     top: int = 0
     remaining: int = -1  # passes; -1 before the first segment
-    model: Model = field(default_factory=model_of_unit)
+    model: Model = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.model = model_of_indices() if self.indices else model_of_unit()
 
     def decode(self, top: int | None, passes: int, segment: bytes, most: int) -> None:
         """Takes the next segment of a unit that may have so many bit-planes at most."""
@@ -183,19 +203,22 @@ class Unit:
         for _ in range(passes):
             self.remaining -= 1
             for band in self.bands:
-                _Pass(band, coder, self.model, self.remaining).run()
+                if not (self.indices and self.remaining == 1):
+                    _Pass(band, coder, self.model, self.remaining, self.indices).run()
 
 
 class _Pass:
     """One pass through one band of a unit."""
 
-    def __init__(self, band: Band, coder: RangeDecoder, model: Model, number: int) -> None:
+    def __init__(self, band: Band, coder: RangeDecoder, model: Model, number: int, indices: bool) -> None:
         self.band = band
         self.coder = coder
         self.model = model
         self.number = number
         self.plane = number >> 1
         self.is_first = bool(number & 1)
+        self.follows = indices and number == 0
+        self.state = 0
 
     def run(self) -> None:
         band = self.band
@@ -206,10 +229,13 @@ class _Pass:
                 columns = range(block_column, min(block_column + BLOCK, band.columns))
                 if not band.blocks[i][j] and not self.is_first:
                     band.blocks[i][j] = self.model.alone(self.coder, self._flag_context(i, j, rows, columns))
-                if band.blocks[i][j]:
-                    for row in rows:
-                        for column in columns:
+                for row in rows:
+                    for column in columns:
+                        if self.follows:
+                            band.state[row][column] = self.state
+                        if band.blocks[i][j]:
                             self._visit(row, column)
+                        self.state = NEXT[self.state][band.magnitude[row + MARGIN][column + MARGIN] & 1]
 
     def _visit(self, row: int, column: int) -> None:
         band, plane = self.band, self.plane
@@ -229,7 +255,13 @@ class _Pass:
         across = ((m * 5 + h) * 5 + w) * 4 + band.kind
         if m < 2:
             around = 400 + (m * 7 + self._ring_class(r, c)) * 6 + self._parent_class(row, column)
-            bit = self.model.mixed(self.coder, across, around, m)
+            pair = m
+            if self.follows:
+                odd = self.state & 1
+                across += ACROSS + 200 * odd
+                around += AROUND - 400 + 84 * odd
+                pair = 2 + 2 * odd + m
+            bit = self.model.mixed(self.coder, across, around, pair)
         else:
             bit = self.model.alone(self.coder, across)
         if bit:

@@ -89,7 +89,6 @@ class Header:
     tile: tuple[int, int]
     fraction: int
     base: int  # 0 where coordinates are not quantised
-    trellis: bool
     extent: float
     blocks: list[Block]
     curves: list[Curve]
@@ -169,9 +168,9 @@ def read_header(payload: bytes) -> Header:
     points_channels, layers = fields.varint(), fields.varint()
     tile = fields.number("B")
     how = fields.number("B")
-    base = fields.varint() if how & 16 else 0
-    if how >> 6 or how & 48 == 32 or (how & 16 and (how & 15 or not 1 <= base < 2**24)):
-        raise DamagedError("an unknown way of quantising")
+    base = fields.varint() if how == 16 else 0
+    if how == 16 and not 1 <= base < 2**24:
+        raise DamagedError("a base that no step has")
     extent = fields.f64()
     if flags & 64:
         blocks, curves, parts = _read_arrangement(fields)
@@ -196,9 +195,8 @@ def read_header(payload: bytes) -> Header:
         points_channels=points_channels,
         layers=layers,
         tile=(tile & 15, tile >> 4),
-        fraction=how & 15,
+        fraction=0 if base else how,
         base=base,
-        trellis=bool(how & 32),
         extent=extent,
         blocks=blocks,
         curves=curves,

@@ -38,7 +38,6 @@ class Arrays:
         self.is_coordinate = channel < header.coordinates
         self.fraction = header.fraction
         self.base = header.base if self.is_coordinate else 0
-        self.trellis = header.trellis
         self.grids = [grid for grid in levels.grids if grid.part >= 0 or self.is_coordinate]
         self.numbers: dict[int, Lines] = {}  # by the number of the grid among all
         for number, grid in enumerate(levels.grids):
@@ -52,7 +51,7 @@ class Arrays:
             quantised = None
             if self.base:
                 size = step(self.levels, self.levels.grids[band.grid], band.kind, unit.level, self.base)
-                quantised = known_parts(band, remaining, size, self.trellis)
+                quantised = known_parts(band, remaining, size)
             for r in range(band.rows):
                 for c in range(band.columns):
                     if quantised is None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from tests.stranger.coder import BLOCK, MARGIN, Band
+from tests.stranger.coder import MARGIN, Band
 from tests.stranger.layout import Grid, Levels
 
 NODE = [65536, 53303, 39201, 27993, 19842, 14039]
 DETAIL = [65536, 77936, 69201, 52586, 37885, 26915]
-NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
 
 
 def _along(d: int, detail: bool) -> int:
@@ -31,28 +30,24 @@ def step(levels: Levels, grid: Grid, kind: int, level: int, base: int) -> int:
     return max(1, product >> 32)
 
 
-def known_parts(band: Band, remaining: int, size: int, trellis: bool) -> list[list[int]]:
+def known_parts(band: Band, remaining: int, size: int) -> list[list[int]]:
     """The known parts of a band's coefficients, without signs."""
     found = [[0] * band.columns for _ in range(band.rows)]
-    state = 0
-    for top in range(0, band.rows, BLOCK):
-        for left in range(0, band.columns, BLOCK):
-            for row in range(top, min(top + BLOCK, band.rows)):
-                for column in range(left, min(left + BLOCK, band.columns)):
-                    m = band.magnitude[row + MARGIN][column + MARGIN]
-                    if trellis and remaining == 0:
-                        t = 16 * m - 8 * (state & 1) if m else 0
-                        state = NEXT[state][m & 1]
-                    else:
-                        t = _sixteenths(m, band.born[row][column], remaining, 4 if trellis else 0)
-                    found[row][column] = min(t * size >> 4, 2**28)
+    for row in range(band.rows):
+        for column in range(band.columns):
+            m = band.magnitude[row + MARGIN][column + MARGIN]
+            if remaining == 0:
+                t = 16 * m - 8 if m and band.state[row][column] & 1 else 16 * m
+            else:
+                t = _sixteenths(m, band.born[row][column], remaining)
+            found[row][column] = min(t * size >> 4, 2**28)
     return found
 
 
-def _sixteenths(m: int, born: int, n: int, q: int) -> int:
+def _sixteenths(m: int, born: int, n: int) -> int:
     p = (n + 1) >> 1
     if m >> p:
-        return 16 * ((m >> p) << p) + 7 * (2**p - 1) - q
+        return 16 * ((m >> p) << p) + 7 * ((1 << p) - 1) - 4
     if n & 1 and born == n:
-        return 16 * 2 ** (p - 1) + 7 * (2 ** (p - 1) - 1) - q
+        return 16 * (1 << p - 1) + 7 * ((1 << p - 1) - 1) - 4
     return 0

@@ -32,8 +32,8 @@ TILE_BITS = 14
 #: Most binary places between lattice steps.
 MOST_FRACTION = 6
 _RULES = ("affine", "decimal")
-# Beside the binary places in their byte.
-_QUANTISED, _TRELLIS = 16, 32
+# In place of the binary places.
+_QUANTISED = 16
 
 
 def serialize_header(header: Header) -> bytes:
@@ -47,7 +47,7 @@ def serialize_header(header: Header) -> bytes:
     out.varint(header.layer_count)
     out.byte(header.tile[0] | header.tile[1] << 4)
     quantiser = header.quantiser
-    out.byte(header.fraction | (0 if quantiser is None else _QUANTISED | (_TRELLIS if quantiser.trellis else 0)))
+    out.byte(header.fraction if quantiser is None else _QUANTISED)
     if quantiser is not None:
         out.varint(quantiser.base)
     out.pack("d", header.extent)
@@ -107,11 +107,9 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
     exponents, how = fields.byte(), fields.byte()
     tile = exponents & 15, exponents >> 4
-    fraction, quantiser = how & 15, None
-    if how >> 6 or how & (_QUANTISED | _TRELLIS) == _TRELLIS:
-        raise CorruptStreamError(f"expected a known way of quantising, got {how >> 4}", offset)
-    if how & _QUANTISED:
-        quantiser = Quantiser(fields.varint(MOST_BASE), bool(how & _TRELLIS))
+    fraction, quantiser = how, None
+    if how == _QUANTISED:
+        fraction, quantiser = 0, Quantiser(fields.varint(MOST_BASE))
         if quantiser.base == 0:
             raise CorruptStreamError("expected steps of 1 or more, got 0", offset)
     (extent,) = fields.unpack("d")
@@ -133,9 +131,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
     if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
         raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
-    most = MOST_FRACTION if quantiser is None else 0
-    if fraction > most:
-        raise CorruptStreamError(f"expected at most {most} binary places, got {fraction}", offset)
+    if fraction > MOST_FRACTION:
+        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
     if not (math.isfinite(extent) and extent >= 0):
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = []
