@@ -66,6 +66,7 @@ class Channel:
                 bitplanes.new_model(),
                 data,
                 NO_COSTS,
+                False,
             )
         return tiles, count
 

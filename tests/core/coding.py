@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 import lodestream
 from lodestream.bitplanes import pass_count
 from lodestream.container import Header
-from lodestream.encoder import _Channel, _TileCoder
 from lodestream.lattice import Lattice
 from lodestream.layout import Layout
 from lodestream.predictors import default_predictors, predictor
 from lodestream.reconstruction import Coded, Reconstruction
+from lodestream.tile_coder import Channel, TileCoder
 from lodestream.tiles import TileTable, gather
 
 __all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "shapes_of", "uncompiled"]
@@ -64,9 +64,11 @@ def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]
     """Code runs of passes, one after another."""
     table = TileTable.of(layout)
     bands = np.ones(len(table.bands))
-    coder = _TileCoder(
+    coder = TileCoder(
         [table] * len(channels),
-        [_Channel(gather(table, [c]), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
+        [Channel(gather(table, [c]), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
+        len(channels),
+        None,
     )
     return [
         Coded(tile, channel, first, passes, coder.code(tile, channel, first + 1, passes), 0)

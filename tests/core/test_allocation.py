@@ -85,7 +85,7 @@ def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
     sizes: NDArray[np.float64] = 20.0 * np.arange(1.0, 20_001.0)
     step = np.log(sizes) / np.log(1.4) % 1
     left: NDArray[np.float64] = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
-    ends = np.array(_layer_ends(sizes, left[0] - left), np.int64)
+    ends = np.array(_layer_ends(sizes, left[0] - left, False), np.int64)
     inner = ends[(ends > 100) & (ends < 15_000)]
     assert len(inner) > 10
     assert np.abs(step[inner - 1] - 0.2).max() < 0.03

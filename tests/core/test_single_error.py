@@ -90,15 +90,7 @@ def test_it_takes_fewer_bytes_than_what_else_meets_the_error() -> None:
     assert index.surface_end < 0.95 * next(layer.end for layer in layers if layer.rms <= wanted)
     assert index.surface_end < 0.95 * len(ls.encode(points, precision=math.sqrt(3) * wanted))
     assert index.header.quantiser is not None
-    assert index.header.quantiser.trellis
     assert 0.99 * wanted < index.layers[-1].rms <= wanted
-
-
-def test_a_smooth_surface_at_a_large_error_needs_no_trellis() -> None:
-    made = ls.encode(waves(200, 180), rms="1e-2d")
-    header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
-    assert header.quantiser is not None
-    assert not header.quantiser.trellis
 
 
 def test_windows_are_those_of_the_whole() -> None:
@@ -134,7 +126,7 @@ def test_either_a_precision_or_an_error() -> None:
         ls.encode(waves(9, 9), 0.1, rms=0.1)
 
 
-@pytest.mark.parametrize(("how", "base"), [(0x20, None), (0x40, None), (0x91, 5), (0x10, 0), (0x11, 5)])
+@pytest.mark.parametrize(("how", "base"), [(0x20, None), (0x11, 5), (0x07, None), (0x10, 0)])
 def test_an_unknown_way_of_quantising_is_refused(how: int, base: int | None) -> None:
     made = ls.encode(waves(33, 40), rms="1e-2d")
     header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
@@ -154,24 +146,22 @@ def test_an_unknown_way_of_quantising_is_refused(how: int, base: int | None) -> 
 @given(
     sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
     classes=st.lists(st.integers(0, 29), min_size=5, max_size=5),
-    trellis=st.booleans(),
 )
-def test_the_cheapest_way_through_the_trellis_is_found(sizes: list[float], classes: list[int], trellis: bool) -> None:
-    bits, worth, count = _laplace(trellis), 0.05, len(sizes)
-    transitions, odd = (TRANSITIONS, ODD) if trellis else (np.zeros((1, 2), np.int64), np.zeros(1, np.int64))
+def test_the_cheapest_way_through_the_trellis_is_found(sizes: list[float], classes: list[int]) -> None:
+    bits, worth, count = _laplace(), 0.05, len(sizes)
     band = np.zeros(10, np.int64)
     band[:4] = 0, count, 1, count
     chosen, counts = np.zeros(count, np.int32), np.zeros(bits.shape)
     groups = np.array(classes[:count], np.int8)
-    _choose(band, np.array(sizes), groups, bits, worth, transitions, odd, chosen, counts)
+    _choose(band, np.array(sizes), groups, bits, worth, chosen, counts)
 
     def cost(indices: tuple[int, ...]) -> float:
         state, total = 0, 0.0
         for size, group, k in zip(sizes, classes, indices, strict=False):
-            o = int(odd[state])
+            o = int(ODD[state])
             error = abs(size) - (k - 0.5 * o if k else 0.0)
             total += error**2 + worth * (bits[o, group, k] + (1.0 if k else 0.0))
-            state = int(transitions[state, k & 1])
+            state = int(TRANSITIONS[state, k & 1])
         return total
 
     nearest = [sorted({0, int(abs(size)), int(abs(size)) + 1, int(abs(size) + 0.5) + 1}) for size in sizes]

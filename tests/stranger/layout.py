@@ -229,7 +229,7 @@ def units_of(header: Header, levels: Levels) -> list[Unit]:
             if len(rows) and len(columns):
                 place = (rows.start, columns.start)
                 bands.append(Band(0, number, place, len(rows), len(columns), place))
-        units.append(Unit(0, bands))
+        units.append(Unit(0, bands, header.base > 0 and channel < header.coordinates))
     coarser: dict[int, Tiles] = {}
     for level in range(1, levels.last + 1):
         finer: dict[int, Tiles] = {}
@@ -261,7 +261,7 @@ def _tiles(header: Header, levels: Levels, level: int, group: list[int], coarser
             tiles[-1].append([])
             for channel in range(header.channels):
                 inherited = parents[channel].bands if parents else []
-                unit = Unit(level, [])
+                unit = Unit(level, [], header.base > 0 and channel < header.coordinates)
                 for number in group:
                     unit.bands += _bands(header, levels, level, number, channel, (i, j) if is_cut else None, inherited)
                 tiles[-1][-1].append(unit)
