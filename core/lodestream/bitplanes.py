@@ -20,8 +20,8 @@ contexts, in this order (`binary_coder` says what they are and learn, `initial_c
   four times the parent plus its four neighbours, at most 5.
 - *Signs*, a 1 is negative: (3 (x + 1) + y + 1) 4 + kind. x is the sign of the sum of the signs known of the neighbours
   in the row, y of those in the column.
-- With a trellis, in plane 0, *across* and *around* for m = 0 and 1 are other ones, of the quantiser that the coefficient
-  is taken from: that follows from the parity of all before it, so plane 0 has no first pass there.
+- With a trellis, in plane 0, *across* and *around* for m = 0 and 1 are other ones, of the quantiser that the index is
+  for: that follows from the parity of all before it, so plane 0 has no first pass there.
 - *Flags*: (3 b + a) 3 + f. b counts the blocks to the left and above that have a significant coefficient, a those to
   the right and below; f is the largest of the parents of the block's coefficients, at most 2.
 """

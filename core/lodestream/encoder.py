@@ -20,9 +20,9 @@ from .errors import OptionError
 from .lattice import LATTICE_BITS, Lattice
 from .picture import coordinate_distances
 from .predictors import COEFFICIENT_BITS, default_predictors
-from .preparation import FINENESS, Preparation
+from .preparation import Preparation
 from .quantiser import Quantiser
-from .rate_distortion import Chooser, longest_base
+from .rate_distortion import MOST_TRIES, Chooser, longest_base
 from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
 from .surface import Block, Surface
 from .target import Tolerance
@@ -38,6 +38,9 @@ _ROUNDING = 0.2
 
 #: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
 _COARSER = (8, 4, 0)
+
+#: The step of a stream made for one error, over the error, that is tried first.
+_LIKELY_STEP = 6
 
 Figures = tuple[float, float]
 State = NDArray[np.int8]
@@ -117,11 +120,10 @@ def _made_for(
 ) -> bytes | None:
     """The stream for this root mean square error; None where exact values are the way to meet it."""
     prepared = Preparation(surface, (None, precisions), rms)
-    if prepared.rms is None or (lattices := prepared.fine_lattices()) is None:
+    if prepared.rms is None or (fine := prepared.fine_lattices()) is None:
         return None
-    encoding = _Encoding(prepared, progress, lattices=lattices)
     try:
-        container = encoding.run()
+        container = _Encoding(prepared, progress, fine=fine).run()
     except _UnreachableError:
         return None
     if prepared.holds_itself():
@@ -147,7 +149,7 @@ class _Encoding:
         prepared: Preparation,
         progress: Callable[[float], None],
         bits: int | None = None,
-        lattices: list[Lattice] | None = None,
+        fine: tuple[list[Lattice], int] | None = None,
     ) -> None:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
@@ -155,7 +157,7 @@ class _Encoding:
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
         self.bits = 0
-        self.lattices = prepared.lattices(bits) if lattices is None else lattices
+        self.lattices, self.fineness = (prepared.lattices(bits), 0) if fine is None else fine
 
     def run(self) -> bytes:
         prepared = self.prepared
@@ -225,6 +227,7 @@ class _Encoding:
         choosers = [Chooser(table, channel.true) for channel in channels]
         state, canvases = np.zeros_like(self._all_passes()), self._canvases()
         kept: dict[int, list[NDArray[np.int32]]] = {}
+        done: list[int] = []
 
         def error(base: int) -> float:
             self.quantiser = Quantiser(base)
@@ -233,13 +236,15 @@ class _Encoding:
             for tiles, indices in zip(self.tiles, found, strict=True):
                 tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
             self.header = self._header()
+            done.append(base)
+            self.progress(0.1 + 0.2 * len(done) / MOST_TRIES)
             rms = self._figures(state, canvases)[0]
             if rms <= wanted:
                 kept.clear()
                 kept[base] = found
             return rms
 
-        base = longest_base(error, wanted, 6 * FINENESS)
+        base = longest_base(error, wanted, _LIKELY_STEP * self.fineness)
         if base is None:
             raise _UnreachableError
         self.quantiser = Quantiser(base)

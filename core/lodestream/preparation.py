@@ -25,10 +25,10 @@ from .surface import Block, Surface
 from .target import Tolerance
 from .transform import allocate
 
-__all__ = ["FINENESS", "Precisions", "Preparation"]
+__all__ = ["Precisions", "Preparation"]
 
-#: Lattice steps in the error of a coordinate that a stream is made for.
-FINENESS = 32
+#: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
+_FINEST, _COARSEST = 128, 8
 
 Arrays = list[NDArray[Any]]
 #: Of the coordinates, and of attributes by name.
@@ -114,18 +114,23 @@ class Preparation:
             found += attribute_lattices(values, self.attribute_precisions.get(kind.name), bits)
         return found
 
-    def fine_lattices(self) -> list[Lattice] | None:
-        """Lattices whose steps are small beside `rms`; None where they would be too many."""
-        lattices = self.lattices(None)
+    def fine_lattices(self) -> tuple[list[Lattice], int] | None:
+        """Lattices whose steps are small beside `rms`, and how many make the error of one coordinate.
+
+        None where all steps would be too many, however few make the error.
+        """
         assert self.rms is not None
-        step = self.rms / math.sqrt(self.geometric) / FINENESS
-        for channel in range(self.geometric):
-            values = channel_of(self._valid, channel)
-            low, high = float(values.min()), float(values.max())
-            lattices[channel] = precision_lattice(low, high, step)
-            if lattices[channel].step > 2 * step:
+        error = self.rms / math.sqrt(self.geometric)
+        flat = [channel_of(self._valid, channel) for channel in range(self.geometric)]
+        spans = [(float(values.min()), float(values.max())) for values in flat]
+        fineness = _FINEST
+        while any(precision_lattice(*span, error / fineness).step > 1.01 * error / fineness for span in spans):
+            fineness //= 2
+            if fineness < _COARSEST:
                 return None
-        return lattices
+        lattices = self.lattices(None)
+        lattices[: self.geometric] = [precision_lattice(*span, error / fineness) for span in spans]
+        return lattices, fineness
 
     def holds_itself(self) -> bool:
         """Whether the coordinates lie on a lattice as coarse as `rms`: an exact stream may then be shorter."""

@@ -19,18 +19,18 @@ from .quantiser import MOST_BASE, Quantiser
 from .tiles import TileTable
 from .trellis import ODD, TRANSITIONS
 
-__all__ = ["Chooser", "longest_base"]
+__all__ = ["MOST_TRIES", "Chooser", "longest_base"]
 
 #: Squared error that a bit is worth, in squared steps.
 _WORTH = 0.05
 _CLASSES = 30
 _FIRST_CLASS = 8.0  # number of the class whose coefficients are about a step
 _INDICES = 16  # the last stands for all that are larger
-_TURNS = 2
+_TURNS = 2  # of the first choice
 #: How many coefficients the Laplace distribution counts for among those that were seen of a class.
 _PRIOR = 8.0
 #: The search for a base: how often, how close to the error wanted, and by which power steps grow with it.
-_TRIES = 10
+MOST_TRIES = 10
 _CLOSE = 0.997
 _ERROR_TO_STEP = 1.2
 
@@ -47,6 +47,7 @@ class Chooser:
     def __init__(self, table: TileTable, coefficients: NDArray[np.int32]) -> None:
         self._table, self._coefficients = table, coefficients
         self._bits = _laplace()
+        self._turns = _TURNS
 
     def indices(self, quantiser: Quantiser) -> NDArray[np.int32]:
         """The index of every coefficient, flat."""
@@ -56,12 +57,12 @@ class Chooser:
         _divide(table.bands, table.steps(quantiser), self._coefficients, relative)
         _classify(table.bands, relative, classes)
         chosen = np.zeros(table.size, np.int32)
-        for _ in range(_TURNS):
+        for _ in range(self._turns):
             counts = _PRIOR * np.exp2(-_laplace())
             for band in table.bands:
                 _choose(band, relative, classes, self._bits, _WORTH, chosen, counts)
-            # What is learned of one choice serves the next one, with other steps, too.
             self._bits = -np.log2(counts / counts.sum(axis=2, keepdims=True))
+        self._turns = 1  # what was learned of one choice serves the next one, with other steps, too
         return chosen
 
 
@@ -193,7 +194,7 @@ def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) ->
     aim = (1.0 + _CLOSE) / 2 * wanted
     known: list[tuple[float, float]] = []  # logarithms of error over aim and of base, nearest to the aim first
     base = guess
-    for _ in range(_TRIES):
+    for _ in range(MOST_TRIES):
         error = error_of(base)
         if error <= wanted:
             below = max(below, base)
@@ -206,8 +207,8 @@ def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) ->
         (near, at), (far, further) = known[0], known[min(1, len(known) - 1)]
         slope = (further - at) / (far - near) if far != near else _ERROR_TO_STEP
         base = round(math.exp(min(max(at - near * min(max(slope, 0.5), 4.0), at - 1.4), at + 1.4)))
-        if not below < base < above:
-            base = round(math.sqrt(max(below, 1) * above))
+        if not below < base < above:  # by chance: the error does not rise everywhere
+            base = round(1.3 * below) if above > MOST_BASE else round(math.sqrt(max(below, 1) * above))
         if not below < base < above:
             break
     return below or None
