@@ -169,6 +169,17 @@ def _family(known: NDArray[np.int32], at: int, stride: int, plane: int) -> int:
     return min(int(_CLASS[min(total, 17)]), 5)
 
 
+@inlined
+def _of_state(state: int) -> tuple[int, int, int]:
+    """Where across, around and their weights begin for an index that is coded in plane 0 in this state."""
+    odd = int(ODD[state])
+    return (
+        _TRELLIS_ACROSS + odd * (_ACROSS_CONTEXTS // 2),
+        _TRELLIS_AROUND + odd * _AROUND_CONTEXTS,
+        _TRELLIS_WEIGHTS + 4 * odd,
+    )
+
+
 @kernel
 def code_passes(
     decoding: bool,
@@ -233,7 +244,9 @@ def code_passes(
                 costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
             continue
         for band in range(bands.shape[0]):
-            state = 0
+            state, first_across, first_around, weights = 0, 0, _FIRST_AROUND, CONTEXTS
+            if dependent:
+                first_across, first_around, weights = _of_state(state)
             offset, stride, kind = bands[band, _OFFSET], bands[band, _STRIDE], bands[band, _KIND]
             rows, columns = bands[band, _ROWS], bands[band, _COLUMNS]
             parent, parent_stride = bands[band, _PARENT], bands[band, _PARENT_STRIDE]
@@ -266,6 +279,7 @@ def code_passes(
                             if dependent:
                                 for _ in range((bottom - top) * (right - left)):
                                     state = TRANSITIONS[state, 0]
+                                first_across, first_around, weights = _of_state(state)
                             continue
                         flags[block & INDEX] = 1
                     for i in range(top, bottom):
@@ -295,12 +309,6 @@ def code_passes(
                                 across_slot = (
                                     (slot * 5 + min(side >> plane, 4)) * 5 + min(rise >> plane, 4)
                                 ) * 4 + kind
-                                first_around, weights = _FIRST_AROUND, CONTEXTS + 2 * slot
-                                if dependent and slot < 2:
-                                    odd = ODD[state]
-                                    across_slot += _TRELLIS_ACROSS + odd * (_ACROSS_CONTEXTS // 2)
-                                    first_around = _TRELLIS_AROUND + odd * _AROUND_CONTEXTS
-                                    weights = _TRELLIS_WEIGHTS + 4 * odd + 2 * slot
                                 if slot > 1:
                                     bit, low, width, place = code_bit(
                                         decoding, bit, low, width, place, data, model, across_slot
@@ -318,9 +326,9 @@ def code_passes(
                                         place,
                                         data,
                                         model,
-                                        across_slot,
+                                        first_across + across_slot,
                                         first_around + around,
-                                        weights,
+                                        weights + 2 * slot,
                                     )
                                 if bit:
                                     value += unit
@@ -337,6 +345,7 @@ def code_passes(
                                         sign[at & INDEX] = -1 if bit else 1
                             if dependent:
                                 state = TRANSITIONS[state, value & 1]
+                                first_across, first_around, weights = _of_state(state)
                             far_west, west, value, east = west, value, east, far_east
                             at += 1
         if costs.size:

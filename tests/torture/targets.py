@@ -154,7 +154,8 @@ def _surfaces() -> tuple[ls.Surface, ...]:
 @functools.cache
 def _containers() -> tuple[bytes, ...]:
     whole = [ls.encode(surface) for surface in _surfaces()]
-    return (*whole, ls.encode(_surfaces()[0], precision=5.0))
+    lossy = ls.encode(_surfaces()[0], precision=5.0), ls.encode(_surfaces()[0], rms="1e-2d")
+    return (*whole, *lossy)
 
 
 def _mend_container(data: bytes) -> bytes:
