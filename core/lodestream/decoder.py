@@ -362,7 +362,7 @@ def decode(container: bytes | bytearray | memoryview) -> Surface:
     Returns
     -------
     Surface
-        With the dtype, axes and values of the original, bit for bit unless it was encoded with a precision or for one error.
+        With the dtype, axes and values of the original, bit for bit unless a precision or an error was asked for.
 
     Raises
     ------
