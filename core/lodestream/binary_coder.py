@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .kernels import inlined, kernel
 
-__all__ = ["INDEX", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit", "finish", "start"]
+__all__ = ["INDEX", "WEIGHT", "WIDEST", "code_bit", "code_five_mixed_bit", "code_mixed_bit", "finish", "start"]
 
 #: Width of the interval at the start.
 WIDEST = 0xFFFFFFFF
@@ -163,6 +163,56 @@ def code_mixed_bit(
     model[(weights + 1) & INDEX] = min(max(light + ((y * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
     model[slot & INDEX] = _learned(context, bit)
     model[other & INDEX] = _learned(second, bit)
+    if width < _BOTTOM:
+        low, width, place = _shift(decoding, low, width, place, data)
+    return bit, low, width, place
+
+
+@inlined
+def _weighed(weight: int, x: int, error: int) -> int:
+    """A weight of an input after a bit whose chance was off by ``error``."""
+    return min(max(weight + ((x * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
+
+
+@kernel
+def code_five_mixed_bit(
+    decoding: bool,
+    bit: int,
+    low: int,
+    width: int,
+    place: int,
+    data: NDArray[np.uint8],
+    model: NDArray[np.int32],
+    slots: tuple[int, int, int, int, int],
+    weights: NDArray[np.int32],
+    at: int,
+) -> tuple[int, int, int, int]:
+    """Code one bit in five contexts, mixed with the five ``weights`` that begin at ``at``. See `code_mixed_bit`."""
+    first, second, third, fourth, fifth = slots
+    a, b, c = int(model[first & INDEX]), int(model[second & INDEX]), int(model[third & INDEX])
+    d, e = int(model[fourth & INDEX]), int(model[fifth & INDEX])
+    x, y = int(_STRETCH[(a >> 16) & 4095]), int(_STRETCH[(b >> 16) & 4095])
+    z, t = int(_STRETCH[(c >> 16) & 4095]), int(_STRETCH[(d >> 16) & 4095])
+    o = int(_STRETCH[(e >> 16) & 4095])
+    p, q = int(weights[at & INDEX]), int(weights[(at + 1) & INDEX])
+    r, s = int(weights[(at + 2) & INDEX]), int(weights[(at + 3) & INDEX])
+    u = int(weights[(at + 4) & INDEX])
+    total = (p * x + q * y + r * z + s * t + u * o) >> 16
+    chance = int(_SQUASH[(min(max(total, -2047), 2047) + 2048) & 4095])
+    bound = (width >> 16) * chance
+    if decoding:
+        bit = 1 if low < bound else 0
+        low = low if bit else low - bound
+    else:
+        low = low if bit else low + bound
+    width = bound if bit else width - bound
+    error = (65536 if bit else 0) - chance
+    weights[at & INDEX], weights[(at + 1) & INDEX] = _weighed(p, x, error), _weighed(q, y, error)
+    weights[(at + 2) & INDEX], weights[(at + 3) & INDEX] = _weighed(r, z, error), _weighed(s, t, error)
+    weights[(at + 4) & INDEX] = _weighed(u, o, error)
+    model[first & INDEX], model[second & INDEX] = _learned(a, bit), _learned(b, bit)
+    model[third & INDEX], model[fourth & INDEX] = _learned(c, bit), _learned(d, bit)
+    model[fifth & INDEX] = _learned(e, bit)
     if width < _BOTTOM:
         low, width, place = _shift(decoding, low, width, place, data)
     return bit, low, width, place

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import exactness
 from .allocation import TileCurve, assign_layers
 from .bitplanes import pass_count, pass_gains
+from .brief import brief_piece, foreseen, rough_step, roughen, worth
 from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.pieces import Window, windows
@@ -99,13 +100,19 @@ def encode(
         if container is not None:
             return container
     prepared = Preparation(surface, (None if precision is None else _tolerance(precision), precisions))
-    container = _Encoding(prepared, progress).run()
+    encoding = _Encoding(prepared, progress)
+    lattice, container = encoding.lattices[0], encoding.run()
+    del encoding
     raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
     for bits in _COARSER:
         if prepared.precision is not None or len(container) <= longest(raw):
             break
         # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
         container = min(container, _Encoding(prepared, progress, bits).run(), key=len)
+    length = foreseen(prepared, lattice)
+    if length is not None and worth(prepared, length, len(container)):
+        brief = _Encoding(prepared, progress, brief=True).run()
+        container = brief if worth(prepared, len(brief), len(container)) else container
     return container
 
 
@@ -150,6 +157,7 @@ class _Encoding:
         progress: Callable[[float], None],
         bits: int | None = None,
         fine: tuple[list[Lattice], int] | None = None,
+        brief: bool = False,
     ) -> None:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
@@ -158,6 +166,7 @@ class _Encoding:
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
         self.bits = 0
         self.lattices, self.fineness = (prepared.lattices(bits), 0) if fine is None else fine
+        self.brief = brief
 
     def run(self) -> bytes:
         prepared = self.prepared
@@ -178,7 +187,8 @@ class _Encoding:
         states, figures = self._measured(states)
         self.progress(0.7)
         pieces, exact, lossless = self._pieces()
-        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
+        last = self._lattice_figures() if self.brief else figures[-1]
+        levels = self._level_figures((0.0, 0.0) if exact else last)
         self.progress(0.8)
         metadata = dict(prepared.surface.metadata)
         if lossless:
@@ -261,10 +271,12 @@ class _Encoding:
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
-        table = self._table(number)
-        true = gather(table, arrays)
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
         spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
+        if self.brief:
+            roughen(arrays[0], self.layout, norms[0], rough_step(self.prepared) / spacing)
+        table = self._table(number)
+        true = gather(table, arrays)
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
         span = self.prepared.extent if number < self.geometric else self._span(number)
@@ -371,6 +383,12 @@ class _Encoding:
             figures.append(self._figures(state, canvases))
         return [*figures, last]
 
+    def _lattice_figures(self) -> Figures:
+        """Errors of heights that come back as their lattice has them."""
+        coordinates = self.prepared.coordinates(0, self.lattices[0])[0]
+        places = np.ascontiguousarray(coordinates[np.newaxis])
+        return coordinate_distances(self.prepared.originals, self.lattices, [places], [0])
+
     def _all_passes(self) -> State:
         """Passes of every tile and channel."""
         return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
@@ -390,6 +408,12 @@ class _Encoding:
             block = prepared.surface.blocks[window.block]
             rows, columns = slice(*window.rows), slice(*window.columns)
             original, restored = self._given(window), self._last[window.block].window(window)
+            if self.brief:
+                valid = None if block.mask is None else block.mask[rows, columns]
+                piece, same = brief_piece(original, restored, valid, self.lattices[0])
+                exact[0] &= same
+                pieces.append(piece)
+                continue
             chosen = slice(None) if block.mask is None else block.mask[rows, columns]
             original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
             if kept[window.channel]:

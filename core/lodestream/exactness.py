@@ -20,9 +20,11 @@ from .errors import CorruptStreamError
 from .kernels import inlined, kernel
 from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["agree", "decode_piece", "encode_piece"]
+__all__ = ["NEIGHBOURS", "agree", "decode_piece", "encode_piece"]
 
 _RAW, _PATTERNS, _DECIMALS, _OFFSETS = range(4)
+#: The first byte of a piece that `neighbours` codes: it looks at whole windows.
+NEIGHBOURS = bytes([_OFFSETS | 63 << 2])
 _MOST_DECIMALS = 15
 _LARGEST_WHOLE = 2.0**53
 #: Values that are on no line near the others, NaN and infinity, are told by their place in a list.

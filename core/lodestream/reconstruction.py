@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exactness
+from . import exactness, neighbours
 from .bitplanes import pass_count
 from .container.model import Header
 from .container.pieces import Window, windows
@@ -162,10 +162,15 @@ class Reconstruction:
             )
             if number in self._pieces and inside:
                 values = blocks[window.block].window(window, top, left)
-                mask = self.header.masks[window.block]
-                chosen = slice(None) if mask is None else mask[slice(*window.rows), slice(*window.columns)]
+                mask, (data, offset) = self.header.masks[window.block], self._pieces[number]
+                valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
+                if data[:1] == exactness.NEIGHBOURS:
+                    lattice = self.header.lattices[window.channel]
+                    values[...] = neighbours.decode_window(values, valid, lattice, data[1:], offset + 1)
+                    continue
+                chosen = slice(None) if valid is None else valid
                 known = values[chosen]
-                values[chosen] = exactness.decode_piece(known.ravel(), *self._pieces[number]).reshape(known.shape)
+                values[chosen] = exactness.decode_piece(known.ravel(), data, offset).reshape(known.shape)
 
     def _prepare(self) -> list[Tiles]:
         if not self._tiles:

@@ -178,7 +178,7 @@ def test_errors_never_rise_from_layer_to_layer_and_end_at_nothing(name: str) -> 
         assert (index.levels[-1].rms, index.levels[-1].max_error) == (0.0, 0.0)
         assert index.exactness is not None or rms[-1] == 0.0
     else:
-        assert name == "precision"
+        assert name in ("precision", "brief")
 
 
 @pytest.mark.parametrize("name", SAMPLES)

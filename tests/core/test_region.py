@@ -57,7 +57,7 @@ REGIONS = [((0, 20), (0, 30)), ((100, 180), (250, 300)), ((299, 300), (0, 400)),
 
 
 @pytest.mark.parametrize("region", REGIONS)
-@pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes"])
+@pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes", "terraces"])
 def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> None:
     heights = wave(300, 400)
     y, x = np.mgrid[:300, :400].astype(float)
@@ -71,6 +71,7 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
         "attributes": lambda: ls.Surface(
             np.rint(heights).astype(np.int16), attributes={"t": heights.astype(np.float32), "k": (x % 7).astype("u1")}
         ),
+        "terraces": lambda: ls.Surface(np.floor(heights / 9).astype(np.int8)),
     }[kind]()
     container = ls.encode(surface)
     decoder = received(container, ls.Target(region=region))

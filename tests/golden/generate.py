@@ -134,7 +134,7 @@ def _simple() -> dict[str, Original]:
         "attributes": Original(ls.Surface(attributes, (False, True))),
         "curve": Original(ls.Surface(_torus(1, 70)[0][:, None].astype(np.float32), (True, False))),
         "two-points": Original(ls.Surface(np.array([[1.0, 4.0]]))),
-        "several-tiles": Original(ls.Surface(np.rint(300 * _wave(386, 389)).astype(np.int32)), "20"),
+        "several-tiles": Original(ls.Surface(np.rint(300 * _wave(386, 389)).astype(np.int32))),
         "several-tiles-line": Original(ls.Surface(np.rint(300 * _wave(1, 50000).T).astype(np.int32)), "20"),
     }
 
@@ -154,6 +154,24 @@ def _with_holes() -> dict[str, Original]:
         "holes-float32": Original(ls.Surface(floats)),
         "holes-int16": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -32768})),
         "holes-closed": Original(ls.Surface(tube, (True, True)), "1e-4d"),
+    }
+
+
+def _terraces() -> dict[str, Original]:
+    """Heights in steps, which cost least by their neighbours, and rough ones at a wide precision."""
+    rng = np.random.default_rng(2005)
+    y, x = np.mgrid[:66, :64] / 20.0
+    hills = 2 * np.sin(1.1 * x + 0.3) * np.cos(0.9 * y) + np.sin(2.3 * x - 1.7 * y) + 0.03 * rng.normal(size=x.shape)
+    turn = 2 * np.pi * np.arange(64) / 64
+    around = np.sin(turn + y) + 0.3 * np.cos(2 * turn - 2 * y) + 0.01 * rng.normal(size=x.shape)
+    lake = (np.hypot(y - 1, x - 2) < 0.5) | (rng.random(x.shape) < 0.01)
+    metres = (5 * np.floor(10 * hills)).astype(np.int16)
+    metres[lake] = -32768
+    return {
+        "terraces-uint8": Original(ls.Surface((np.floor(10 * hills) + 100).astype(np.uint8))),
+        "terraces-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -32768})),
+        "terraces-decimal": Original(ls.Surface(np.round(np.floor(30 * around) / 10, 1), (False, True))),
+        "terraces-precision": Original(ls.Surface((hills + rng.normal(size=x.shape)).astype(np.float32)), "2e-2d"),
     }
 
 
@@ -280,7 +298,15 @@ def _made_for_an_error() -> dict[str, Original]:
 
 def originals() -> dict[str, Original]:
     """All that there is a golden file of."""
-    return {**_simple(), **_with_holes(), **_with_attributes(), **_planes(), **_arrangements(), **_made_for_an_error()}
+    return {
+        **_simple(),
+        **_with_holes(),
+        **_terraces(),
+        **_with_attributes(),
+        **_planes(),
+        **_arrangements(),
+        **_made_for_an_error(),
+    }
 
 
 def digest(arrays: Sequence[NDArray[Any]]) -> str:

@@ -79,16 +79,28 @@ class Model:
 
     def mixed(self, coder: RangeDecoder, first: int, second: int, pair: int) -> int:
         """A bit coded with two contexts and one of the pairs of weights."""
-        x, y = STRETCH[self._chance[first] >> 8], STRETCH[self._chance[second] >> 8]
-        weights = self._weights[pair]
-        chance = SQUASH[clamp((weights[0] * x + weights[1] * y) >> 16, -2047, 2047) + 2048]
+        return self.mixed_by(coder, [first, second], self._weights[pair])
+
+    def mixed_by(self, coder: RangeDecoder, contexts: list[int], weights: list[int]) -> int:
+        """A bit coded with several contexts and as many weights, which change."""
+        inputs = [STRETCH[self._chance[context] >> 8] for context in contexts]
+        total = sum(weight * x for weight, x in zip(weights, inputs, strict=True)) >> 16
+        chance = SQUASH[clamp(total, -2047, 2047) + 2048]
         bit = coder.bit(chance)
         error = (65536 if bit else 0) - chance
-        weights[0] = clamp(weights[0] + ((x * error + 16384) >> 15), -(2**18), 2**18)
-        weights[1] = clamp(weights[1] + ((y * error + 16384) >> 15), -(2**18), 2**18)
-        self._learn(first, bit)
-        self._learn(second, bit)
+        weights[:] = [
+            clamp(weight + ((x * error + 16384) >> 15), -(2**18), 2**18)
+            for weight, x in zip(weights, inputs, strict=True)
+        ]
+        for context in contexts:
+            self._learn(context, bit)
         return bit
+
+    def add(self) -> int:
+        """One more context that knows nothing yet; its number."""
+        self._chance.append(2**19)
+        self._sureness.append(1)
+        return len(self._chance) - 1
 
 
 def model_of_unit() -> Model:

@@ -12,6 +12,7 @@ from tests.stranger.exactness import restore
 from tests.stranger.header import Header
 from tests.stranger.layout import Levels, units_of
 from tests.stranger.masks import Masks, read_masks
+from tests.stranger.neighbours import NEIGHBOURS, numbers_of
 from tests.stranger.picture import Arrays, Values, block_places, plane_value, put_together, rounded, value
 
 
@@ -129,7 +130,12 @@ class Decoder:
             if self.masks is not None:
                 valid = self.masks.masks[block][window]
             values = found[block][channel][window]
-            values[valid] = restore(piece, values[valid])
+            if piece[:1] == NEIGHBOURS:
+                lattice = self.header.lattices[channel]
+                told = [value(lattice, q) for row in numbers_of(piece[1:], values, valid, lattice) for q in row]
+                values[valid] = rounded(told, self.header.types[channel]).reshape(values.shape)[valid]
+            else:
+                values[valid] = restore(piece, values[valid])
         return self.shown(found)
 
 
