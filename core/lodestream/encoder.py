@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ from .container.model import Header
 from .container.pieces import Window, windows
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
-from .errors import OptionError
+from .errors import InputError, OptionError
 from .lattice import LATTICE_BITS, Lattice
 from .picture import coordinate_distances
 from .predictors import COEFFICIENT_BITS, default_predictors
@@ -42,6 +43,10 @@ _COARSER = (8, 4, 0)
 
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
+
+#: How often a brief stream is made for one error, and how far below it the next try aims.
+_MOST_BRIEF_TRIES = 3
+_BELOW = 0.999
 
 Figures = tuple[float, float]
 State = NDArray[np.int8]
@@ -136,7 +141,33 @@ def _made_for(
     if prepared.holds_itself():
         exact = Preparation(surface, (None, precisions))
         container = min(container, _Encoding(exact, progress).run(), key=len)
-    return container
+    brief = _brief_for(surface, prepared.rms, precisions, progress, len(container))
+    return container if brief is None else brief
+
+
+def _brief_for(
+    surface: Surface,
+    rms: float,
+    precisions: Mapping[str, Tolerance],
+    progress: Callable[[float], None],
+    length: int,
+) -> bytes | None:
+    """A brief stream of floats for this root mean square error that is shorter than one of such a length, if any."""
+    precision = math.sqrt(3) * rms  # of values that lie anywhere in a step
+    for _ in range(_MOST_BRIEF_TRIES if surface.dtype.kind == "f" else 0):
+        prepared = Preparation(surface, (Tolerance(precision), precisions))
+        try:
+            encoding = _Encoding(prepared, progress, brief=True)
+        except InputError:
+            return None  # the type of the values itself rounds by more
+        expected = foreseen(prepared, encoding.lattices[0])
+        if expected is None or not worth(prepared, expected, length):
+            return None
+        container = encoding.run()
+        if encoding.left[0] <= rms:
+            return container if worth(prepared, len(container), length) else None
+        precision *= _BELOW * rms / encoding.left[0]
+    return None
 
 
 def longest(raw: int) -> int:
@@ -188,7 +219,8 @@ class _Encoding:
         self.progress(0.7)
         pieces, exact, lossless = self._pieces()
         last = self._lattice_figures() if self.brief else figures[-1]
-        levels = self._level_figures((0.0, 0.0) if exact else last)
+        self.left = (0.0, 0.0) if exact else last
+        levels = self._level_figures(self.left)
         self.progress(0.8)
         metadata = dict(prepared.surface.metadata)
         if lossless:

@@ -191,6 +191,19 @@ def test_a_precision_holds_with_fewer_bytes_and_its_errors_are_told() -> None:
     assert (index.levels[-1].rms, index.levels[-1].max_error) == (views[-1].rms, views[-1].max_error)
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_stream_made_for_one_error_is_brief_where_that_is_shorter(dtype: str) -> None:
+    rng = np.random.default_rng(6)
+    points = np.cumsum(np.cumsum(rng.normal(size=(130, 90)), 0), 1).astype(dtype)
+    container = ls.encode(points, rms=0.3)
+    assert all(piece[:1] == NEIGHBOURS for piece in pieces_of(container))
+    told = index_of(container).levels[-1]
+    rms, largest = errors(points, ls.decode(container).points)
+    assert 0.25 < rms <= 0.3
+    assert told.rms == pytest.approx(rms)
+    assert told.max_error == pytest.approx(largest)
+
+
 def test_a_window_is_that_of_the_whole() -> None:
     points = heights().astype(np.int16)
     container = ls.encode(points)
