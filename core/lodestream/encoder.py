@@ -44,6 +44,9 @@ _COARSER = (8, 4, 0)
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
 
+#: What the first runs are of all, where a brief stream may follow.
+_FIRST_RUNS = 0.7
+
 #: How often a brief stream is made for one error, and how far below it the next try aims.
 _MOST_BRIEF_TRIES = 3
 _BELOW = 0.999
@@ -92,7 +95,7 @@ def encode(
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
-    progress = progress or (lambda fraction: None)
+    rising = _rising(progress or (lambda fraction: None))
     precisions = {name: _tolerance(wanted) for name, wanted in (attribute_precision or {}).items()}
     unknown = [name for name in precisions if name not in surface.blocks[0].attributes]
     if unknown:
@@ -101,11 +104,12 @@ def encode(
     if precision is not None and rms is not None:
         raise OptionError("expected either a precision or a root mean square error, got both")
     if rms is not None:
-        container = _made_for(surface, _tolerance(rms), precisions, progress)
+        container = _made_for(surface, _tolerance(rms), precisions, rising)
         if container is not None:
+            rising(1.0)
             return container
     prepared = Preparation(surface, (None if precision is None else _tolerance(precision), precisions))
-    encoding = _Encoding(prepared, progress)
+    encoding = _Encoding(prepared, _first(rising))
     lattice, container = encoding.lattices[0], encoding.run()
     del encoding
     raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
@@ -113,12 +117,30 @@ def encode(
         if prepared.precision is not None or len(container) <= longest(raw):
             break
         # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
-        container = min(container, _Encoding(prepared, progress, bits).run(), key=len)
+        container = min(container, _Encoding(prepared, _first(rising), bits).run(), key=len)
     length = foreseen(prepared, lattice)
     if length is not None and worth(prepared, length, len(container)):
-        brief = _Encoding(prepared, progress, brief=True).run()
+        brief = _Encoding(prepared, rising, brief=True).run()
         container = brief if worth(prepared, len(brief), len(container)) else container
+    rising(1.0)
     return container
+
+
+def _rising(progress: Callable[[float], None]) -> Callable[[float], None]:
+    """Tell fractions that never fall, whatever is tried one after another."""
+    highest = 0.0
+
+    def told(fraction: float) -> None:
+        nonlocal highest
+        highest = max(highest, fraction)
+        progress(highest)
+
+    return told
+
+
+def _first(progress: Callable[[float], None]) -> Callable[[float], None]:
+    """The progress of runs that another may follow."""
+    return lambda fraction: progress(_FIRST_RUNS * fraction)
 
 
 def _tolerance(precision: float | str | Tolerance) -> Tolerance:
@@ -135,12 +157,12 @@ def _made_for(
     if prepared.rms is None or (fine := prepared.fine_lattices()) is None:
         return None
     try:
-        container = _Encoding(prepared, progress, fine=fine).run()
+        container = _Encoding(prepared, _first(progress), fine=fine).run()
     except _UnreachableError:
         return None
     if prepared.holds_itself():
         exact = Preparation(surface, (None, precisions))
-        container = min(container, _Encoding(exact, progress).run(), key=len)
+        container = min(container, _Encoding(exact, _first(progress)).run(), key=len)
     brief = _brief_for(surface, prepared.rms, precisions, progress, len(container))
     return container if brief is None else brief
 

@@ -193,9 +193,17 @@ def test_framing_costs_little(name: str) -> None:
     assert index.header.length <= 256
 
 
-def test_progress_rises_to_one() -> None:
+@pytest.mark.parametrize("kind", ["small", "brief", "for one error", "noise"])
+def test_progress_rises_to_one(kind: str) -> None:
     told: list[float] = []
-    ls.encode(terrain((40, 40)), progress=told.append)
+    if kind == "small":
+        ls.encode(terrain((40, 40)), progress=told.append)
+    elif kind == "brief":
+        ls.encode(terrain((70, 70)), 20.0, progress=told.append)
+    elif kind == "for one error":
+        ls.encode(terrain((70, 70)), rms=1.0, progress=told.append)
+    else:
+        ls.encode(np.random.default_rng(1).random((70, 70)), progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     assert all(0 <= fraction <= 1 for fraction in told)
