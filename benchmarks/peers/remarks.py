@@ -8,8 +8,8 @@ __all__ = ["REMARKS", "TERRACES", "remark_of"]
 
 REMARKS: dict[str, str] = {
     "few bytes": """\
-Less than 4 KB in all, of which the header and the frames of layers are a good part. Tried: layers only
-where they are worth their frame (kept), shorter headers (kept), trained contexts (kept). Starting every tile with
+Less than 4 KB in all, of which the header and the frames of layers are a good part. Tried: a stream for this one
+error, with three layers (kept), shorter headers (kept), trained contexts (kept). Starting every tile with
 its own final model, the best that any initial table could be, would save 1 to 2 % here; showing insignificant
 coefficients by linear prediction lowers the RMS by 0.5 to 2 %. SPERR's 9/7 filters are longer than those of the
 optimal hierarchy.""",
@@ -19,9 +19,9 @@ longer tiles on narrow surfaces, and models shared by small parts (both kept). T
 surfaces.""",
     "quantised values": """\
 The peer codes whole numbers, quantised with the very step that meets the error, by predictors and contexts chosen
-for this surface, and gives nothing before its end. Tried: a precision that meets the error, in steps of odd size on
-whole heights (kept as the setting: it takes 5 to 19 % off one exact stream where the values' own lattice is about
-as coarse as the error); signed sums of neighbours as contexts (+0.3 %); finer classes of the ring, with the kind of
+for this surface, and gives nothing before its end. Tried: a stream for this one error, with a trellis (kept as the
+setting: 5 to 20 % less than one exact stream, and less than any precision); whole numbers by their neighbours in
+raster order, as the peer does it (kept where it is shorter); signed sums of neighbours as contexts (+0.3 %); finer classes of the ring, with the kind of
 band (+0.1 %); the ring mixed in for higher planes (-0.1 %, a tenth slower); other rates of learning (within 0.05
 %); surer probabilities (-0.03 %); another lifting step within bands against what is left of correlation (1 to 5 %
 worse at medium rates, nothing at the end).""",
@@ -32,8 +32,8 @@ contexts (as above) gain nothing here either; a precision is no help below the v
     "transforms": """\
 The peer is a wavelet coder with longer filters (9/7) and its rates are chosen after coding. Tried: layers that end
 where the error has just fallen (kept, up to 6 %); weights of bands other than the norms of their synthesis (no
-gain); reconstruction points for each tile and class (0.2 %, left out); a precision for the error (no gain at so
-large an error).""",
+gain); reconstruction points for each tile and class (0.2 %, left out); a stream for this one error (kept as the
+setting).""",
     "maximum": """\
 Not an aim. A maximum is met by coding all values quantised, which is what a precision does; before its end the
 largest error of an embedded stream is four times its RMS and more. Tried: a precision for the maximum (kept as the
