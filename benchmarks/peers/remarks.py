@@ -20,11 +20,11 @@ surfaces.""",
     "quantised values": """\
 The peer codes whole numbers, quantised with the very step that meets the error, by predictors and contexts chosen
 for this surface, and gives nothing before its end. Tried: a stream for this one error, with a trellis (kept as the
-setting: 5 to 20 % less than one exact stream, and less than any precision); whole numbers by their neighbours in
-raster order, as the peer does it (kept where it is shorter); signed sums of neighbours as contexts (+0.3 %); finer classes of the ring, with the kind of
-band (+0.1 %); the ring mixed in for higher planes (-0.1 %, a tenth slower); other rates of learning (within 0.05
-%); surer probabilities (-0.03 %); another lifting step within bands against what is left of correlation (1 to 5 %
-worse at medium rates, nothing at the end).""",
+setting: 5 to 20 % less than one exact stream); whole numbers by their neighbours in raster order, as the peer does
+it (kept where that is shorter); signed sums of neighbours as contexts (+0.3 %); finer classes of the ring, with the
+kind of band (+0.1 %); the ring mixed in for higher planes (-0.1 %, a tenth slower); other rates of learning (within
+0.05 %); surer probabilities (-0.03 %); another lifting step within bands against what is left of correlation (1 to 5
+% worse at medium rates, nothing at the end).""",
     "terraces": """\
 A map of heights in 8 bits that are 153 of the 256 values, where two neighbours in three are equal: the peer's tree of
 predictors says so exactly, while the optimal hierarchy spreads each edge of a terrace over its levels. Finer classes of

@@ -383,3 +383,15 @@ def test_a_signalling_nan_is_a_hole_like_any_other(tmp_path: Path) -> None:
     surface = formats.read(path)
     assert sorted(surface.shape) == [7, 9]
     assert np.isnan(surface.points).any(axis=2).sum() == 1
+
+
+@pytest.mark.parametrize("extra", ["", "property list uchar int more\n"])
+def test_a_number_that_its_float_cannot_hold_is_refused(tmp_path: Path, extra: str) -> None:
+    vertices = "".join(f"{x} {1e60 if x * y else 0} {y}{' 0' if extra else ''}\n" for x in (0, 1) for y in (0, 1))
+    path = tmp_path / "far.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        f"{extra}element face 1\nproperty list uchar int vertex_indices\nend_header\n{vertices}4 0 1 3 2\n"
+    )
+    with pytest.raises(FormatError, match="can hold"):
+        formats.read(path)

@@ -200,6 +200,11 @@ def _read_text(path: Path, header: Header) -> dict[str, Table]:
     return tables
 
 
+def _too_large(numbers: NDArray[np.float64], it: Property) -> NDArray[np.bool_]:
+    """Which numbers would be infinite in their floating type, but are not."""
+    return np.isfinite(numbers) & (np.abs(numbers) > float(np.finfo(it.dtype).max))
+
+
 class _Words:
     """The rows of one element in text, each on a line of its own."""
 
@@ -245,8 +250,13 @@ class _Words:
             raise
 
     def _fitting(self, numbers: NDArray[np.float64], it: Property, start: int) -> NDArray[np.float64]:
-        """Check that numbers fit into an integer type."""
+        """Check that numbers fit into their type."""
         if np.dtype(it.dtype).kind == "f":
+            large = _too_large(numbers, it)
+            if large.any():
+                raise self._refusal(
+                    start + int(large.argmax()), f"a number that {np.dtype(it.dtype)} can hold ({it.name})"
+                )
             return numbers
         limits = np.iinfo(it.dtype)
         wrong = ~((numbers >= limits.min) & (numbers <= limits.max) & (numbers == np.trunc(numbers)))
@@ -292,6 +302,10 @@ class _Words:
     def _typed(self, numbers: list[float], it: Property) -> NDArray[Any]:
         values = np.array(numbers, np.float64)
         dtype = np.dtype(it.dtype)
+        if dtype.kind == "f" and _too_large(values, it).any():
+            raise FormatError(
+                f"expected {it.name} of {self._element.name} as numbers that {dtype} can hold, got larger ones"
+            )
         if dtype.kind != "f" and values.size:
             limits = np.iinfo(dtype)
             if not (values.min() >= limits.min and values.max() <= limits.max and (values == np.trunc(values)).all()):
