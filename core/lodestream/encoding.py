@@ -1,0 +1,410 @@
+"""One run of the encoder: a prepared surface into a container of a certain kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import exactness
+from .allocation import TileCurve, assign_layers
+from .bitplanes import pass_count, pass_gains
+from .brief import brief_piece, rough_step, roughen
+from .container.headers import MOST_FRACTION
+from .container.model import Header
+from .container.pieces import Window, windows
+from .container.writer import CodedLayer, CodedSegment, write_container
+from .digest import DIGEST, values_digest
+from .lattice import LATTICE_BITS, Lattice
+from .picture import coordinate_distances
+from .predictors import COEFFICIENT_BITS, default_predictors
+from .preparation import Preparation
+from .quantiser import Quantiser
+from .rate_distortion import MOST_TRIES, Chooser, longest_base
+from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
+from .surface import Block, Surface
+from .tile_coder import Channel, TileCoder, planes_of
+from .tiles import Tiles, TileTable, gather
+from .transform import PADDING, forward, synthesis_norms
+
+__all__ = ["Encoding", "UnreachableError"]
+
+#: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
+#: whose tiles are all known is inverted without errors of rounding.
+_ROUNDING = 0.2
+
+#: The step of a stream made for one error, over the error, that is tried first.
+_LIKELY_STEP = 6
+
+Figures = tuple[float, float]
+State = NDArray[np.int8]
+
+
+class UnreachableError(Exception):
+    """No step is short enough for the error: the type of the values itself rounds by more."""
+
+
+class Encoding:
+    """One run of the encoder; the methods stand in the order in which they are called.
+
+    Parameters
+    ----------
+    prepared : Preparation
+    progress : callable
+        Called now and then with the fraction done, 0 to 1.
+    bits : int, optional
+        Keep no more of any channel than so many bits of its range.
+    fine : (list of Lattice, int), optional
+        What a stream for one error is quantised on, see `Preparation.fine_lattices`.
+    brief : bool
+        Rough layers, and the rest by `neighbours`.
+
+    Attributes
+    ----------
+    lattices : list of Lattice, one a channel
+    left : (float, float)
+        RMS and maximum error of the complete stream, after `run`.
+    """
+
+    def __init__(
+        self,
+        prepared: Preparation,
+        progress: Callable[[float], None],
+        bits: int | None = None,
+        fine: tuple[list[Lattice], int] | None = None,
+        brief: bool = False,
+    ) -> None:
+        self.prepared, self.progress = prepared, progress
+        self.quantiser: Quantiser | None = None
+        self.geometric, self.layout = prepared.geometric, prepared.layout
+        table = TileTable.of(self.layout)
+        self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
+        self.bits = 0
+        self.lattices, self.fineness = (prepared.lattices(bits), 0) if fine is None else fine
+        self.brief = brief
+
+    def run(self) -> bytes:
+        """The container.
+
+        Raises
+        ------
+        UnreachableError
+        """
+        prepared = self.prepared
+        predictors = np.zeros((len(self.lattices), *default_predictors(self.layout).shape), np.int8)
+        channels = []
+        for number, lattice in enumerate(self.lattices):
+            channel, predictors[number] = self._transform(number, lattice)
+            channels.append(channel)
+        self.channels = channels
+        self.predictors = predictors
+        self.progress(0.1)
+        if prepared.rms is not None:
+            self._quantise(prepared.rms)
+        curves = self._curves()
+        self.header = self._header()
+        states = assign_layers(curves, self.layout, len(channels), self.quantiser is not None)
+        self.progress(0.4)
+        states, figures = self._measured(states)
+        self.progress(0.7)
+        pieces, exact, lossless = self._pieces()
+        last = self._lattice_figures() if self.brief else figures[-1]
+        self.left = (0.0, 0.0) if exact else last
+        levels = self._level_figures(self.left)
+        self.progress(0.8)
+        metadata = dict(prepared.surface.metadata)
+        if lossless:
+            metadata[DIGEST] = values_digest(_as_returned(prepared.given, self.header.hole))
+        coded = self._coded(states, figures)
+        container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
+        self.progress(1.0)
+        return container
+
+    def _header(self) -> Header:
+        prepared, surface = self.prepared, self.prepared.surface
+        masks = [block.mask for block in surface.blocks]
+        return Header(
+            dtype=surface.dtype,
+            blocks=tuple((block.shape, block.closed) for block in surface.blocks),
+            arrangement=prepared.arrangement,
+            point_channels=prepared.point_channels,
+            flat=surface.blocks[0].points.ndim == 2,
+            attributes=prepared.kinds,
+            lattices=tuple(self.lattices),
+            predictors=self.predictors,
+            extent=prepared.extent,
+            empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
+            fraction=self._fraction(),
+            tile=self.layout.tile,
+            exact=False,
+            corrected=False,
+            layer_count=0,
+            plane=prepared.plane,
+            masked=any(mask is not None for mask in masks),
+            hole=_hole(surface),
+            holes=tuple(block.holes for block in surface.blocks),
+            quantiser=self.quantiser,
+            mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
+        )
+
+    def _fraction(self) -> int:
+        """Binary places between lattice steps, which are fine enough as they are where there is a quantiser."""
+        if self.quantiser is not None:
+            return 0
+        return max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes()))
+
+    def _quantise(self, wanted: float) -> None:
+        """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
+        table, channels = self.tables[0], self.channels[: self.geometric]
+        choosers = [Chooser(table, channel.true) for channel in channels]
+        state, canvases = np.zeros_like(self._all_passes()), self._canvases()
+        kept: dict[int, list[NDArray[np.int32]]] = {}
+        done: list[int] = []
+
+        def error(base: int) -> float:
+            self.quantiser = Quantiser(base)
+            found = [chooser.indices(self.quantiser) for chooser in choosers]
+            self.tiles = [Tiles(table, self.quantiser) for _ in choosers]
+            for tiles, indices in zip(self.tiles, found, strict=True):
+                tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
+            self.header = self._header()
+            done.append(base)
+            self.progress(0.1 + 0.2 * len(done) / MOST_TRIES)
+            rms = self._figures(state, canvases)[0]
+            if rms <= wanted:
+                kept.clear()
+                kept[base] = found
+            return rms
+
+        base = longest_base(error, wanted, _LIKELY_STEP * self.fineness)
+        if base is None:
+            raise UnreachableError
+        self.quantiser = Quantiser(base)
+        squares = table.steps(self.quantiser).astype(np.float64) ** 2
+        for channel, indices in zip(channels, kept[base], strict=True):
+            channel.true, channel.weights = indices, channel.weights * squares
+            channel.top = np.array([planes_of(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
+
+    def _transform(self, number: int, lattice: Lattice) -> tuple[Channel, NDArray[np.int8]]:
+        """Lattice coordinates of a channel, transformed and cut into tiles."""
+        for fit in (True, False):
+            arrays = self.prepared.coordinates(number, lattice)
+            self.bits = max(self.bits, max(_largest(array) for array in arrays).bit_length())
+            predictors = forward(arrays, self.layout, fit)
+            if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
+                break
+        norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
+        spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
+        if self.brief:
+            roughen(arrays[0], self.layout, norms[0], rough_step(self.prepared) / spacing)
+        table = self._table(number)
+        true = gather(table, arrays)
+        # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
+        # attribute shares the stream in proportion to its own range.
+        span = self.prepared.extent if number < self.geometric else self._span(number)
+        spacing = spacing / span if span else 0.0
+        weights = np.array(
+            [
+                norms[band.grid][tile.level, *map(int, band.kind)] * spacing**2
+                for tile, bands in zip(self.layout.tiles, table.members, strict=True)
+                for band in bands
+            ]
+        )
+        top = np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
+        return Channel(true, weights, top), predictors
+
+    def _table(self, channel: int) -> TileTable:
+        return self.tables[0 if channel < self.geometric else 1]
+
+    def _span(self, channel: int) -> float:
+        """Range of an attribute."""
+        values = [self.prepared.channel(block, channel) for block in range(len(self.prepared.arrays))]
+        return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
+
+    def _most_planes(self) -> int:
+        """Bit-planes of the tile that has most; with the fraction they must fit a coefficient."""
+        return max(int(channel.top.max()) for channel in self.channels)
+
+    def _empty_levels(self, top: NDArray[np.int8]) -> int:
+        """The levels without a coefficient other than 0, as bits."""
+        levels = range(self.layout.levels + 1)
+        return sum(1 << level for level in levels if not top[self.layout.tiles_of(level)].any())
+
+    def _curves(self) -> list[TileCurve]:
+        """Cost and gain of every pass, by coding each tile once as a whole."""
+        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        self.tiles = coder.tiles
+        curves = []
+        for tile in range(len(self.layout.tiles)):
+            for number, channel in enumerate(self.channels):
+                top = int(channel.top[tile])
+                if top:
+                    passes = pass_count(top)
+                    costs = np.zeros(passes, np.float64)
+                    coder.code(tile, number, passes, passes, costs)
+                    bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+                    errors = np.zeros(passes + 1, np.float64)
+                    table = self._table(number)
+                    first, last = table.first[tile], table.first[tile + 1]
+                    early, weights = coder.tiles[number].early, channel.weights[first:last]
+                    rows = table.of_tile(tile)
+                    pass_gains(rows, weights, passes, channel.true, early, errors)
+                    gains = np.diff(errors)
+                    rounding = _ROUNDING if self.quantiser is None else 0.0
+                    gains[0] += rounding * float((weights * rows[:, 2] * rows[:, 3]).sum())
+                    curves.append(TileCurve(tile, number, bits, gains))
+        return curves
+
+    def _tables_of_channels(self) -> list[TileTable]:
+        return [self._table(number) for number in range(len(self.channels))]
+
+    def _figures(self, state: State, canvases: list[NDArray[np.int32]]) -> Figures:
+        """RMS and maximum error of what a receiver shows in this state, see `reconstruction.Reconstruction`."""
+        fractions = []
+        for number in range(self.geometric):
+            places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
+            fractions.append(self._picture(number, state, places)[1])
+        curves = len(canvases) - len(self.prepared.parts)
+        lattices = self.lattices[: self.geometric]
+        return coordinate_distances(self.prepared.originals, lattices, canvases[curves:], fractions)
+
+    def _picture(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Picture:
+        return channel_picture(self.header, number, self.tiles[number], state[:, number], self.layout.levels, canvases)
+
+    def _canvases(self) -> list[NDArray[np.int32]]:
+        """Room for a picture of each channel that is a coordinate, one array for each grid."""
+        shapes = [grid.shape for grid in self.layout.grids]
+        return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
+
+    def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
+        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
+        canvases = self._canvases()
+        kept: list[State] = []
+        figures: list[Figures] = []
+        for state in states:
+            announced = state < self._all_passes()
+            shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
+            measured = self._figures(shown.astype(np.int8), canvases)
+            while figures and measured[0] > figures[-1][0]:
+                kept.pop()
+                figures.pop()
+            kept.append(state)
+            figures.append(measured)
+        del canvases
+        pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
+        self._last = to_values(self.header, pictures, self.layout.levels)
+        return kept, figures
+
+    def _level_figures(self, last: Figures) -> list[Figures]:
+        """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
+        canvases, start = self._canvases(), initial_state(self.header)
+        figures = []
+        for level in range(self.layout.levels):
+            state = start.copy()
+            state[: self.layout.tiles_of(level).stop] = 0
+            figures.append(self._figures(state, canvases))
+        return [*figures, last]
+
+    def _lattice_figures(self) -> Figures:
+        """Errors of heights that come back as their lattice has them."""
+        coordinates = self.prepared.coordinates(0, self.lattices[0])[0]
+        places = np.ascontiguousarray(coordinates[np.newaxis])
+        return coordinate_distances(self.prepared.originals, self.lattices, [places], [0])
+
+    def _all_passes(self) -> State:
+        """Passes of every tile and channel."""
+        return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
+
+    def _pieces(self) -> tuple[list[bytes], bool, bool]:
+        """The exactness section's pieces; whether the coordinates are exact then, and whether all is.
+
+        A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit.
+        """
+        prepared, pieces = self.prepared, []
+        kept = [prepared.precision is not None or prepared.rms is not None] * self.geometric
+        kept += [False] * (prepared.point_channels - self.geometric)
+        for kind in prepared.kinds:
+            kept += [kind.name in prepared.attribute_precisions] * kind.channels
+        exact = [True, True]
+        for window in windows(self.header):
+            block = prepared.surface.blocks[window.block]
+            rows, columns = slice(*window.rows), slice(*window.columns)
+            original, restored = self._given(window), self._last[window.block].window(window)
+            if self.brief:
+                valid = None if block.mask is None else block.mask[rows, columns]
+                piece, same = brief_piece(original, restored, valid, self.lattices[0])
+                exact[0] &= same
+                pieces.append(piece)
+                continue
+            chosen = slice(None) if block.mask is None else block.mask[rows, columns]
+            original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
+            if kept[window.channel]:
+                exact[0 if window.channel < self.geometric else 1] &= exactness.agree(original, restored)
+                pieces.append(b"")
+            else:
+                step = self.lattices[window.channel].step if original.dtype == np.float32 else None
+                pieces.append(exactness.encode_piece(original, restored, step))
+        return pieces, exact[0], all(exact)
+
+    def _given(self, window: Window) -> NDArray[Any]:
+        """One channel of the surface in a window, as it was given."""
+        block, channel = self.prepared.surface.blocks[window.block], window.channel
+        for values in (block.points, *block.attributes.values()):
+            array = values if values.ndim == 3 else values[..., np.newaxis]
+            if channel < array.shape[2]:
+                return array[slice(*window.rows), slice(*window.columns), channel]
+            channel -= array.shape[2]
+        raise IndexError(window.channel)
+
+    def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
+        """Code the passes that each layer adds."""
+        del self.tiles, self._last  # as large as what takes their place
+        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        before = start = self._all_passes()
+        layers = []
+        for state, (rms, worst) in zip(states, figures, strict=True):
+            segments = []
+            for tile, number in np.argwhere(state < before):
+                first, last = int(before[tile, number]), int(state[tile, number])
+                data = coder.code(int(tile), int(number), first, first - last)
+                top, begins = int(self.channels[number].top[tile]), first == start[tile, number]
+                segments.append(CodedSegment(int(tile), int(number), top, first - last, bool(begins), data))
+            layers.append(CodedLayer(rms, worst, segments))
+            before = state
+        return layers
+
+
+def _largest(values: NDArray[np.int32]) -> int:
+    """The largest magnitude."""
+    return max(int(values.max()), -int(values.min()))
+
+
+def _encode_mask(mask: NDArray[np.bool_]) -> bytes:
+    from .mask import encode_mask  # only where there is one
+
+    return encode_mask(mask)
+
+
+def _hole(surface: Surface) -> int:
+    """What integer points are under holes: the surface's nodata value where it is one of them."""
+    nodata = surface.metadata.get("nodata")
+    if surface.dtype.kind == "f" or not isinstance(nodata, int | float) or nodata != int(nodata):
+        return 0
+    limits = np.iinfo(surface.dtype)
+    return int(nodata) if max(limits.min, -(2**63)) <= nodata <= min(limits.max, 2**63 - 1) else 0
+
+
+def _as_returned(surface: Surface, hole: int) -> Iterator[Block]:
+    """The blocks as they come out of a container: holes have the value that says so."""
+    for block in surface.blocks:
+        if block.mask is None:
+            yield block
+            continue
+        arrays = [np.array(array) for array in (block.points, *block.attributes.values())]
+        values = Values([array.reshape(*block.shape, -1) for array in arrays])
+        values.clear(~block.mask, hole)
+        points, *attributes = (v.reshape(a.shape) for v, a in zip(values.arrays, arrays, strict=True))
+        named = dict(zip(block.attributes, attributes, strict=True))
+        yield Block(points, block.closed, mask=block.mask, attributes=named)
