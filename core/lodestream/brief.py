@@ -24,8 +24,9 @@ __all__ = ["brief_piece", "foreseen", "rough_step", "roughen", "worth"]
 _EXACT_STEP, _PRECISE_STEP = 0.15, 4.0
 #: A coefficient becomes a multiple of its step from this part of a step below it.
 _ROUNDED_UP = 0.25
-#: A brief stream is at most so long, in parts of the other.
-_EXACT_SHARE, _PRECISE_SHARE = 0.85, 0.99
+#: A brief stream is at most so long, in parts of the other: of exact ones, of those with a precision, and of those that
+#: are made for one error, where nothing counts but their length.
+_EXACT_SHARE, _PRECISE_SHARE, _MADE_SHARE = 0.85, 0.9, 0.99
 #: A surface below this has too little to learn from.
 _FEWEST_POINTS = 1 << 12
 #: A stream's length is foreseen from every so many windows, and at most so many.
@@ -60,9 +61,10 @@ def roughen(array: NDArray[np.int32], layout: Layout, norms: NDArray[np.float64]
             band[...] = np.where(band < 0, -magnitudes, magnitudes)
 
 
-def worth(prepared: Preparation, length: int, other: int) -> bool:
-    """Whether a brief stream of so many bytes is better than another of so many."""
-    return length <= (_EXACT_SHARE if prepared.precision is None else _PRECISE_SHARE) * other
+def worth(prepared: Preparation, length: int, other: int, made: bool = False) -> bool:
+    """Whether a brief stream of so many bytes is better than another of so many; ``made`` for one error only."""
+    share = _MADE_SHARE if made else _EXACT_SHARE if prepared.precision is None else _PRECISE_SHARE
+    return length <= share * other
 
 
 def foreseen(prepared: Preparation, lattice: Lattice) -> int | None:

@@ -161,10 +161,10 @@ def _brief_for(
         except InputError:
             break  # the type of the values itself rounds by more
         expected = foreseen(prepared, encoding.lattices[0])
-        if expected is None or not worth(prepared, expected, length):
+        if expected is None or not worth(prepared, expected, length, made=True):
             break
         container, error = encoding.run(), encoding.left[0]
-        if error <= rms and worth(prepared, len(container), length):
+        if error <= rms and worth(prepared, len(container), length, made=True):
             best, length = container, len(container)
         if surface.dtype.kind in "iu" or _CLOSE * rms <= error <= rms:
             break
