@@ -15,7 +15,7 @@ Grid = list[list[int]]
 
 def clamp(value: int, least: int, most: int) -> int:
     """The value, or the end of the range that it lies beyond."""
-    return min(max(value, least), most)
+    return least if value < least else most if value > most else value
 
 
 def _squash(x: int) -> int:
@@ -178,14 +178,6 @@ def classify(total: int) -> int:
     return CLASS[total] if total <= 16 else 6
 
 
-AT_TWO = [
-    (row, column, 2 if row == 0 or column == 0 else 1)
-    for row in range(-2, 3)
-    for column in range(-2, 3)
-    if max(abs(row), abs(column)) == 2
-]
-
-
 @dataclass
 class Unit:
     """A tile of one channel, with the state of its coder."""
@@ -241,13 +233,16 @@ class _Pass:
                 columns = range(block_column, min(block_column + BLOCK, band.columns))
                 if not band.blocks[i][j] and not self.is_first:
                     band.blocks[i][j] = self.model.alone(self.coder, self._flag_context(i, j, rows, columns))
+                if not (band.blocks[i][j] or self.follows):
+                    continue
                 for row in rows:
                     for column in columns:
                         if self.follows:
                             band.state[row][column] = self.state
                         if band.blocks[i][j]:
                             self._visit(row, column)
-                        self.state = NEXT[self.state][band.magnitude[row + MARGIN][column + MARGIN] & 1]
+                        if self.follows:
+                            self.state = NEXT[self.state][band.magnitude[row + MARGIN][column + MARGIN] & 1]
 
     def _visit(self, row: int, column: int) -> None:
         band, plane = self.band, self.plane
@@ -283,16 +278,19 @@ class _Pass:
             here[c] += 1 << plane
 
     def _ring_class(self, r: int, c: int) -> int:
-        magnitude = self.band.magnitude
-        return classify(sum(count * magnitude[r + i][c + j] for i, j, count in AT_TWO) >> self.plane)
+        over, above, here, below, under = self.band.magnitude[r - 2 : r + 3]
+        total = sum(over[c - 2 : c + 3]) + over[c] + sum(under[c - 2 : c + 3]) + under[c]
+        total += above[c - 2] + above[c + 2] + 2 * (here[c - 2] + here[c + 2]) + below[c - 2] + below[c + 2]
+        return classify(total >> self.plane)
 
     def _parent_class(self, row: int, column: int) -> int:
         parent, plane = self.band.parent, self.plane
         if parent is None:
             return 0
         r, c = self.band.parent_place(row, column)
-        around = [parent.at(r, c - 1), parent.at(r, c + 1), parent.at(r - 1, c), parent.at(r + 1, c)]
-        return min(classify(4 * (parent.at(r, c) >> plane) + sum(number >> plane for number in around)), 5)
+        across = (parent.at(r, c - 1) >> plane) + (parent.at(r, c + 1) >> plane)
+        down = (parent.at(r - 1, c) >> plane) + (parent.at(r + 1, c) >> plane)
+        return min(classify(4 * (parent.at(r, c) >> plane) + across + down), 5)
 
     def _sign_context(self, r: int, c: int) -> int:
         sign = self.band.sign

@@ -77,8 +77,7 @@ class Decoder:
         shown = []
         for block in range(len(header.blocks)):
             grid = put_together(header, self.levels, block, level, arrays.numbers)
-            numbers = [value(header.lattices[channel], q / over) for row in grid for q in row]
-            shown.append(rounded(numbers, header.types[channel]).reshape(len(grid), len(grid[0])))
+            shown.append(rounded(value(header.lattices[channel], grid / over), header.types[channel]))
         return shown
 
     def channels(self, layers: int | None = None, level: int | None = None) -> list[list[Values]]:
@@ -105,7 +104,7 @@ class Decoder:
             size = header.blocks[number].rows, header.blocks[number].columns
             for axis, rule in zip((0, 1), reversed(header.plane["grid"]), strict=True):
                 numbers = [plane_value(rule, axis, (row, column), size) for row in rows for column in columns]
-                points.insert(0, rounded(numbers, header.type).reshape(valid.shape))
+                points.insert(0, rounded(np.array(numbers).reshape(valid.shape), header.type))
         arrays = [_with_holes(np.stack(points, axis=-1), valid, 0 if self.masks is None else self.masks.hole)]
         if header.flat and header.plane is None:
             arrays[0] = arrays[0][..., 0]
@@ -132,8 +131,8 @@ class Decoder:
             values = found[block][channel][window]
             if piece[:1] == NEIGHBOURS:
                 lattice = self.header.lattices[channel]
-                told = [value(lattice, q) for row in numbers_of(piece[1:], values, valid, lattice) for q in row]
-                values[valid] = rounded(told, self.header.types[channel]).reshape(values.shape)[valid]
+                told = value(lattice, np.array(numbers_of(piece[1:], values, valid, lattice), float))
+                values[valid] = rounded(told, self.header.types[channel])[valid]
             else:
                 values[valid] = restore(piece, values[valid])
         return self.shown(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +22,7 @@ NEIGHBOURS = b"\xff"  # how a piece begins
 MOST_BITS = 26
 
 
+@functools.cache
 def places(text: str) -> list[Place]:
     """Rows and columns from a point."""
     return [(int(row), int(column)) for row, column in (pair.split(",") for pair in text.split())]

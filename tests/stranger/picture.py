@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,11 @@ from numpy.typing import NDArray
 from tests.stranger.coder import MARGIN, Unit, clamp
 from tests.stranger.header import Header, Lattice, Part
 from tests.stranger.layout import Grid, Levels
-from tests.stranger.lifting import details, undo
+from tests.stranger.lifting import Lines, details, undo
 from tests.stranger.quantised import known_parts, step
 
 Values = NDArray[Any]
-Lines = list[list[int]]
+Floats = NDArray[np.float64]
 
 
 def known_part(magnitude: int, born: int, remaining: int) -> int:
@@ -41,8 +40,7 @@ class Arrays:
         self.grids = [grid for grid in levels.grids if grid.part >= 0 or self.is_coordinate]
         self.numbers: dict[int, Lines] = {}  # by the number of the grid among all
         for number, grid in enumerate(levels.grids):
-            rows, columns = grid.shape[level]
-            self.numbers[number] = [[0] * columns for _ in range(rows)]
+            self.numbers[number] = np.zeros(grid.shape[level], np.int64)
 
     def put(self, unit: Unit, remaining: int, factor: int) -> None:
         """The known part of a unit's coefficients."""
@@ -58,7 +56,9 @@ class Arrays:
                         shown = known_part(band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c], remaining)
                     else:
                         shown = quantised[r][c]
-                    numbers[band.place[0] + r][band.place[1] + c] = band.sign[r + MARGIN][c + MARGIN] * shown * factor
+                    if shown:
+                        sign = band.sign[r + MARGIN][c + MARGIN]
+                        numbers[band.place[0] + r, band.place[1] + c] = sign * shown * factor
 
     def to_points(self, whole: int) -> None:
         """Undoes all steps, where the levels up to `whole` are known."""
@@ -73,18 +73,18 @@ class Arrays:
 
     def _take_common_ends(self) -> None:
         for (curve, end), (holder, held) in sorted(self.levels.held.items()):
-            self.numbers[curve][end * (self.levels.grids[curve].shape[0][0] - 1)][0] = self.numbers[holder][
+            self.numbers[curve][end * (self.levels.grids[curve].shape[0][0] - 1)] = self.numbers[holder][
                 held * (self.levels.grids[holder].shape[0][0] - 1)
-            ][0]
+            ]
 
-    def _curve(self, grid: Grid, side: int, level: int, count: int) -> list[int] | None:
+    def _curve(self, grid: Grid, side: int, level: int, count: int) -> Lines | None:
         """The points of a level of the curve of a side, in the order of the side; None if there is no curve."""
         taken = grid.sides[side]
         if taken is None:
             return None
-        points = [row[0] for row in self.numbers[taken.curve][: self.levels.grids[taken.curve].shape[level][0]]]
+        points = self.numbers[taken.curve][: self.levels.grids[taken.curve].shape[level][0], 0]
         if self.levels.grids[taken.curve].axes[0].samples == 1:
-            return points * count
+            return np.repeat(points, count)
         return points[::-1] if taken.reversed else points
 
     def _take_sides(self, numbers: Lines, grid: Grid) -> None:
@@ -102,52 +102,43 @@ class Arrays:
             points = self._curve(grid, side, level, grid.shape[level][along])
             if step is None or points is None:
                 continue
-            found = details(points, step, self.levels.predictor(self.channel, grid, level, along))
+            found = details(points[:, None], step, self.levels.predictor(self.channel, grid, level, along))[:, 0]
             _set_line(numbers, side // 2, (side % 2) * (nodes[side // 2] - 1), nodes[along], found)
 
     def _refine(self, numbers: Lines, grid: Grid, level: int, scaled: bool) -> None:
         if scaled:
             limit, scale = 2 ** (27 - self.fraction), 2**self.fraction
-            rows, columns = grid.shape[level - 1]
-            for row in numbers[:rows]:
-                row[:columns] = [clamp(number, -limit, limit) * scale for number in row[:columns]]
+            coarser = numbers[: grid.shape[level - 1][0], : grid.shape[level - 1][1]]
+            coarser[:] = np.clip(coarser, -limit, limit) * scale
         if self.is_coordinate:
             self._make_side_details(numbers, grid, level)
-        rows, columns = grid.shape[level]
-        step = grid.steps[level][1]
-        if step is not None:
-            predictor = self.levels.predictor(self.channel, grid, level, 1)
-            for row in numbers[:rows]:
-                row[:columns] = undo(row[:columns], step, predictor)
-        step = grid.steps[level][0]
-        if step is not None:
-            predictor = self.levels.predictor(self.channel, grid, level, 0)
-            for column in range(columns):
-                _set_line(numbers, 1, column, 0, undo([row[column] for row in numbers[:rows]], step, predictor))
+        finer = numbers[: grid.shape[level][0], : grid.shape[level][1]]
+        for axis, across in ((1, finer.T), (0, finer)):
+            step = grid.steps[level][axis]
+            if step is not None:
+                across[:] = undo(across, step, self.levels.predictor(self.channel, grid, level, axis))
 
 
-def _set_line(numbers: Lines, axis: int, index: int, first: int, values: Iterable[int]) -> None:
+def _set_line(numbers: Lines, axis: int, index: int, first: int, values: Lines) -> None:
     """Sets a row (axis 0) or column (axis 1), from a place on."""
-    for place, number in enumerate(values, first):
-        if axis == 0:
-            numbers[index][place] = number
-        else:
-            numbers[place][index] = number
+    across = numbers if axis == 0 else numbers.T
+    across[index, first : first + len(values)] = values
 
 
-def value(lattice: Lattice, q: float) -> float:
-    """Section 3: the float64 value of a lattice coordinate, before it is rounded to the type."""
+def value(lattice: Lattice, q: Floats) -> Floats:
+    """Section 3: the float64 values of lattice coordinates, before they are rounded to the type."""
     return (lattice.origin + q) / lattice.step if lattice.decimal else lattice.origin + lattice.step * q
 
 
-def rounded(numbers: list[float], kind: str) -> Values:
-    """Values of the type, on one axis."""
+def rounded(numbers: Floats, kind: str) -> Values:
+    """Values of the type."""
     dtype = np.dtype(kind).newbyteorder("<")
     if dtype.kind == "f":
         greatest = float(np.finfo(dtype).max)
-        return np.array([min(max(number, -greatest), greatest) for number in numbers], dtype)
+        return np.clip(numbers, -greatest, greatest).astype(dtype)
     least, most = int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
-    return np.array([clamp(round(number), least, most) for number in numbers], dtype)
+    whole = [clamp(round(number), least, most) for number in numbers.ravel().tolist()]
+    return np.array(whole, dtype).reshape(numbers.shape)
 
 
 def block_places(header: Header, levels: Levels, block: int, level: int) -> tuple[list[int], list[int]]:
@@ -182,19 +173,18 @@ def _in_block(part: Part, places: list[int], axis: int, size: int) -> list[int]:
 def put_together(header: Header, levels: Levels, block: int, level: int, grids: dict[int, Lines]) -> Lines:
     """The grid of a block, from those of its parts."""
     rows, columns = block_places(header, levels, block, level)
-    found: list[list[int | None]] = [[None] * len(columns) for _ in rows]
-    row_of, column_of = ({place: index for index, place in enumerate(places)} for places in (rows, columns))
+    found = np.zeros((len(rows), len(columns)), np.int64)
+    covered = np.zeros(found.shape, bool)
     for number, part in enumerate(header.parts):
         if part.block != block:
             continue
         down, along = part_places(header, levels, number, level)
-        for r, row in enumerate(down):
-            for c, column in enumerate(along):
-                found[row_of[row]][column_of[column]] = grids[len(header.curves) + number][r][c]
-    together = [[number for number in row if number is not None] for row in found]
-    if any(len(row) != len(columns) for row in together):
+        window = np.ix_(np.searchsorted(rows, down), np.searchsorted(columns, along))
+        found[window] = grids[len(header.curves) + number][: len(down), : len(along)]
+        covered[window] = True
+    if not covered.all():
         raise ValueError("the parts of a block do not cover it")
-    return together
+    return found
 
 
 def plane_value(rule: list[Any], axis: int, place: tuple[int, int], size: tuple[int, int]) -> float:
