@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -56,9 +57,9 @@ def cut(surface: ls.Surface, region: Any) -> list[NDArray[Any]]:
 REGIONS = [((0, 20), (0, 30)), ((100, 180), (250, 300)), ((299, 300), (0, 400)), ((0, 300), (0, 400))]
 
 
-@pytest.mark.parametrize("region", REGIONS)
-@pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes", "terraces"])
-def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> None:
+@functools.cache
+def encoded(kind: str) -> tuple[ls.Surface, bytes]:
+    """A surface that many windows are cut out of, and its container."""
     heights = wave(300, 400)
     y, x = np.mgrid[:300, :400].astype(float)
     surface = {
@@ -73,7 +74,13 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
         ),
         "terraces": lambda: ls.Surface(np.floor(heights / 9).astype(np.int8)),
     }[kind]()
-    container = ls.encode(surface)
+    return surface, ls.encode(surface)
+
+
+@pytest.mark.parametrize("region", REGIONS)
+@pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes", "terraces"])
+def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> None:
+    surface, container = encoded(kind)
     decoder = received(container, ls.Target(region=region))
     window = decoder.surface()
     for found, wanted in zip((window.points, *window.attributes.values()), cut(surface, region), strict=True):
