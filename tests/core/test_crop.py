@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -83,6 +84,7 @@ def test_a_window_of_any_state(
     np.testing.assert_array_equal(window, whole[0][slice(*region[0]), slice(*region[1])])
 
 
+@functools.cache
 def surfaces() -> dict[str, ls.Surface]:
     rows, columns = np.mgrid[:300, :340].astype(float)
     heights = np.rint(200 * np.sin(rows / 40) * np.cos(columns / 30) + np.random.default_rng(2).normal(size=(300, 340)))
@@ -103,6 +105,11 @@ def surfaces() -> dict[str, ls.Surface]:
     }
 
 
+@functools.cache
+def contained(kind: str) -> bytes:
+    return ls.encode(surfaces()[kind])
+
+
 def rng_colours(heights: NDArray[np.float64]) -> NDArray[np.uint8]:
     return (np.stack([heights, heights + 9, heights * 3], axis=2) % 256).astype(np.uint8)
 
@@ -110,9 +117,8 @@ def rng_colours(heights: NDArray[np.float64]) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("kind", list(surfaces()))
 def test_every_view_of_a_window_is_cut_out_of_the_whole(kind: str) -> None:
     surface = surfaces()[kind]
-    container = ls.encode(surface)
     decoder = ls.Decoder()
-    decoder.feed(container)
+    decoder.feed(contained(kind))
     rng = np.random.default_rng(1)
     for view in decoder.layers[:: max(len(decoder.layers) // 5, 1)] + decoder.layers[-1:]:
         (top, bottom), (left, right) = (sorted(rng.choice(n, 2, replace=False)) for n in surface.shape)
@@ -135,8 +141,7 @@ def test_every_view_of_a_window_is_cut_out_of_the_whole(kind: str) -> None:
 
 
 def test_a_window_of_holes_alone_is_refused() -> None:
-    surface = surfaces()["bands"]
     decoder = ls.Decoder(Wish(((95, 105), (95, 105))))
-    decoder.feed(ls.encode(surface))
+    decoder.feed(contained("bands"))
     with pytest.raises(ls.InputError):
         decoder.surface()

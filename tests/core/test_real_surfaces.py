@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,6 +103,13 @@ def of(name: str) -> Row:
     return next(row for row in ROWS if row.files[0] == name)
 
 
+@functools.cache
+def streamed(name: str) -> tuple[Surface, bytes]:
+    """A file's surface, which some tests look at, and its container."""
+    surface = read(of(name))
+    return surface, ls.encode(surface)
+
+
 def valid_of(surface: Surface) -> NDArray[np.bool_]:
     return np.ones(surface.shape, np.bool_) if surface.mask is None else surface.mask
 
@@ -122,8 +130,8 @@ def test_a_real_surface_is_read_as_its_readme_says(row: Row) -> None:
 
 @rows
 def test_a_real_surface_streams_bit_for_bit(row: Row) -> None:
-    surface = read(row)
-    back = ls.decode(ls.encode(surface))
+    surface, container = streamed(row.files[0])
+    back = ls.decode(container)
     valid = valid_of(surface)
     assert (back.shape, back.closed, back.dtype) == (surface.shape, surface.closed, surface.dtype)
     np.testing.assert_array_equal(valid_of(back), valid)
@@ -139,9 +147,9 @@ def test_a_real_surface_streams_bit_for_bit(row: Row) -> None:
 
 @pytest.mark.parametrize("name", ["topobathy.npz", BIJOU, "ccsm_popgrid.nc", NCSX[0], "SainteHelens.dem"])
 def test_levels_of_small_surfaces_are_within_the_lattice_of_the_optimum_of_the_filled_grid(name: str) -> None:
-    surface = read(of(name))
+    surface, container = streamed(name)
     decoder = ls.Decoder()
-    decoder.feed(ls.encode(surface))
+    decoder.feed(container)
     decoder.finish()
     prepared = Preparation(surface, (None, {}))
     assert decoder.header is not None
@@ -160,10 +168,10 @@ def test_levels_of_small_surfaces_are_within_the_lattice_of_the_optimum_of_the_f
 
 def test_the_seam_of_etopo_is_the_one_in_the_file(tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
-    surface = read(of("etopo20.cdf"))
+    surface, container = streamed("etopo20.cdf")
     with xarray.open_dataset(DATA / "etopo20.cdf", engine="scipy", decode_cf=False) as dataset:
         heights, x, y = (dataset[name].values for name in ("ROSE", "ETOPO20X1_1081", "ETOPO20Y"))
-    back = restore(ls.decode(ls.encode(surface)))
+    back = restore(ls.decode(container))
     assert (back.shape, back.closed) == ((540, 1081), (False, False))
     np.testing.assert_array_equal(back.points, heights)
     made = coordinates(back)
@@ -182,10 +190,10 @@ def test_the_seam_of_etopo_is_the_one_in_the_file(tmp_path: Path) -> None:
 )
 def test_longitudes_of_ocean_grids_come_back(name: str, variables: tuple[str, ...], engine: str) -> None:
     xarray = pytest.importorskip("xarray")
-    surface = read(of(name))
+    surface, container = streamed(name)
     jumps = np.abs(np.diff(np.where(valid_of(surface), surface.points[..., 0], np.nan), axis=1)) > 180
     assert not jumps.any()
-    back = restore(ls.decode(ls.encode(surface)))
+    back = restore(ls.decode(container))
     valid = valid_of(back)
     with xarray.open_dataset(DATA / name, engine=engine, decode_cf=False) as dataset:
         for channel, variable in enumerate(variables):
@@ -206,8 +214,8 @@ def test_coordinates_of_topobathy_are_the_vectors_in_the_file() -> None:
 @pytest.mark.parametrize("name", ["bigtujunga.tif", "SainteHelens.dem", "lidar_dsm_2m.tif", BIJOU, "etopo20.cdf"])
 def test_another_library_finds_heights_holes_and_place(tmp_path: Path, name: str) -> None:
     rasterio = pytest.importorskip("rasterio")
-    surface = read(of(name))
-    formats.write(ls.decode(ls.encode(surface)), tmp_path / "a.tif")
+    surface, container = streamed(name)
+    formats.write(ls.decode(container), tmp_path / "a.tif")
     given = restore(surface)
     with rasterio.open(tmp_path / "a.tif") as dataset:
         heights = dataset.read(1)
@@ -238,9 +246,8 @@ def test_heights_given_as_xyz_take_hardly_more_bytes(name: str, dtype: str) -> N
 
 def test_a_level_of_real_heights_lies_where_the_surface_lies(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
-    surface = read(of("bigtujunga.tif"))
     decoder = ls.Decoder()
-    decoder.feed(ls.encode(surface))
+    decoder.feed(streamed("bigtujunga.tif")[1])
     decoder.finish()
     level = decoder.surface(5)
     with warnings.catch_warnings():

@@ -29,7 +29,7 @@ OPERATIONS = {
     for operation in (result.ok() for result in SCHEMA.get_all_operations() if isinstance(result, Ok))
 }
 POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE
-EXAMPLES = 4 * settings().max_examples  # more than of others, since each is cheap
+EXAMPLES = 2 * settings().max_examples  # more than of others, since each is cheap
 
 #: What no schema can say: whether bytes are a surface, how many levels one has.
 INDESCRIBABLE = {"POST /v1/surfaces", "GET /v1/surfaces/{surface}/levels/{level}"}
