@@ -123,6 +123,12 @@ def test_the_index_finds_every_segment_of_the_layers(name: str) -> None:
     assert index.pieces == ([] if container.exactness is None else container.exactness.pieces)
 
 
+def test_the_files_have_pieces_of_every_rule() -> None:
+    containers = [read_container(file_of(name)) for name in EXPECTED]
+    pieces = [piece for container in containers if container.exactness for piece in container.exactness.pieces if piece]
+    assert {piece[0] if piece[0] == 255 else piece[0] & 3 for piece in pieces} == {0, 1, 2, 3, 255}
+
+
 @small
 def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     index = index_of(name)

@@ -113,6 +113,9 @@ def _simple() -> dict[str, Original]:
     attributes = np.concatenate([_torus(17, 20), rng.integers(0, 256, (17, 20, 2)).astype(np.float64)], axis=-1)
     hostile = np.array([[-0.0, 5e-324, 1.5], [1e30, -1e30, 2.0], [0.1, -7.0, np.pi]])
     noise = np.random.default_rng(1).integers(0, 2**31, (2, 2))
+    own = np.random.default_rng(2006)
+    offsets = np.repeat(np.repeat(own.random((9, 8)), 8, 0), 8, 1)[:66]
+    quantised = 0.3 * (np.rint(np.cumsum(5 * own.normal(size=(66, 64)), 1)) + offsets) + 20
     tower = np.zeros((9, 9), np.float32)
     tower[4, 4] = 1
     return {
@@ -127,6 +130,7 @@ def _simple() -> dict[str, Original]:
         "heights-noise": Original(ls.Surface(noise.astype(np.uint32).view(np.float32))),
         "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
         "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
+        "heights-offsets": Original(ls.Surface(quantised.astype(np.float32))),
         "heights-tower": Original(ls.Surface(tower)),
         "planar-open": Original(ls.Surface(_torus(13, 11)[..., :2].astype(np.float32))),
         "torus-odd": Original(ls.Surface(_torus(21, 33).astype(np.float32), (True, True))),

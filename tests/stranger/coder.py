@@ -128,6 +128,18 @@ def new_contexts(count: int, pairs: int = 0) -> Model:
     return Model([2**19] * count, [1] * count, pairs)
 
 
+class Contexts:
+    """Contexts by their names, made where they are first asked for."""
+
+    def __init__(self) -> None:
+        self._models: dict[tuple[str, int], Model] = {}
+
+    def bit(self, coder: RangeDecoder, name: str, number: int) -> int:
+        """A bit in a context alone."""
+        model = self._models.setdefault((name, number), new_contexts(1))
+        return model.alone(coder, 0)
+
+
 def _zeros(rows: int, columns: int, margin: int, value: int = 0) -> Grid:
     return [[value] * (columns + 2 * margin) for _ in range(rows + 2 * margin)]
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.stranger.coder import Model, RangeDecoder, clamp, new_contexts
+from tests.stranger.coder import Contexts, RangeDecoder, clamp
 from tests.stranger.fields import Fields
+from tests.stranger.offsets import with_offsets
 
 Values = NDArray[Any]
 
@@ -89,18 +90,6 @@ class Stored:
         """The bytes end with the one in which the last bit lies."""
         if (self._taken + 7) // 8 != self._length:
             raise ValueError("the stored bits of a piece are too many or too few")
-
-
-class Contexts:
-    """The contexts of a piece by their names, made where they are first asked for."""
-
-    def __init__(self) -> None:
-        self._models: dict[tuple[str, int], Model] = {}
-
-    def bit(self, coder: RangeDecoder, name: str, number: int) -> int:
-        """A bit in a context alone."""
-        model = self._models.setdefault((name, number), new_contexts(1))
-        return model.alone(coder, 0)
 
 
 @dataclass
@@ -191,8 +180,10 @@ def restore(piece: bytes, values: Values) -> Values:
         if len(found) != values.size * dtype.itemsize or t:
             raise ValueError("a piece of values themselves has too many or too few")
         return np.frombuffer(found, dtype)
-    if rule == 3 or (rule == 2 and dtype.kind != "f"):
-        raise ValueError("a piece has a rule that does not exist")
+    if rule == 3:
+        return with_offsets(fields, t, values)
+    if rule == 2 and dtype.kind != "f":
+        raise ValueError("a piece of whole numbers has the rule of decimals")
     (most,) = struct.unpack("<H", fields.take(2))
     specials = [fields.take(dtype.itemsize) for _ in range(most >> 12)]
     coder = RangeDecoder(fields.take(fields.varint()))
