@@ -26,6 +26,8 @@ _FIRST_RUNS = 0.7
 _MOST_BRIEF_TRIES = 3
 _BELOW = 0.999
 _CLOSE = 0.98
+#: What is foreseen from some windows may be so much too long.
+_FORESEEN = 1.05
 
 
 def encode(
@@ -161,7 +163,7 @@ def _brief_for(
         except InputError:
             break  # the type of the values itself rounds by more
         expected = foreseen(prepared, encoding.lattices[0])
-        if expected is None or not worth(prepared, expected, length, made=True):
+        if expected is None or expected > _FORESEEN * length:
             break
         container, error = encoding.run(), encoding.left[0]
         if error <= rms and worth(prepared, len(container), length, made=True):
