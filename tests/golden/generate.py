@@ -5,6 +5,7 @@ Until Lodestream 1.0 this goes with each new version of the format and nothing e
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import json
@@ -300,6 +301,7 @@ def _made_for_an_error() -> dict[str, Original]:
     }
 
 
+@functools.cache
 def originals() -> dict[str, Original]:
     """All that there is a golden file of."""
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -25,10 +26,7 @@ def _squash(x: int) -> int:
 
 
 SQUASH = [_squash(x) for x in range(-2048, 2048)]
-STRETCH = [
-    clamp(next((x for x in range(-2048, 2048) if SQUASH[x + 2048] >= 16 * p + 8), 2047), -2047, 2047)
-    for p in range(4096)
-]
+STRETCH = [clamp(bisect_left(SQUASH, 16 * p + 8) - 2048, -2047, 2047) for p in range(4096)]  # SQUASH rises
 
 
 class RangeDecoder:
