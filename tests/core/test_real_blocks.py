@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,6 +98,12 @@ names = [" ".join(row.files) + "".join(f" {key}={value}" for key, value in row.o
 
 
 def read(row: Row) -> Surface:
+    return _read(ROWS.index(row))
+
+
+@functools.cache
+def _read(number: int) -> Surface:
+    row = ROWS[number]
     for name in row.files:
         if not (DATA / name).exists():
             pytest.skip(f"the real file {name} is not beside this project")

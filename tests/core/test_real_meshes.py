@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -50,6 +51,12 @@ def plain_mesh(path: Path) -> tuple[NDArray[np.float64], list[list[int]]]:
     return np.array(points), [[int(word.split("/")[0]) - 1 for word in line[1:]] for line in words if line[:1] == ["f"]]
 
 
+@functools.cache
+def surface_of(name: str) -> Surface:
+    """What is recognised in a file."""
+    return formats.read(path_of(name))
+
+
 Corner = tuple[float, ...]
 
 
@@ -71,15 +78,13 @@ def edges(faces: list[list[int]]) -> Counter[int]:
 
 @pytest.mark.parametrize("name", READ)
 def test_what_is_recognised(name: str) -> None:
-    surface = formats.read(path_of(name))
-    assert surface.metadata["recognised"] == READ[name]
+    assert surface_of(name).metadata["recognised"] == READ[name]
 
 
 @pytest.mark.parametrize("name", READ)
 def test_the_mesh_is_the_same(name: str) -> None:
-    path = path_of(name)
-    points, faces = plain_mesh(path)
-    mesh = faces_of(restore(formats.read(path)))
+    points, faces = plain_mesh(path_of(name))
+    mesh = faces_of(restore(surface_of(name)))
     out = [*mesh.quads.tolist(), *mesh.triangles.tolist()]
     assert len(mesh.vertices) == len(points)
     assert at_places(mesh.vertices, out) == at_places(points, faces)
@@ -104,7 +109,7 @@ def test_in_another_order(name: str, tmp_path: Path) -> None:
     path.write_text(shuffled(points, faces))
     surface = formats.read(path)
     if len(surface.blocks) < 10:  # where lines stop at each other, it is the order that decides which do
-        assert shapes(surface) == shapes(formats.read(DATA / name))
+        assert shapes(surface) == shapes(surface_of(name))
     mesh = faces_of(restore(surface))
     out = [*mesh.quads.tolist(), *mesh.triangles.tolist()]
     assert at_places(mesh.vertices, out) == at_places(points, faces)
