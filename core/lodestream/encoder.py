@@ -157,7 +157,7 @@ def _brief_for(
         precision = math.floor(precision) + 0.25 if precision < 2.0**52 else precision
     best = None
     for _ in range(_MOST_BRIEF_TRIES):
-        prepared = Preparation(surface, (Tolerance(precision), precisions))
+        prepared = Preparation(surface, (Tolerance(precision), precisions), large_tiles=True)
         try:
             encoding = Encoding(prepared, progress, brief=True)
         except InputError:

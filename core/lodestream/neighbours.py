@@ -153,17 +153,26 @@ def _fitted(numbers: _Ints, picture: _Ints, valid: _Mask) -> NDArray[np.int8]:
     sources = [known[row + i, column + j] for i, j in _BEFORE] + [shown[row + i, column + j] for i, j in _AROUND]
     told = np.stack(sources) - above
     sought = numbers.ravel()[chosen] - above
-    weights, parts = np.ones(sought.size), np.zeros(_PARTS)
+    # What looks alike everywhere, as a rough picture may, can take parts that no eight bits hold.
+    every = [_parts_of(told[:count], sought) for count in (_KNOWN, _PARTS)]
+    return min(every, key=lambda parts: float(np.log2(1 + np.abs(sought - parts @ told / 2**_BINARY_PLACES)).sum()))
+
+
+def _parts_of(told: NDArray[np.float64], sought: NDArray[np.float64]) -> NDArray[np.int8]:
+    """Parts of the first sources in a sum that misses little of what is sought; the others have none."""
+    count = len(told)
+    weights = np.ones(sought.size)
+    parts: NDArray[np.float64] = np.zeros(count)
     for _ in range(3 if sought.size else 0):
         weighed = told * weights
         matrix = weighed @ told.T
         # Of neighbours that are all alike none is preferred.
-        matrix += np.eye(_PARTS) * (1e-3 * float(np.abs(sought).mean()) + 1e-9 * float(np.trace(matrix)) + 1e-3)
-        parts = np.linalg.solve(matrix, weighed @ sought)
+        matrix += np.eye(count) * (1e-3 * float(np.abs(sought).mean()) + 1e-9 * float(np.trace(matrix)) + 1e-3)
+        parts = np.asarray(np.linalg.solve(matrix, weighed @ sought), np.float64)
         missed = np.abs(sought - parts @ told)
         weights = 1 / (missed + 0.25 * missed.mean() + 0.2)
     rounded: NDArray[np.float64] = np.rint(parts * 2**_BINARY_PLACES)
-    return np.clip(rounded, -_LARGEST_PART, _LARGEST_PART).astype(np.int8)
+    return np.pad(np.clip(rounded, -_LARGEST_PART, _LARGEST_PART).astype(np.int8), (0, _PARTS - count))
 
 
 @inlined

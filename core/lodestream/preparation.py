@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrangement import VertexCounter, grids_of
-from .container.headers import TILE_BITS
+from .container.headers import LARGE_TILE_BITS, TILE_BITS
 from .container.model import AttributeKind
 from .heights import to_heights
 from .lattice import Lattice, find_lattice, offset_lattice, precision_lattice
@@ -38,6 +38,16 @@ Precisions = tuple[Tolerance | None, Mapping[str, Tolerance]]
 class Preparation:
     """What the encoder needs of a surface.
 
+    Parameters
+    ----------
+    surface : Surface
+    precisions : Precisions
+    rms : Tolerance, optional
+        The error that a stream is made for.
+    large_tiles : bool
+        Fewer and larger tiles, and so windows of exactness, of one block: less is learned anew in each, and a region
+        takes more bytes.
+
     Attributes
     ----------
     given, surface : Surface
@@ -62,7 +72,9 @@ class Preparation:
     originals : list of Original, one for each part
     """
 
-    def __init__(self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None) -> None:
+    def __init__(
+        self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None, large_tiles: bool = False
+    ) -> None:
         self.given = surface
         surface, self.plane = _heights(surface)
         self.surface = surface
@@ -95,7 +107,7 @@ class Preparation:
         if self.arrangement is None:
             shape = first.shape
             self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
-            self.tile = tile_exponents(shape)
+            self.tile = tile_exponents(shape, LARGE_TILE_BITS if large_tiles else TILE_BITS)
             self.layout = Layout.single(shape, first.closed, self.tile)
         else:
             self.parts, self.tile = self.arrangement.parts, (TILE_BITS // 2, TILE_BITS // 2)
@@ -235,19 +247,22 @@ class Preparation:
         return originals
 
 
+#: Most rows or columns of a tile, as an exponent of two.
+_LONGEST_TILE = 15
 #: Numbers of the rules of x and y that a header may hold.
 _LONGEST_RULES = 16
 
 
-def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
+def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
     """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
-    rows = TILE_BITS // 2
+    rows = bits // 2
     narrow = min(shape)
     while rows > 1 and narrow <= 1 << rows:
         rows -= 1
-    if narrow > 1 << (TILE_BITS // 2):
-        return TILE_BITS // 2, TILE_BITS // 2
-    return (rows, TILE_BITS - rows) if shape[0] <= shape[1] else (TILE_BITS - rows, rows)
+    if narrow > 1 << (bits // 2):
+        return bits // 2, bits // 2
+    longer = min(bits - rows, _LONGEST_TILE)
+    return (rows, longer) if shape[0] <= shape[1] else (longer, rows)
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:

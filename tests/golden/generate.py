@@ -297,6 +297,7 @@ def _made_for_an_error() -> dict[str, Original]:
         "error-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -9999}), rms="5"),
         "error-attributes": Original(ls.Surface(_torus(48, 51), (True, True), attributes=colors), rms="2e-3d"),
         "error-blocks": Original(_blocks(_cut(globe, [0, 16], [0, 9, 24])), rms="1e-3d"),
+        "error-brief": Original(ls.Surface(np.rint(40 * _wave(150, 290)).astype(np.int16)), rms="0.1"),
         "error-curve": Original(ls.Surface(_torus(1, 90)[0][:, None], (True, False)), rms="1e-3d"),
     }
 
