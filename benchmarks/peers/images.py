@@ -20,7 +20,7 @@ def htj2k(trial: Trial) -> None:
     _planes(trial, lambda plane: imagecodecs.htj2k_encode(plane, reversible=True), _htj2k_decode)
     surface = trial.surface
     step = float(surface.sides.max()) / 65535
-    for level in np.geomspace(0.3, 1e-5, 6 if surface.large else 14):
+    for level in np.geomspace(0.3, 1e-5, 6 if surface.large else 40):
 
         def encode(level: float = float(level)) -> list[bytes]:
             numbers = trial.quantised(step).astype(np.uint16)
