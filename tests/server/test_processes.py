@@ -123,6 +123,10 @@ def test_a_cancelled_call_has_ended_when_it_says_so(tmp_path: Path) -> None:
     asyncio.run(check())
 
 
+def _threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("lodestream-process")]
+
+
 def test_closing_kills_what_runs(tmp_path: Path) -> None:
     async def check() -> None:
         begun = tmp_path / "begun"
@@ -132,7 +136,8 @@ def test_closing_kills_what_runs(tmp_path: Path) -> None:
         with pytest.raises(ProcessDiedError):
             await task
         assert gone(int(begun.read_text()))
-        assert not [thread for thread in threading.enumerate() if thread.name.startswith("lodestream-process")]
+        # Its thread has told the result, and may not have ended yet.
+        await asyncio.to_thread(eventually, lambda: not _threads(), "the thread to end")
 
     asyncio.run(check())
 
