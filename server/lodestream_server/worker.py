@@ -147,6 +147,11 @@ def warm() -> None:
     errors = decode(encode(heights, rms="1e-2d")).points - heights
     if np.sqrt(np.mean(np.square(errors))) > 0.01 * np.ptp(heights):
         raise RuntimeError("expected a surface within the error that it was encoded for, got another one")
+    # Of as many points as a stream by neighbours is thought of for.
+    many = np.mgrid[0:64, 0:65]
+    terraces = np.rint(4 * np.sin(many[0] / 9) * np.cos(many[1] / 7)).astype(np.int16)
+    if not np.array_equal(decode(encode(terraces)).points, terraces):
+        raise RuntimeError("expected the terraces that were encoded, got others")
     number = np.arange(rows.size, dtype=np.int32).reshape(rows.shape)
     a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     none = np.full_like(a, -1)
