@@ -183,5 +183,4 @@ def surface_parameters(
 
 
 def _tolerance(error: Tolerance | float | str) -> str:
-    tolerance = error if isinstance(error, Tolerance) else Tolerance.parse(str(error))
-    return f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
+    return str(error if isinstance(error, Tolerance) else Tolerance.parse(str(error)))

@@ -56,6 +56,10 @@ class Tolerance:
         except ValueError:
             raise OptionError(f"expected a number such as 0.5, or 1e-3d (times the extent), got {text!r}") from None
 
+    def __str__(self) -> str:
+        """The text that `parse` reads as this very tolerance: one spelling for each."""
+        return f"{float(self.value)!r}{'d' if self.relative else ''}"
+
     def absolute(self, extent: float) -> float:
         """The tolerance in the surface's unit, for a surface of this extent."""
         return self.value * extent if self.relative else self.value

@@ -58,9 +58,9 @@ class SurfaceOptions:
             if key == "precision":
                 # A name may hold an equals sign, a tolerance does not.
                 attribute, equals, value = value.rpartition("=")
-                key, value = key + equals + attribute, _spelled(value)
+                key, value = key + equals + attribute, str(Tolerance.parse(value))
             elif key == "rms":
-                value = _spelled(value)
+                value = str(Tolerance.parse(value))
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value
@@ -108,11 +108,6 @@ def identify(digest: hashlib._Hash, format_: Format, filename: str | None, optio
     whole = digest.copy()
     whole.update(json.dumps([format_.name, sorted({**told, **options.chosen}.items())], ensure_ascii=True).encode())
     return whole.hexdigest()[:20]
-
-
-def _spelled(text: str) -> str:
-    tolerance = Tolerance.parse(text)
-    return f"{tolerance.value!r}{'d' if tolerance.relative else ''}"
 
 
 def plain_name(text: str) -> str | None:

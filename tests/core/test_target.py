@@ -2,7 +2,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lodestream import OptionError, Target, Tolerance
 
@@ -19,6 +22,26 @@ from lodestream import OptionError, Target, Tolerance
 def test_an_error_is_in_the_unit_or_a_fraction(text: str, tolerance: Tolerance) -> None:
     assert Tolerance.parse(text) == tolerance
     assert tolerance.absolute(200.0) == tolerance.value * (200.0 if tolerance.relative else 1.0)
+
+
+@given(value=st.floats(0, allow_infinity=False), relative=st.booleans())
+def test_a_tolerance_is_the_one_that_its_text_says(value: float, relative: bool) -> None:
+    tolerance = Tolerance(value, relative)
+    assert Tolerance.parse(str(tolerance)) == tolerance
+    assert str(Tolerance.parse(f" {value:.20e}{'d' if relative else ''}")) == str(tolerance)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "text"),
+    [
+        (Tolerance(0.5), "0.5"),
+        (Tolerance(1e-3, relative=True), "0.001d"),
+        (Tolerance(2), "2.0"),
+        (Tolerance(np.float64(0.25)), "0.25"),
+    ],
+)
+def test_a_tolerance_has_one_spelling(tolerance: Tolerance, text: str) -> None:
+    assert str(tolerance) == text
 
 
 @pytest.mark.parametrize("text", ["", "d", "fine", "-1", "nan", "inf", "1e-3dd", "1 m"])
