@@ -1,4 +1,4 @@
-"""Elements of PLY files, as another library writes them and as nobody should."""
+"""Headers and elements of PLY files, as another library writes them and as nobody should."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from plyfile import PlyData, PlyElement
 
 from lodestream.errors import FormatError
 from lodestream.formats.attributes import group, split
-from lodestream.formats.ply_elements import Lists, read_elements, read_header
+from lodestream.formats.ply_elements import Lists, read_elements
+from lodestream.formats.ply_header import read_header
 
 TYPES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
 

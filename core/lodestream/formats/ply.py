@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..errors import FormatError
 from ..surface import Surface
 from . import ply_mesh, range_grid
-from .ply_elements import read_header
+from .ply_header import read_header
 from .source import Source
 
 __all__ = ["read", "sniff"]

@@ -13,7 +13,8 @@ from ..surface import Surface
 from .attributes import TEXTURE, group
 from .connectivity import find_curve
 from .meshes import check_faces, surface_of
-from .ply_elements import Header, Lists, Table, read_elements
+from .ply_elements import Lists, Table, read_elements
+from .ply_header import Header
 from .source import Source, number
 
 __all__ = ["CURVE", "ELEMENT", "read", "read_curve"]

@@ -11,7 +11,8 @@ from ..errors import FormatError
 from ..seams import merge
 from ..surface import Surface
 from .attributes import group
-from .ply_elements import Header, Lists, Table, read_elements
+from .ply_elements import Lists, Table, read_elements
+from .ply_header import Header
 from .source import Source, number
 
 __all__ = ["ELEMENT", "read"]
