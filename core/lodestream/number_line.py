@@ -1,0 +1,90 @@
+"""Values as places on a line of whole numbers, in the order of what they stand for.
+
+By the rule of patterns these are their bit patterns, less the zeros at the end that all patterns of a piece have; by
+the rule of decimals, their number of units of so many decimal places.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["DECIMALS", "MOST_DECIMALS", "PATTERNS", "common_zeros", "decimal_places", "from_line", "to_line"]
+
+#: The rules, as a piece of exactness names them; their arguments are how many zeros, and how many decimal places.
+PATTERNS, DECIMALS = 1, 2
+MOST_DECIMALS = 15
+_LARGEST_WHOLE = 2.0**53
+_SAMPLE = 64
+
+_Ints = NDArray[np.int64]
+
+
+def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDArray[np.int32], int]:
+    """Put finite values, shape (value,), on the line.
+
+    Returns
+    -------
+    places : int64 array of shape (value,)
+    exponents : int32 array of shape (value,)
+        Of the values, biased; 0 where places are of one width, whatever the value.
+    mantissa : int
+        Bits of a mantissa on the line; 64 where there are no exponents.
+    """
+    bits = 8 * values.dtype.itemsize
+    if rule == DECIMALS:
+        with np.errstate(over="ignore"):
+            wide = np.clip(values.astype(np.float64) * 10.0**argument, -_LARGEST_WHOLE, _LARGEST_WHOLE)
+        return np.rint(wide).astype(np.int64), np.zeros(values.size, np.int32), 64
+    if values.dtype.kind != "f":
+        return values.astype(np.int64) >> argument, np.zeros(values.size, np.int32), 64
+    signed = values.view(f"i{values.dtype.itemsize}").astype(np.int64)
+    magnitudes = signed & ((1 << (bits - 1)) - 1)
+    mantissa = 23 if bits == 32 else 52
+    exponents = (magnitudes >> mantissa).astype(np.int32)
+    magnitudes >>= argument
+    return np.where(signed < 0, ~magnitudes, magnitudes), exponents, mantissa - argument
+
+
+def from_line(rule: int, argument: int, places: _Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Undo `to_line`: values of ``dtype``, shape (value,); the places may be any numbers."""
+    if rule == DECIMALS:
+        whole = np.clip(places, -(2**53), 2**53).astype(np.float64)
+        with np.errstate(over="ignore"):
+            return np.asarray((whole / 10.0**argument).astype(dtype))
+    if dtype.kind != "f":
+        return (places << argument).astype(dtype)
+    signed = np.where(places < 0, ~places, places) << argument
+    top = np.int64(-(2**63)) if dtype.itemsize == 8 else np.int64(2**31)
+    signed = np.where(places < 0, signed | top, signed)
+    return signed.astype(f"u{dtype.itemsize}").view(dtype)
+
+
+def common_zeros(values: NDArray[Any]) -> int:
+    """Bits at the end that are 0 in the patterns of all values, shape (value,): the argument of `PATTERNS`."""
+    if not values.size:
+        return 0
+    bits = 8 * values.dtype.itemsize
+    seen = int(np.bitwise_or.reduce(values.view(f"u{values.dtype.itemsize}")))
+    zeros = (seen & -seen).bit_length() - 1 if seen else 0
+    # The exponents stay whole, so that contexts can tell them.
+    return min(zeros, 23 if bits == 32 else 52) if values.dtype.kind == "f" else min(zeros, bits - 1)
+
+
+def decimal_places(values: NDArray[Any]) -> int | None:
+    """The fewest decimal places that give all of the values, shape (value,), bit for bit; None if there are none."""
+    if values.dtype.kind != "f" or not values.size:
+        return None
+    sample = values[:: max(1, values.size // _SAMPLE)]
+    for places in range(MOST_DECIMALS + 1):
+        if _are_decimals(sample, places):
+            return places if _are_decimals(values, places) else None
+    return None
+
+
+def _are_decimals(values: NDArray[Any], places: int) -> bool:
+    line = to_line(DECIMALS, places, values)[0]
+    unsigned = f"u{values.dtype.itemsize}"
+    return np.array_equal(from_line(DECIMALS, places, line, values.dtype).view(unsigned), values.view(unsigned))
