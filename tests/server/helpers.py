@@ -10,7 +10,9 @@ from typing import Any, TypeVar
 
 import httpx
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
@@ -97,3 +99,18 @@ def raw_stream(url: str, query: str = "", **options: Any) -> Iterator[Raw]:
     options = {"subprotocols": [SUBPROTOCOL], "max_size": MAX_MESSAGE, "compression": None, "proxy": None, **options}
     with connect(url.replace("http", "ws", 1) + "/stream" + query, **options) as socket:
         yield Raw(socket)
+
+
+def closed(stream: Raw, code: int) -> str:
+    """Wait for the close frame; its reason."""
+    for _ in range(100_000):
+        try:
+            stream.receive()
+        except ConnectionClosed as over:
+            frame = over.rcvd
+            break
+    else:
+        pytest.fail("the server goes on and on")
+    assert frame is not None, "the connection broke without a close frame"
+    assert frame.code == code
+    return frame.reason

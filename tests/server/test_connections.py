@@ -1,4 +1,4 @@
-"""Connections that dawdle, and requests that do not end where they say."""
+"""Connections and streams that dawdle, and requests that do not end where they say."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
+import lodestream as ls
+from lodestream.messages import CODES, Credit, End, Error, Event, Header, Open, Segments, Stop
 from lodestream_server import running_server
-from tests.server.helpers import PATIENCE, eventually, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, eventually, hills, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Any]]]:
     """A server that waits for nobody, and a surface on it that no buffer takes whole."""
-    with running_server(tmp_path_factory.mktemp("data"), workers=1, head_seconds=0.5, idle_seconds=0.5) as url:
+    with running_server(
+        tmp_path_factory.mktemp("data"), workers=1, head_seconds=0.5, idle_seconds=0.5, bye_seconds=0.2
+    ) as url:
         with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
             made = push(http, npy(hills(700, 700)))
         yield url, made
@@ -150,9 +154,30 @@ def test_an_answer_that_is_taken_slowly_comes_whole(impatient: tuple[str, dict[s
     assert len(data.partition(b"\r\n\r\n")[2]) == made["bytes"]
 
 
-def test_streams_outlive_the_clock_of_heads(impatient: tuple[str, dict[str, Any]]) -> None:
-    from lodestream.messages import Credit, Header, Open, Segments
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([], "expected open"),
+        ([Open(credit=100)], "expected credit or stop"),
+        ([Open(ls.Target(level=0))], "expected bye"),
+    ],
+)
+def test_a_silent_client_is_closed_with_a_reason(
+    impatient: tuple[str, dict[str, Any]], messages: list[Event], words: str
+) -> None:
+    url, made = impatient
+    with raw_stream(url + made["url"]) as stream:
+        for message in messages:
+            stream.send(message)
+        event = stream.receive()
+        while not isinstance(event, Error):
+            event = stream.receive()
+        assert event.code == "idle"
+        assert words in event.detail
+        assert closed(stream, CODES["idle"].close).startswith("idle")
 
+
+def test_a_stream_whose_client_speaks_now_and_then_outlives_the_clocks(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
     with raw_stream(url + made["url"]) as stream:
         stream.send(Open(credit=1))
@@ -163,6 +188,9 @@ def test_streams_outlive_the_clock_of_heads(impatient: tuple[str, dict[str, Any]
             with pytest.raises(TimeoutError):
                 stream.socket.recv(timeout=0.03)
             stream.send(Credit(1))
+        stream.send(Stop())
+        assert stream.until_end()[-1] == End("stopped")
+        assert closed(stream, 1000) == "stopped"
 
 
 def test_a_body_longer_than_it_says_is_cut_there(http: httpx.Client, server: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import time
 from collections.abc import MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 from fastapi import WebSocket
 from uvicorn.protocols.utils import ClientDisconnected
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import lodestream as ls
@@ -42,7 +41,7 @@ from lodestream.messages import (
 from lodestream.ranges import RangeSet
 from lodestream.wire import serialize
 from lodestream_server import running_server, streams
-from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, data_of, eventually, hills, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -75,21 +74,6 @@ def download(url: str, target: ls.Target | None = None, window: int = MAX_CREDIT
             stream.socket.send(message)
         closed(stream, 1000)
     return driver
-
-
-def closed(stream: Raw, code: int) -> str:
-    """Wait for the close frame; its reason."""
-    for _ in range(100_000):
-        try:
-            stream.receive()
-        except ConnectionClosed as over:
-            frame = over.rcvd
-            break
-    else:
-        pytest.fail("the server goes on and on")
-    assert frame is not None, "the connection broke without a close frame"
-    assert frame.code == code
-    return frame.reason
 
 
 @pytest.mark.parametrize("window", [5000, MAX_CREDIT])
@@ -295,54 +279,6 @@ def test_a_damaged_container_is_reported_after_what_is_whole(server: str, http: 
         assert events[-1].code == "damaged"
         assert data_of(events) > 0
         closed(stream, CODES["damaged"].close)
-
-
-@pytest.fixture(scope="module")
-def hasty(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A server that waits for nobody, and a surface on it."""
-    folder = tmp_path_factory.mktemp("hasty") / "data"
-    with (
-        running_server(folder, workers=1, idle_seconds=0.2, bye_seconds=0.2) as address,
-        httpx.Client(base_url=address, trust_env=False, timeout=60) as http,
-    ):
-        yield address + push(http, npy(hills(90, 80)))["url"]
-
-
-@pytest.mark.parametrize(
-    ("messages", "words"),
-    [
-        ([], "expected open"),
-        ([Open(credit=100)], "expected credit or stop"),
-        ([Open(ls.Target(level=0))], "expected bye"),
-    ],
-)
-def test_a_silent_client_is_closed_with_a_reason(hasty: str, messages: list[Event], words: str) -> None:
-    with raw_stream(hasty) as stream:
-        for message in messages:
-            stream.send(message)
-        event = stream.receive()
-        while not isinstance(event, Error):
-            event = stream.receive()
-        assert event.code == "idle"
-        assert words in event.detail
-        assert closed(stream, CODES["idle"].close).startswith("idle")
-
-
-def test_a_client_that_speaks_now_and_then_is_not_silent(hasty: str) -> None:
-    driver = Download(window=400)
-    with raw_stream(hasty) as stream:
-        started = time.monotonic()
-        while driver.ended is None:
-            for message in driver.data_to_send():
-                stream.socket.send(message)
-            driver.receive(stream.socket.recv(timeout=PATIENCE, decode=False))
-            # Longer in all than the server waits, never so long at once.
-            if time.monotonic() - started < 0.6:
-                time.sleep(0.01)
-        for message in driver.data_to_send():
-            stream.socket.send(message)
-        closed(stream, 1000)
-    assert driver.ended == "complete"
 
 
 def test_clients_that_vanish_leave_no_task_and_no_file_behind(url: str) -> None:
