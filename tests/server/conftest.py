@@ -1,4 +1,4 @@
-"""A server on a real socket, shared by the tests of a file."""
+"""A server on a real socket, and tokens, shared by the tests of a file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import httpx
 import pytest
 
 from lodestream_server import running_server, worker
+from lodestream_server.tokens import SCOPES, TokenFile
 from tests.server import slow
+from tests.server.helpers import Keys
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +29,18 @@ def server(data: Path) -> Iterator[str]:
 def http(server: str) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server, trust_env=False, timeout=60) as client:
         yield client
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
+    folder = tmp_path_factory.mktemp("keys")
+    file = TokenFile(folder / "tokens.json")
+    tokens = {scope: file.create(scope, (scope,))[0] for scope in SCOPES}
+    tokens["revoked"] = file.create("revoked", ("admin",))[0]
+    file.revoke("revoked")
+    tokens["expired"] = file.create("expired", ("admin",), days=1e-9)[0]
+    tokens["wrong"] = tokens["admin"][:-1] + ("A" if tokens["admin"][-1] != "A" else "B")
+    return Keys(folder, tokens)
 
 
 @pytest.fixture

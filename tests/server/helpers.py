@@ -1,4 +1,4 @@
-"""What the tests of the server share: small surfaces, and waiting for what must happen, with an end."""
+"""What the tests of the server share: small surfaces, raw streams, and waiting for what must happen, with an end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import io
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
@@ -114,3 +116,22 @@ def closed(stream: Raw, code: int) -> str:
     assert frame is not None, "the connection broke without a close frame"
     assert frame.code == code
     return frame.reason
+
+
+def problem(answer: httpx.Response) -> tuple[int, str]:
+    """Status and code of an answer that is a problem document."""
+    document = answer.json()
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert document["status"] == answer.status_code
+    return answer.status_code, document["code"]
+
+
+@dataclass
+class Keys:
+    """A folder with a token of each scope, and two that are good for nothing any more."""
+
+    folder: Path
+    tokens: dict[str, str]
+
+    def header(self, name: str) -> dict[str, str]:
+        return {"authorization": f"Bearer {self.tokens[name]}"}
