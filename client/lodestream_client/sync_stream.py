@@ -1,0 +1,298 @@
+"""Streams for programs without an event loop; `lodestream_client.sync` exports these names."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from lodestream.errors import LodestreamError
+from lodestream.target import Region, Target
+
+from . import problems
+from .roads import Transport
+from .stream import LONGEST_PROBLEM, PARTS, BaseStream, Received
+
+if TYPE_CHECKING:
+    import httpx
+    from websockets.sync.client import ClientConnection
+
+    from lodestream.decoder import View
+    from lodestream.reception import Store
+
+__all__ = ["Stream", "connect"]
+
+
+class Stream(BaseStream):
+    """One surface being received; iterate over it for a `View` per layer.
+
+    It is a context manager: leaving it tells the server that no more is wanted. `connect` makes it.
+    """
+
+    _socket: ClientConnection | None = None
+    _client: httpx.Client | None = None
+    _body: Iterator[bytes] | None = None
+
+    def _open(self) -> None:
+        self._held = ExitStack()
+        self._wake = threading.Event()
+        try:
+            while not self._roads.met and self._step():
+                pass
+        except BaseException:
+            self._abandon()
+            raise
+
+    def __iter__(self) -> Iterator[View]:
+        return self
+
+    def __next__(self) -> View:
+        while not self._views and self._step():
+            pass
+        if not self._views:
+            raise StopIteration
+        return self._views.popleft()
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._abandon()
+
+    def stop(self) -> None:
+        """Ask for no more, at once: no further view is yielded.
+
+        May be called from another thread than the one that iterates.
+        """
+        self._stop()
+        self._wake.set()
+        self._flush()
+
+    def focus(self, region: Region | None) -> None:
+        """Let what a region needs come before the rest; at any time, and as often as one looks elsewhere.
+
+        Nothing is sent twice for it, and the end is the same. Views then come whenever a layer is whole in the region,
+        or everywhere; their errors are not known (NaN) where they hold more than belongs to that layer.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int)) or None
+            Rows and columns, half-open, in full-resolution indices; None for the target's own order again.
+
+        Raises
+        ------
+        OptionError
+            When the surface has no such region, or several blocks; before it is known, the iteration raises it.
+        """
+        self._turn(region)
+        self._flush()
+
+    def close(self) -> None:
+        """Stop, take leave and close the connection, within the time allowed for it."""
+        try:
+            if self.ended is None:
+                self.stop()
+            self._close_by = time.monotonic() + self._close_timeout
+            while self._step():
+                pass
+        except LodestreamError:
+            # Whoever closes has what they want; how the other side takes it is no concern of theirs.
+            pass
+        self._abandon()
+
+    def _abandon(self) -> None:
+        self._abandoned = True
+        self._hang_up()
+        if self._client is not None:
+            self._client.close()
+
+    def _step(self) -> bool:
+        # Whether there may be another.
+        try:
+            self._answer = self._way.send(self._answer)
+        except StopIteration:
+            return False
+        return True
+
+    def _dial(self, url: str) -> str | None:
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect as connect_socket
+
+        # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
+        try:
+            self._socket = self._held.enter_context(connect_socket(url, **self._socket_options()))
+        except (OSError, WebSocketException) as error:
+            raise problems.from_connection(error, self.url) from error
+        return self._socket.subprotocol
+
+    def _hear(self, seconds: float) -> bytes | None:
+        from websockets.exceptions import ConnectionClosed
+
+        assert self._socket is not None, "a message is expected of an open connection"
+        try:
+            return self._socket.recv(seconds, decode=False)
+        except TimeoutError:
+            return None
+        except ConnectionClosed as error:
+            self._lost(error)
+
+    def _say(self, message: bytes) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            if self._socket is not None:
+                self._socket.send(message)
+        except ConnectionClosed:
+            # What the server said before it closed is still to be received, and tells more than this.
+            return
+
+    def _flush(self) -> None:
+        with self._lock:
+            for message in self._messages():
+                self._say(message)
+
+    def _leave(self) -> None:
+        # The server closes after our bye. Closing first would cut its last messages off on some stacks.
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            if self._socket is not None:
+                self._socket.recv(self._close_timeout, decode=False)
+        except (TimeoutError, ConnectionClosed):
+            pass
+        finally:
+            self._hang_up()
+
+    def _hang_up(self) -> None:
+        self._socket = self._body = None
+        self._held.close()
+
+    def _drop(self) -> None:
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.socket.shutdown(socket.SHUT_RDWR)
+        self._hang_up()
+
+    def _get(self, url: str, headers: dict[str, str], seconds: float) -> tuple[int, dict[str, str], str]:
+        import httpx
+
+        if self._client is None:
+            self._client = httpx.Client(**self._client_options())
+        self._held.close()
+        try:
+            answer = self._held.enter_context(
+                self._client.stream("GET", url, headers=self._part_headers(url, headers), timeout=seconds)
+            )
+            if answer.status_code not in PARTS:
+                body = bytearray()
+                for piece in answer.iter_bytes():
+                    body += piece
+                    if len(body) > LONGEST_PROBLEM:
+                        break
+                raise self._refused(answer, bytes(body))
+        except httpx.HTTPError as error:
+            raise problems.from_connection(error, self.url) from error
+        self._body = answer.iter_raw()
+        return answer.status_code, dict(answer.headers), str(answer.url)
+
+    def _read(self) -> bytes:
+        import httpx
+
+        try:
+            return next(self._body or iter(()), b"")
+        except httpx.HTTPError as error:
+            raise self._broke(error) from error
+
+    def _wait(self, seconds: float) -> None:
+        self._wake.wait(seconds)
+
+
+def connect(
+    url: str | Sequence[str],
+    *,
+    target: Target | None = None,
+    token: str | None = None,
+    transport: Transport = "auto",
+    silence: float = 30.0,
+    deadline: float = 60.0,
+    close_timeout: float = 5.0,
+    limit_rate: float | None = None,
+    window: int | None = None,
+    store: Store | None = None,
+    container: str | None = None,
+    size: int | None = None,
+    progress: Received | None = None,
+) -> Stream:
+    """Open the stream of a surface.
+
+    A connection that breaks later is replaced by itself, and what has come is not sent again.
+
+    Parameters
+    ----------
+    url : str or sequence of str
+        The surface's address, ``http(s)://HOST/v1/surfaces/ID``, or that of a container's file on any web server. Of
+        several addresses of one surface, the next is taken when a connection fails.
+    target : Target or None
+        Where to stop, and the order on the way there; None for the whole surface.
+    token : str or None
+        What the server asks for, if it does.
+    transport : "auto", "ws" or "http"
+        Whether to use a WebSocket, or parts of the file by HTTP Range; ``auto`` takes the second where the first does
+        not come through.
+    silence : float
+        Seconds without a word after which a connection is given up, with `SilenceError` if it is not replaced.
+    deadline : float
+        Seconds for which a lost connection is tried to be replaced while no byte comes, before the error is raised; 0
+        for never replacing one.
+    close_timeout : float
+        Seconds that taking leave may last.
+    limit_rate : float or None
+        Receive at most so many bytes a second.
+    window : int or None
+        Bytes that may be under way at once; None for what suits the rate allowed, or else for what is measured. It is
+        also what may still arrive after `Stream.stop`.
+    store : Store or None
+        Where what comes is kept; what is there is not asked for again.
+    container, size : str or None, int or None
+        SHA-256 and bytes of the container that the store has bytes of.
+    progress : callable or None
+        Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is
+        None until it is known.
+
+    Returns
+    -------
+    Stream
+
+    Raises
+    ------
+    UnreachableError
+        When there is no connection.
+    NotFoundError, RemoteError, RemoteProtocolError
+        When the server refuses, or is none.
+    """
+    stream = Stream(
+        url,
+        target,
+        token=token,
+        transport=transport,
+        silence=silence,
+        deadline=deadline,
+        close_timeout=close_timeout,
+        limit_rate=limit_rate,
+        window=window,
+        store=store,
+        container=container,
+        size=size,
+        progress=progress,
+    )
+    stream._open()
+    return stream
