@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
-from .kernels import kernel
+from .kernels import inlined, kernel
 
 __all__ = ["CLAMP", "REACH", "TAPS", "forward_step", "inverse_step"]
 
@@ -285,6 +285,16 @@ def _step_columns(
                     _clamp(tail)
 
 
+@inlined
+def _nothing(line: NDArray[np.int32]) -> bool:
+    """Whether a row holds zeros only."""
+    found = line[0]
+    if found == 0:
+        for k in range(line.size):
+            found |= line[k]
+    return bool(found == 0)
+
+
 @kernel
 def _step_rows(
     x: NDArray[np.int32],
@@ -306,6 +316,8 @@ def _step_rows(
     n, d = nodes[2 : run + 2], details[10 : midpoints + 10]
     for row in range(rows):
         line = x[row * pitch : row * pitch + length]
+        if _nothing(line):
+            continue  # and so are zeros: of a picture on its way, many rows of details
         tail = line[(coarse if inverse else length) - 1]
         if inverse:
             tail = min(max(tail, -_CLAMP), _CLAMP)

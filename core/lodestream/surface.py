@@ -78,8 +78,9 @@ class Block:
                 raise InputError(f"expected a mask of booleans of shape {self.shape}, got {valid.dtype} {valid.shape}")
         if self.points.dtype.kind == "f":
             coordinates = self.points if self.points.ndim == 2 else self.points[..., : min(self.points.shape[2], 3)]
-            finite = np.isfinite(coordinates)
-            if not finite.all():
+            with np.errstate(over="ignore", invalid="ignore"):
+                total = coordinates.sum()  # quicker than to look at each; finite only where all are
+            if not np.isfinite(total) and not (finite := np.isfinite(coordinates)).all():
                 finite = finite if finite.ndim == 2 else finite.all(axis=2)
                 valid = finite if valid is None else valid & finite
         if valid is None or valid.all():

@@ -56,7 +56,10 @@ class FieldReader:
 
     def byte(self) -> int:
         """A whole number of 0 to 255."""
-        return self.take(1)[0]
+        if self.place == len(self.data):
+            raise CorruptStreamError("expected 1 more bytes, got 0", self.at)
+        self.place += 1
+        return self.data[self.place - 1]
 
     def varint(self, limit: int) -> int:
         """A whole number that must not exceed ``limit``."""
