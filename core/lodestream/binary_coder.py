@@ -95,11 +95,44 @@ def _shift(decoding: bool, low: int, width: int, place: int, data: NDArray[np.ui
 
 
 @inlined
+def _narrowed(decoding: bool, bit: int, low: int, width: int, chance: int) -> tuple[int, int, int]:
+    """The part of the interval for a bit, which is read from ``low`` where decoding; returns bit, low, width.
+
+    A 1 has the lower part: ``chance`` over 2**16.
+    """
+    bound = (width >> 16) * chance
+    if decoding:
+        bit = 1 if low < bound else 0
+        low = low if bit else low - bound
+    else:
+        low = low if bit else low + bound
+    return bit, low, bound if bit else width - bound
+
+
+@inlined
+def _mixed(total: int) -> int:
+    """Chance of a 1 over 2**16 where inputs times their weights come to this in all."""
+    return int(_SQUASH[(min(max(total >> 16, -2047), 2047) + 2048) & 4095])
+
+
+@inlined
+def _stretched(context: int) -> int:
+    """What a context brings to a mixture."""
+    return int(_STRETCH[(context >> 16) & 4095])
+
+
+@inlined
 def _learned(context: int, bit: int) -> int:
     """The context after a bit."""
     chance, sure = context >> 8, context & 255
     chance += (((_ONE if bit else 0) - chance) * int(_RATES[sure & _SUREST])) >> 16
     return (chance << 8) | min(sure + 1, _SUREST)
+
+
+@inlined
+def _weighed(weight: int, x: int, error: int) -> int:
+    """A weight of an input after a bit whose chance was off by ``error``."""
+    return min(max(weight + ((x * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
 
 
 @inlined
@@ -120,13 +153,7 @@ def code_bit(
     that end. Bytes past the end of the data are zeros.
     """
     context = int(model[slot & INDEX])
-    bound = (width >> 16) * min(max(context >> 12, 32), 65504)
-    if decoding:
-        bit = 1 if low < bound else 0
-        low = low if bit else low - bound
-    else:
-        low = low if bit else low + bound
-    width = bound if bit else width - bound
+    bit, low, width = _narrowed(decoding, bit, low, width, min(max(context >> 12, 32), 65504))
     model[slot & INDEX] = _learned(context, bit)
     if width < _BOTTOM:
         low, width, place = _shift(decoding, low, width, place, data)
@@ -149,29 +176,16 @@ def code_mixed_bit(
     """Code one bit in two contexts, mixed with the two weights at ``weights``; all four learn it. See `code_bit`."""
     context, second = int(model[slot & INDEX]), int(model[other & INDEX])
     heavy, light = int(model[weights & INDEX]), int(model[(weights + 1) & INDEX])
-    x, y = int(_STRETCH[(context >> 16) & 4095]), int(_STRETCH[(second >> 16) & 4095])
-    chance = int(_SQUASH[(min(max((heavy * x + light * y) >> 16, -2047), 2047) + 2048) & 4095])
-    bound = (width >> 16) * chance
-    if decoding:
-        bit = 1 if low < bound else 0
-        low = low if bit else low - bound
-    else:
-        low = low if bit else low + bound
-    width = bound if bit else width - bound
+    x, y = _stretched(context), _stretched(second)
+    chance = _mixed(heavy * x + light * y)
+    bit, low, width = _narrowed(decoding, bit, low, width, chance)
     error = (65536 if bit else 0) - chance
-    model[weights & INDEX] = min(max(heavy + ((x * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
-    model[(weights + 1) & INDEX] = min(max(light + ((y * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
+    model[weights & INDEX], model[(weights + 1) & INDEX] = _weighed(heavy, x, error), _weighed(light, y, error)
     model[slot & INDEX] = _learned(context, bit)
     model[other & INDEX] = _learned(second, bit)
     if width < _BOTTOM:
         low, width, place = _shift(decoding, low, width, place, data)
     return bit, low, width, place
-
-
-@inlined
-def _weighed(weight: int, x: int, error: int) -> int:
-    """A weight of an input after a bit whose chance was off by ``error``."""
-    return min(max(weight + ((x * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
 
 
 @kernel
@@ -191,21 +205,14 @@ def code_five_mixed_bit(
     first, second, third, fourth, fifth = slots
     a, b, c = int(model[first & INDEX]), int(model[second & INDEX]), int(model[third & INDEX])
     d, e = int(model[fourth & INDEX]), int(model[fifth & INDEX])
-    x, y = int(_STRETCH[(a >> 16) & 4095]), int(_STRETCH[(b >> 16) & 4095])
-    z, t = int(_STRETCH[(c >> 16) & 4095]), int(_STRETCH[(d >> 16) & 4095])
-    o = int(_STRETCH[(e >> 16) & 4095])
+    x, y = _stretched(a), _stretched(b)
+    z, t = _stretched(c), _stretched(d)
+    o = _stretched(e)
     p, q = int(weights[at & INDEX]), int(weights[(at + 1) & INDEX])
     r, s = int(weights[(at + 2) & INDEX]), int(weights[(at + 3) & INDEX])
     u = int(weights[(at + 4) & INDEX])
-    total = (p * x + q * y + r * z + s * t + u * o) >> 16
-    chance = int(_SQUASH[(min(max(total, -2047), 2047) + 2048) & 4095])
-    bound = (width >> 16) * chance
-    if decoding:
-        bit = 1 if low < bound else 0
-        low = low if bit else low - bound
-    else:
-        low = low if bit else low + bound
-    width = bound if bit else width - bound
+    chance = _mixed(p * x + q * y + r * z + s * t + u * o)
+    bit, low, width = _narrowed(decoding, bit, low, width, chance)
     error = (65536 if bit else 0) - chance
     weights[at & INDEX], weights[(at + 1) & INDEX] = _weighed(p, x, error), _weighed(q, y, error)
     weights[(at + 2) & INDEX], weights[(at + 3) & INDEX] = _weighed(r, z, error), _weighed(s, t, error)

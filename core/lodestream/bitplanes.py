@@ -31,13 +31,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .band_fields import (
+    COLUMN_SHIFT,
+    COLUMNS,
+    FLAGS,
+    KIND,
+    OFFSET,
+    PARENT,
+    PARENT_STRIDE,
+    ROW_SHIFT,
+    ROWS,
+    STRIDE,
+)
 from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
 from .initial_contexts import CHANCES, SURENESS
 from .kernels import inlined, kernel
 from .trellis import ODD, TRANSITIONS
 
 __all__ = [
-    "BAND_FIELDS",
     "BLOCK",
     "CONTEXTS",
     "code_passes",
@@ -46,21 +57,6 @@ __all__ = [
     "pass_gains",
     "reconstruction_point",
 ]
-
-#: Columns of the table that describes a tile's bands to the kernels, see `code_passes`.
-BAND_FIELDS = 10
-(
-    _OFFSET,
-    _STRIDE,
-    _ROWS,
-    _COLUMNS,
-    _FLAGS,
-    _PARENT,
-    _PARENT_STRIDE,
-    _ROW_SHIFT,
-    _COLUMN_SHIFT,
-    _KIND,
-) = range(BAND_FIELDS)
 
 #: Rows and columns of a block.
 BLOCK = 8
@@ -202,11 +198,7 @@ def code_passes(
     ----------
     decoding : bool
         Read ``data`` rather than write it.
-    bands : int64, shape (band, `BAND_FIELDS`)
-        For each band: where its first coefficient stands in the flat arrays, their stride, rows, columns, where its
-        first block stands in ``flags`` (stride: blocks across + 1, with a row before and one behind), where the parent
-        of the first coefficient stands and its stride, the shifts that take a row and a column to the parent's, and
-        the band's kind.
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
     known : int32, flat
         Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
     sign : int8, flat
@@ -247,11 +239,11 @@ def code_passes(
             state, first_across, first_around, weights = 0, 0, _FIRST_AROUND, CONTEXTS
             if dependent:
                 first_across, first_around, weights = _of_state(state)
-            offset, stride, kind = bands[band, _OFFSET], bands[band, _STRIDE], bands[band, _KIND]
-            rows, columns = bands[band, _ROWS], bands[band, _COLUMNS]
-            parent, parent_stride = bands[band, _PARENT], bands[band, _PARENT_STRIDE]
-            row_shift, column_shift = bands[band, _ROW_SHIFT], bands[band, _COLUMN_SHIFT]
-            first_flag, across = bands[band, _FLAGS], (columns + 7) >> 3
+            offset, stride, kind = bands[band, OFFSET], bands[band, STRIDE], bands[band, KIND]
+            rows, columns = bands[band, ROWS], bands[band, COLUMNS]
+            parent, parent_stride = bands[band, PARENT], bands[band, PARENT_STRIDE]
+            row_shift, column_shift = bands[band, ROW_SHIFT], bands[band, COLUMN_SHIFT]
+            first_flag, across = bands[band, FLAGS], (columns + 7) >> 3
             for top in range(0, rows, 8):
                 bottom = min(top + 8, rows)
                 for left in range(0, columns, 8):
@@ -370,9 +362,9 @@ def pass_gains(
     errors[:] = 0.0
     for band in range(bands.shape[0]):
         sums = np.zeros(passes + 2, np.float64)
-        offset, stride = bands[band, _OFFSET], bands[band, _STRIDE]
-        for i in range(bands[band, _ROWS]):
-            for j in range(bands[band, _COLUMNS]):
+        offset, stride = bands[band, OFFSET], bands[band, STRIDE]
+        for i in range(bands[band, ROWS]):
+            for j in range(bands[band, COLUMNS]):
                 at = offset + i * stride + j
                 value = abs(int(true[at]))
                 if value == 0:

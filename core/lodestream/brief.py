@@ -17,7 +17,7 @@ from .layout import Layout
 from .neighbours import encode_window
 from .preparation import Preparation
 
-__all__ = ["brief_piece", "foreseen", "rough_step", "roughen", "worth"]
+__all__ = ["brief_piece", "expected_length", "may_be_brief", "rough_step", "roughen", "worth"]
 
 #: Step of a coefficient of norm 1 in parts of the extent: where nothing was said, so that the layers come to an RMS
 #: error of about 1e-2; and with a precision, so that they cost next to nothing.
@@ -26,7 +26,7 @@ _EXACT_STEP, _PRECISE_STEP = 0.15, 4.0
 _ROUNDED_UP = 0.25
 #: A brief stream is at most so long, in parts of the other: of exact ones, of those with a precision, and of those that
 #: are made for one error, where nothing counts but their length.
-_EXACT_SHARE, _PRECISE_SHARE, _MADE_SHARE = 0.85, 0.9, 0.99
+_EXACT_SHARE, _PRECISE_SHARE, _ONE_ERROR_SHARE = 0.85, 0.9, 0.99
 #: A surface below this has too little to learn from.
 _FEWEST_POINTS = 1 << 12
 #: A stream's length is foreseen from every so many windows, and at most so many.
@@ -61,19 +61,21 @@ def roughen(array: NDArray[np.int32], layout: Layout, norms: NDArray[np.float64]
             band[...] = np.where(band < 0, -magnitudes, magnitudes)
 
 
-def worth(prepared: Preparation, length: int, other: int, made: bool = False) -> bool:
-    """Whether a brief stream of so many bytes is better than another of so many; ``made`` for one error only."""
-    share = _MADE_SHARE if made else _EXACT_SHARE if prepared.precision is None else _PRECISE_SHARE
+def may_be_brief(prepared: Preparation) -> bool:
+    """Whether there is a brief stream of a surface at all: heights and nothing else, of one block, enough of them."""
+    heights_only = prepared.point_channels == 1 and not prepared.kinds and prepared.arrangement is None
+    return heights_only and prepared.arrays[0][0].size >= _FEWEST_POINTS
+
+
+def worth(prepared: Preparation, length: int, other: int, one_error: bool = False) -> bool:
+    """Whether a brief stream of so many bytes is better than another of so many; made for ``one_error`` or any."""
+    share = _ONE_ERROR_SHARE if one_error else _EXACT_SHARE if prepared.precision is None else _PRECISE_SHARE
     return length <= share * other
 
 
-def foreseen(prepared: Preparation, lattice: Lattice) -> int | None:
-    """About how many bytes a brief stream takes, from some of its windows; None where there is none."""
-    if prepared.point_channels > 1 or prepared.kinds or prepared.arrangement is not None:
-        return None
+def expected_length(prepared: Preparation, lattice: Lattice) -> int | None:
+    """About how many bytes a brief stream takes, from some of its windows; None where its values were not exact."""
     heights, mask = prepared.arrays[0][0][..., 0], prepared.surface.blocks[0].mask
-    if heights.size < _FEWEST_POINTS:
-        return None
     if prepared.precision is None:
         given = np.ascontiguousarray(heights if mask is None else heights[mask, np.newaxis])
         if not agree(given, lattice.values(lattice.coordinates(given), given.dtype)):

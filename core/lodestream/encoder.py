@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from numpy.typing import ArrayLike
 
-from .brief import foreseen, worth
+from .brief import expected_length, may_be_brief, worth
 from .encoding import Encoding, UnreachableError
 from .errors import InputError, OptionError
 from .preparation import Preparation
@@ -26,8 +26,8 @@ _FIRST_RUNS = 0.7
 _MOST_BRIEF_TRIES = 3
 _BELOW = 0.999
 _CLOSE = 0.98
-#: What is foreseen from some windows may be so much too long.
-_FORESEEN = 1.05
+#: What is expected from some windows may be so much too long.
+_LONGER = 1.05
 
 
 def encode(
@@ -93,8 +93,8 @@ def encode(
             break
         # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
         container = min(container, Encoding(prepared, _first(rising), bits).run(), key=len)
-    length = foreseen(prepared, lattice)
-    if length is not None and worth(prepared, length, len(container)):
+    expected = expected_length(prepared, lattice) if may_be_brief(prepared) else None
+    if expected is not None and worth(prepared, expected, len(container)):
         brief = Encoding(prepared, rising, brief=True).run()
         container = brief if worth(prepared, len(brief), len(container)) else container
     rising(1.0)
@@ -135,10 +135,12 @@ def _made_for(
         container = Encoding(prepared, _first(progress), fine=fine).run()
     except UnreachableError:
         return None
-    if prepared.holds_itself():
+    if prepared.lies_on_coarse_lattice():
         exact = Preparation(surface, (None, precisions))
         container = min(container, Encoding(exact, _first(progress)).run(), key=len)
-    brief = _brief_for(surface, prepared.rms, precisions, progress, len(container))
+    brief = None
+    if may_be_brief(prepared):
+        brief = _brief_for(surface, prepared.rms, precisions, progress, len(container))
     return container if brief is None else brief
 
 
@@ -162,11 +164,11 @@ def _brief_for(
             encoding = Encoding(prepared, progress, brief=True)
         except InputError:
             break  # the type of the values itself rounds by more
-        expected = foreseen(prepared, encoding.lattices[0])
-        if expected is None or expected > _FORESEEN * length:
+        expected = expected_length(prepared, encoding.lattices[0])
+        if expected is None or expected > _LONGER * length:
             break
-        container, error = encoding.run(), encoding.left[0]
-        if error <= rms and worth(prepared, len(container), length, made=True):
+        container, error = encoding.run(), encoding.final[0]
+        if error <= rms and worth(prepared, len(container), length, one_error=True):
             best, length = container, len(container)
         if surface.dtype.kind in "iu" or _CLOSE * rms <= error <= rms:
             break

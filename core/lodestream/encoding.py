@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exactness
 from .allocation import TileCurve, assign_layers
+from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
-from .brief import brief_piece, rough_step, roughen
+from .brief import rough_step, roughen
 from .container.headers import MOST_FRACTION
 from .container.model import Header
-from .container.pieces import Window, windows
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
 from .lattice import LATTICE_BITS, Lattice
 from .picture import coordinate_distances
+from .piece_coder import as_returned, encode_pieces
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
 from .quantiser import Quantiser
-from .rate_distortion import MOST_TRIES, Chooser, longest_base
-from .reconstruction import Picture, Values, channel_picture, initial_state, to_values
-from .surface import Block, Surface
+from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
+from .reconstruction import Picture, channel_picture, initial_state, to_values
+from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
 from .tiles import Tiles, TileTable, gather
 from .transform import PADDING, forward, synthesis_norms
@@ -64,7 +63,7 @@ class Encoding:
     Attributes
     ----------
     lattices : list of Lattice, one a channel
-    left : (float, float)
+    final : (float, float)
         RMS and maximum error of the complete stream, after `run`.
     """
 
@@ -109,14 +108,14 @@ class Encoding:
         self.progress(0.4)
         states, figures = self._measured(states)
         self.progress(0.7)
-        pieces, exact, lossless = self._pieces()
+        pieces, exact, lossless = encode_pieces(prepared, self.header, self._last, self.brief)
         last = self._lattice_figures() if self.brief else figures[-1]
-        self.left = (0.0, 0.0) if exact else last
-        levels = self._level_figures(self.left)
+        self.final = (0.0, 0.0) if exact else last
+        levels = self._level_figures(self.final)
         self.progress(0.8)
         metadata = dict(prepared.surface.metadata)
         if lossless:
-            metadata[DIGEST] = values_digest(_as_returned(prepared.given, self.header.hole))
+            metadata[DIGEST] = values_digest(as_returned(prepared.given, self.header.hole))
         coded = self._coded(states, figures)
         container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
         self.progress(1.0)
@@ -158,7 +157,7 @@ class Encoding:
     def _quantise(self, wanted: float) -> None:
         """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
         table, channels = self.tables[0], self.channels[: self.geometric]
-        choosers = [Chooser(table, channel.true) for channel in channels]
+        choosers = [IndexChooser(table, channel.true) for channel in channels]
         state, canvases = np.zeros_like(self._all_passes()), self._canvases()
         kept: dict[int, list[NDArray[np.int32]]] = {}
         done: list[int] = []
@@ -196,15 +195,14 @@ class Encoding:
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
-        spacing = 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
         if self.brief:
-            roughen(arrays[0], self.layout, norms[0], rough_step(self.prepared) / spacing)
+            roughen(arrays[0], self.layout, norms[0], rough_step(self.prepared) / lattice.spacing)
         table = self._table(number)
         true = gather(table, arrays)
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
         span = self.prepared.extent if number < self.geometric else self._span(number)
-        spacing = spacing / span if span else 0.0
+        spacing = lattice.spacing / span if span else 0.0
         weights = np.array(
             [
                 norms[band.grid][tile.level, *map(int, band.kind)] * spacing**2
@@ -253,7 +251,7 @@ class Encoding:
                     pass_gains(rows, weights, passes, channel.true, early, errors)
                     gains = np.diff(errors)
                     rounding = _ROUNDING if self.quantiser is None else 0.0
-                    gains[0] += rounding * float((weights * rows[:, 2] * rows[:, 3]).sum())
+                    gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
                     curves.append(TileCurve(tile, number, bits, gains))
         return curves
 
@@ -317,47 +315,6 @@ class Encoding:
         """Passes of every tile and channel."""
         return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
 
-    def _pieces(self) -> tuple[list[bytes], bool, bool]:
-        """The exactness section's pieces; whether the coordinates are exact then, and whether all is.
-
-        A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit.
-        """
-        prepared, pieces = self.prepared, []
-        kept = [prepared.precision is not None or prepared.rms is not None] * self.geometric
-        kept += [False] * (prepared.point_channels - self.geometric)
-        for kind in prepared.kinds:
-            kept += [kind.name in prepared.attribute_precisions] * kind.channels
-        exact = [True, True]
-        for window in windows(self.header):
-            block = prepared.surface.blocks[window.block]
-            rows, columns = slice(*window.rows), slice(*window.columns)
-            original, restored = self._given(window), self._last[window.block].window(window)
-            if self.brief:
-                valid = None if block.mask is None else block.mask[rows, columns]
-                piece, same = brief_piece(original, restored, valid, self.lattices[0])
-                exact[0] &= same
-                pieces.append(piece)
-                continue
-            chosen = slice(None) if block.mask is None else block.mask[rows, columns]
-            original, restored = (np.ascontiguousarray(v[chosen]).ravel() for v in (original, restored))
-            if kept[window.channel]:
-                exact[0 if window.channel < self.geometric else 1] &= exactness.agree(original, restored)
-                pieces.append(b"")
-            else:
-                step = self.lattices[window.channel].step if original.dtype == np.float32 else None
-                pieces.append(exactness.encode_piece(original, restored, step))
-        return pieces, exact[0], all(exact)
-
-    def _given(self, window: Window) -> NDArray[Any]:
-        """One channel of the surface in a window, as it was given."""
-        block, channel = self.prepared.surface.blocks[window.block], window.channel
-        for values in (block.points, *block.attributes.values()):
-            array = values if values.ndim == 3 else values[..., np.newaxis]
-            if channel < array.shape[2]:
-                return array[slice(*window.rows), slice(*window.columns), channel]
-            channel -= array.shape[2]
-        raise IndexError(window.channel)
-
     def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self.tiles, self._last  # as large as what takes their place
@@ -394,17 +351,3 @@ def _hole(surface: Surface) -> int:
         return 0
     limits = np.iinfo(surface.dtype)
     return int(nodata) if max(limits.min, -(2**63)) <= nodata <= min(limits.max, 2**63 - 1) else 0
-
-
-def _as_returned(surface: Surface, hole: int) -> Iterator[Block]:
-    """The blocks as they come out of a container: holes have the value that says so."""
-    for block in surface.blocks:
-        if block.mask is None:
-            yield block
-            continue
-        arrays = [np.array(array) for array in (block.points, *block.attributes.values())]
-        values = Values([array.reshape(*block.shape, -1) for array in arrays])
-        values.clear(~block.mask, hole)
-        points, *attributes = (v.reshape(a.shape) for v, a in zip(values.arrays, arrays, strict=True))
-        named = dict(zip(block.attributes, attributes, strict=True))
-        yield Block(points, block.closed, mask=block.mask, attributes=named)

@@ -41,6 +41,11 @@ class Lattice:
     origin: float
     step: float
 
+    @property
+    def spacing(self) -> float:
+        """Distance between neighbouring values, in their unit."""
+        return 1.0 / self.step if self.rule == "decimal" else self.step
+
     def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any], fraction: int = 0) -> NDArray[Any]:
         """Values of lattice coordinates over 2**fraction, any shape, in the given dtype."""
         q = coordinates.astype(np.float64)

@@ -144,11 +144,10 @@ class Preparation:
         lattices[: self.geometric] = [precision_lattice(*span, error / fineness) for span in spans]
         return lattices, fineness
 
-    def holds_itself(self) -> bool:
+    def lies_on_coarse_lattice(self) -> bool:
         """Whether the coordinates lie on a lattice as coarse as `rms`: an exact stream may then be shorter."""
         found = find_lattice(self._valid)
-        spacing = 0.0 if found is None else 1.0 / found.step if found.rule == "decimal" else found.step
-        return self.rms is not None and spacing >= self.rms
+        return found is not None and self.rms is not None and found.spacing >= self.rms
 
     def channel(self, block: int, channel: int) -> NDArray[Any]:
         """One channel of a block, shape (row, column), a view."""

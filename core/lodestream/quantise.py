@@ -73,7 +73,7 @@ def choose_lattices(
         own = find_lattice(channel_of(points, channel))
         if channel >= geometric:
             lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_STEPS))
-        elif own is not None and (precision is None or _spacing(own) >= wanted):
+        elif own is not None and (precision is None or own.spacing >= wanted):
             lattices.append(own)
         else:
             lattices.append(precision_lattice(low, high, wanted))
@@ -105,10 +105,6 @@ def attribute_lattices(
         return choose_lattices(grid, count, None, bits)
     # As attributes of nothing: each component gets its own lattice, or a fine one.
     return choose_lattices(grid, 0, None)
-
-
-def _spacing(lattice: Lattice) -> float:
-    return 1.0 / lattice.step if lattice.rule == "decimal" else lattice.step
 
 
 def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: list[tuple[float, float]]) -> float:

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import BLOCK
 from .kernels import inlined, kernel
 from .layout import Band, Layout
+from .predictors import COEFFICIENT_BITS
 from .trellis import ODD, TRANSITIONS
 
 __all__ = ["MOST_BASE", "Quantiser", "spread_quantised", "step_of"]
@@ -22,7 +24,7 @@ __all__ = ["MOST_BASE", "Quantiser", "spread_quantised", "step_of"]
 #: Largest `Quantiser.base`.
 MOST_BASE = (1 << 24) - 1
 #: Largest magnitude of a coefficient, as in the inverse transform.
-_LARGEST = 1 << 28
+_LARGEST = 1 << COEFFICIENT_BITS
 
 #: Of a node and of a detail along an axis: 2**16 over the norm of its synthesis function with the four-point rule, by
 #: the axis's steps from there to the finest level; further steps halve it for each two of them.
@@ -86,7 +88,7 @@ def spread_quantised(
     Parameters
     ----------
     known, sign, early : flat, see `bitplanes.code_passes`
-    band : int64, shape (`BAND_FIELDS`,)
+    band : int64, shape (`band_fields.BAND_FIELDS`,)
     step : int
         Lattice steps.
     remaining : int
@@ -94,7 +96,7 @@ def spread_quantised(
     out : int32, flat
         The coefficient of row i and column j goes to ``place + i * pitch + j``.
     """
-    offset, stride, rows, columns = band[0], band[1], band[2], band[3]
+    offset, stride, rows, columns = band[OFFSET], band[STRIDE], band[ROWS], band[COLUMNS]
     begun = remaining >> 1
     plane = begun + (remaining & 1)
     state = 0

@@ -13,13 +13,23 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .band_fields import (
+    COLUMN_SHIFT,
+    COLUMNS,
+    OFFSET,
+    PARENT,
+    PARENT_STRIDE,
+    ROW_SHIFT,
+    ROWS,
+    STRIDE,
+)
 from .bitplanes import BLOCK
 from .kernels import kernel
 from .quantiser import MOST_BASE, Quantiser
 from .tiles import TileTable
 from .trellis import ODD, TRANSITIONS
 
-__all__ = ["MOST_TRIES", "Chooser", "longest_base"]
+__all__ = ["MOST_TRIES", "IndexChooser", "longest_base"]
 
 #: Squared error that a bit is worth, in squared steps.
 _WORTH = 0.05
@@ -35,7 +45,7 @@ _CLOSE = 0.997
 _ERROR_TO_STEP = 1.2
 
 
-class Chooser:
+class IndexChooser:
     """Chooses the indices of one channel.
 
     Parameters
@@ -88,9 +98,9 @@ def _divide(
 ) -> None:
     for band in range(bands.shape[0]):
         scale = 1.0 / steps[band]
-        for i in range(bands[band, 2]):
-            for j in range(bands[band, 3]):
-                at = bands[band, 0] + i * bands[band, 1] + j
+        for i in range(bands[band, ROWS]):
+            for j in range(bands[band, COLUMNS]):
+                at = bands[band, OFFSET] + i * bands[band, STRIDE] + j
                 relative[at] = coefficients[at] * scale
 
 
@@ -98,10 +108,11 @@ def _divide(
 def _classify(bands: NDArray[np.int64], relative: NDArray[np.float64], classes: NDArray[np.int8]) -> None:
     """Class of each coefficient by its eight neighbours and its parent: half octaves."""
     for band in range(bands.shape[0]):
-        stride, parent = bands[band, 1], bands[band, 5]
-        for i in range(bands[band, 2]):
-            for j in range(bands[band, 3]):
-                at = bands[band, 0] + i * stride + j
+        stride, parent, parent_stride = bands[band, STRIDE], bands[band, PARENT], bands[band, PARENT_STRIDE]
+        row_shift, column_shift = bands[band, ROW_SHIFT], bands[band, COLUMN_SHIFT]
+        for i in range(bands[band, ROWS]):
+            for j in range(bands[band, COLUMNS]):
+                at = bands[band, OFFSET] + i * stride + j
                 near = (
                     abs(relative[at - 1])
                     + abs(relative[at + 1])
@@ -114,7 +125,7 @@ def _classify(bands: NDArray[np.int64], relative: NDArray[np.float64], classes: 
                     + abs(relative[at + stride - 1])
                     + abs(relative[at + stride + 1])
                 )
-                above = abs(relative[parent + (i >> bands[band, 7]) * bands[band, 6] + (j >> bands[band, 8])])
+                above = abs(relative[parent + (i >> row_shift) * parent_stride + (j >> column_shift)])
                 size = (2.0 * near + corners + 2.0 * above) / 14.0
                 number = int(np.floor(2.0 * np.log2(size + 1e-3) + _FIRST_CLASS))
                 classes[at] = min(max(number, 0), _CLASSES - 1)
@@ -134,7 +145,7 @@ def _choose(
 
     ``counts``, of the shape of ``bits``, are increased by what was chosen.
     """
-    offset, stride, rows, columns = band[0], band[1], band[2], band[3]
+    offset, stride, rows, columns = band[OFFSET], band[STRIDE], band[ROWS], band[COLUMNS]
     states, length = ODD.size, rows * columns
     places = np.empty(length, np.int64)
     before = np.zeros((length, states), np.int8)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .band_fields import COLUMNS, ROWS
 from .bitplanes import code_passes
 from .quantiser import Quantiser
 from .tiles import Tiles, TileTable
@@ -56,7 +57,7 @@ class TileCoder:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
         tiles = self.tiles[channel]
         rows = tiles.table.of_tile(tile)
-        coefficients = int((rows[:, 2] * rows[:, 3]).sum())
+        coefficients = int((rows[:, ROWS] * rows[:, COLUMNS]).sum())
         # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
         data = np.empty(64 + 3 * passes * coefficients, np.uint8)
         length = code_passes(

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .bitplanes import BAND_FIELDS, code_passes, new_model, reconstruction_point
+from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
+from .bitplanes import code_passes, new_model, reconstruction_point
 from .kernels import inlined, kernel
 from .layout import Band, Layout
 from .quantiser import Quantiser, spread_quantised, step_of
@@ -30,8 +31,8 @@ class TileTable:
 
     Attributes
     ----------
-    bands : int64, shape (band, `BAND_FIELDS`)
-        For `bitplanes.code_planes`, of all tiles in order.
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
+        Of all tiles in order.
     first : list of int
         Number of each tile's first band, and the number of bands at the end.
     size, blocks : int
@@ -158,7 +159,7 @@ class Tiles:
 
     def band(self, number: int, state: NDArray[np.int8], fraction: int) -> NDArray[np.int32]:
         """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column)."""
-        height, width = (int(n) for n in self.table.bands[number, 2:4])
+        height, width = (int(n) for n in self.table.bands[number, [ROWS, COLUMNS]])
         array = np.zeros((height, width), np.int32)
         tile, top, left = (int(n) for n in self.table.windows[number])
         self._spread(np.array([number]), state, array, tile, fraction, (top, left))
@@ -250,13 +251,13 @@ def _spread(
     for band in numbers:
         tile, top, left = windows[band, 0], windows[band, 1] - first_row, windows[band, 2] - first_column
         passes, shift = int(state[tile]), fraction if tile >= finer else 0
-        width = bands[band, 3]
+        width = bands[band, COLUMNS]
         if steps[band] and passes < UNANNOUNCED:
             place, row, step = top * pitch + left, bands[band], steps[band]
             spread_quantised(known, sign, early, row, step, passes, out, place, pitch)
             continue
-        for i in range(bands[band, 2]):
-            start = bands[band, 0] + i * bands[band, 1]
+        for i in range(bands[band, ROWS]):
+            start = bands[band, OFFSET] + i * bands[band, STRIDE]
             target = (top + i) * pitch + left
             _spread_row(
                 known[start : start + width],
@@ -308,7 +309,7 @@ def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArr
     flat = np.zeros(table.size, np.int32)
     for number, bands in enumerate(table.members):
         for band, row in zip(bands, table.of_tile(number), strict=True):
-            place, stride, height = (int(x) for x in row[:3])
+            place, stride, height = (int(x) for x in row[[OFFSET, STRIDE, ROWS]])
             start = place - stride - 1
             frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
             frame[1:-1, 1:-1] = _window(coefficients[band.grid], band)
