@@ -85,7 +85,7 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     if rule == _OFFSETS:
         return _decoded_offsets(restored, data, argument, offset)
     limit = 8 * dtype.itemsize - 1 if rule == PATTERNS else MOST_DECIMALS
-    if argument > limit or (rule == DECIMALS and dtype.kind != "f"):
+    if rule == _RAW or argument > limit or (rule == DECIMALS and dtype.kind != "f"):
         raise CorruptStreamError(f"expected a rule of exactness for {dtype} values, got {data[0]}", offset)
     packed = int.from_bytes(data[1:3], "little")
     most, count = packed & 4095, packed >> 12

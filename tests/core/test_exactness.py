@@ -192,6 +192,15 @@ def test_any_bytes_are_values_or_refused(data: bytes, rule: int, dtype: str) -> 
     assert 1000 <= offset <= 1000 + len(payload)
 
 
+def test_the_values_themselves_take_no_argument() -> None:
+    values = normal("float32", 40)
+    data = encode_piece(values, on_lattice(values, 1e-4))
+    for argument in (1, 63):
+        with pytest.raises(CorruptStreamError, match="rule of exactness") as error:
+            decode_piece(values, bytes([argument << 2]) + data[1:], 7)
+        assert error.value.offset == 7
+
+
 def test_every_prefix_is_refused() -> None:
     values = normal("float32", 500)
     restored = on_lattice(values, 1e-4)
