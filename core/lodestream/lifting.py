@@ -368,10 +368,9 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
     rows, columns = values.shape
     if axis == 0 and columns < _STRIP // 4:
         # Too few columns to fill a strip: each is a row of its own.
-        for column in range(columns):
-            line = values[None, :, column].copy()
-            _step(line, 1, step, predictor, inverse)
-            values[:, column] = line[0]
+        lines = values.T.copy(order="C")
+        _step(lines, 1, step, predictor, inverse)
+        values[...] = lines.T
         return
     if values.strides[1] != values.itemsize or values.strides[0] < 0:
         packed = values.copy(order="C")
@@ -379,7 +378,10 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
         values[...] = packed
         return
     pitch = values.strides[0] // values.itemsize
-    flat = np.lib.stride_tricks.as_strided(values, ((rows - 1) * pitch + columns,), (values.itemsize,))
+    if pitch == columns:
+        flat = values.reshape(-1)
+    else:
+        flat = np.lib.stride_tricks.as_strided(values, ((rows - 1) * pitch + columns,), (values.itemsize,))
     kernel_of_axis, across = (_step_columns, columns) if axis == 0 else (_step_rows, rows)
     table = step.extension(REACH)
     kernel_of_axis(flat, pitch, across, step.length, step.midpoints, step.run, table, *predictor, inverse)
