@@ -21,7 +21,7 @@ demo: $(STAMP) ## serve real surfaces to itself over a slow link, stop early, sh
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says.
 test: $(STAMP) ## run the tests; ARGS="-k name" for some of them
-	@$(BIN)/python -c 'from lodestream_server.worker import warm; warm()' # compile once, not in every process at once
+	@$(BIN)/python -m tests.warming # compile once, not in every process at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows

@@ -45,7 +45,7 @@ def main(folder: Path, arguments: list[str]) -> int:
     group = ["--group", f"{ROOT}/pyproject.toml:test"]
     subprocess.run([*pip, "--constraint", str(listed), "--editable", f"{ROOT}[all]", *group], check=True)
     variables = {**os.environ, "NUMBA_CACHE_DIR": str((folder / "kernels").resolve())}
-    subprocess.run([python, "-c", "from lodestream_server.worker import warm; warm()"], env=variables, check=True)
+    subprocess.run([python, "-m", "tests.warming"], cwd=ROOT, env=variables, check=True)
     command = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", *arguments]
     return subprocess.run(command, cwd=ROOT, env=variables, check=False).returncode
 

@@ -131,7 +131,7 @@ def read_progress(folder: Path) -> float:
 
 
 def warm() -> None:
-    """Compile the kernels, or load them from the disk: code small surfaces, and find the grids of small meshes."""
+    """Compile the kernels, or load them from the disk: find the grids of small meshes, and code small surfaces."""
     import numpy as np
 
     from lodestream import decode, encode
@@ -141,6 +141,14 @@ def warm() -> None:
     rows, columns = np.mgrid[0:37, 0:41].astype(np.float64)
     xyz = np.stack((rows, columns, np.sin(rows * columns / 99)), axis=-1)
     heights = np.sin(rows / 5) * columns
+    number = np.arange(rows.size, dtype=np.int32).reshape(rows.shape)
+    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    none = np.full_like(a, -1)
+    quads = np.stack((a, b, c, d), axis=-1)
+    halves = np.concatenate((np.stack((a, b, c, none), axis=-1), np.stack((a, c, d, none), axis=-1)))
+    for corners in (quads, halves):
+        if not np.array_equal(recognise(Mesh(xyz.reshape(-1, 3), corners)).surface().points, xyz):
+            raise RuntimeError("expected the grid that the mesh was made of, got another one")
     for points in (heights, xyz):
         if not np.array_equal(decode(encode(points)).points, points):
             raise RuntimeError("expected the surface that was encoded, got another one")
@@ -152,14 +160,6 @@ def warm() -> None:
     terraces = np.rint(4 * np.sin(many[0] / 9) * np.cos(many[1] / 7)).astype(np.int16)
     if not np.array_equal(decode(encode(terraces)).points, terraces):
         raise RuntimeError("expected the terraces that were encoded, got others")
-    number = np.arange(rows.size, dtype=np.int32).reshape(rows.shape)
-    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    none = np.full_like(a, -1)
-    quads = np.stack((a, b, c, d), axis=-1)
-    halves = np.concatenate((np.stack((a, b, c, none), axis=-1), np.stack((a, c, d, none), axis=-1)))
-    for corners in (quads, halves):
-        if not np.array_equal(recognise(Mesh(xyz.reshape(-1, 3), corners)).surface().points, xyz):
-            raise RuntimeError("expected the grid that the mesh was made of, got another one")
 
 
 def _build(job: Job) -> Built:
