@@ -14,6 +14,17 @@ from tests.server import slow
 from tests.server.helpers import Keys
 
 
+@pytest.fixture(scope="package", autouse=True)
+def unwarmed() -> Iterator[None]:
+    """Servers whose processes load the kernels that a build needs when it needs them, not all at their start.
+
+    Those of the client's tests, and those that are programs of their own, do as they always do.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "warm", slow.number)
+        yield
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("server") / "data"
@@ -41,11 +52,3 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
     tokens["expired"] = file.create("expired", ("admin",), days=1e-9)[0]
     tokens["wrong"] = tokens["admin"][:-1] + ("A" if tokens["admin"][-1] != "A" else "B")
     return Keys(folder, tokens)
-
-
-@pytest.fixture
-def unwarmed() -> Iterator[None]:
-    """Servers whose processes load the kernels that a build needs when it needs them, not all at their start."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker, "warm", slow.number)
-        yield

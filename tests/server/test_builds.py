@@ -19,8 +19,6 @@ from lodestream_server.storage import Storage
 from tests.server import slow
 from tests.server.helpers import eventually, hills, npy, push, settled
 
-pytestmark = pytest.mark.usefixtures("unwarmed")
-
 
 @contextmanager
 def running(data: Path, **settings: Any) -> Iterator[httpx.Client]:

@@ -14,8 +14,6 @@ from tests.server.helpers import eventually, hills, npy, push, settled
 from tests.server.test_builds import running
 from tests.torture import small_disk
 
-pytestmark = pytest.mark.usefixtures("unwarmed")
-
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
