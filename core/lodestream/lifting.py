@@ -378,10 +378,19 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
         values[...] = packed
         return
     pitch = values.strides[0] // values.itemsize
-    if pitch == columns:
-        flat = values.reshape(-1)
-    else:
-        flat = np.lib.stride_tricks.as_strided(values, ((rows - 1) * pitch + columns,), (values.itemsize,))
+    flat = values.reshape(-1) if pitch == columns else _from_first_to_last(values, (rows - 1) * pitch + columns)
     kernel_of_axis, across = (_step_columns, columns) if axis == 0 else (_step_rows, rows)
     table = step.extension(REACH)
     kernel_of_axis(flat, pitch, across, step.length, step.midpoints, step.run, table, *predictor, inverse)
+
+
+def _from_first_to_last(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:
+    """All from the first value of an array to the last, what lies between its rows included."""
+    around = values.base
+    if isinstance(around, np.ndarray) and around.flags.c_contiguous and around.dtype == values.dtype:
+        # A window of a larger array, as nearly always: ten times as fast as what serves any array.
+        first, start = (array.__array_interface__["data"][0] for array in (values, around))
+        place = (first - start) // values.itemsize
+        found: NDArray[np.int32] = around.reshape(-1)[place : place + count]
+        return found
+    return np.lib.stride_tricks.as_strided(values, (count,), (values.itemsize,))
