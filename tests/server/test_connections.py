@@ -22,11 +22,11 @@ from tests.server.helpers import PATIENCE, closed, eventually, hills, npy, push,
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, Any]]]:
     """A server that waits for nobody, and a surface on it that no buffer takes whole."""
-    with running_server(
-        tmp_path_factory.mktemp("data"), workers=1, head_seconds=0.5, idle_seconds=0.5, bye_seconds=0.2
-    ) as url:
-        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
-            made = push(http, npy(hills(700, 700)))
+    data = tmp_path_factory.mktemp("data")
+    # Built by one that is patient, which does not mind how busy this machine is.
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        made = push(http, npy(hills(700, 700)))
+    with running_server(data, workers=1, head_seconds=0.5, idle_seconds=0.5, bye_seconds=0.2) as url:
         yield url, made
 
 
