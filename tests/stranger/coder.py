@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from operator import mul
 
 from tests.stranger.tables import LOGISTIC, START_CHANCE, START_SURENESS
 
@@ -26,6 +27,7 @@ def _squash(x: int) -> int:
 
 
 SQUASH = [_squash(x) for x in range(-2048, 2048)]
+RATE = [2**17 // (2 * n + 3) for n in range(128)]
 STRETCH = [clamp(bisect_left(SQUASH, 16 * p + 8) - 2048, -2047, 2047) for p in range(4096)]  # SQUASH rises
 
 
@@ -66,8 +68,9 @@ class Model:
     def _learn(self, context: int, bit: int) -> None:
         n = self._sureness[context]
         aim = 2**20 - 1 if bit else 0
-        self._chance[context] += (aim - self._chance[context]) * (2**17 // (2 * n + 3)) >> 16
-        self._sureness[context] = min(n + 1, 127)
+        self._chance[context] += (aim - self._chance[context]) * RATE[n] >> 16
+        if n < 127:
+            self._sureness[context] = n + 1
 
     def alone(self, coder: RangeDecoder, context: int) -> int:
         """A bit coded with one context."""
@@ -82,7 +85,7 @@ class Model:
     def mixed_by(self, coder: RangeDecoder, contexts: list[int], weights: list[int]) -> int:
         """A bit coded with several contexts and as many weights, which change."""
         inputs = [STRETCH[self._chance[context] >> 8] for context in contexts]
-        total = sum(weight * x for weight, x in zip(weights, inputs, strict=True)) >> 16
+        total = sum(map(mul, weights, inputs)) >> 16
         chance = SQUASH[clamp(total, -2047, 2047) + 2048]
         bit = coder.bit(chance)
         error = (65536 if bit else 0) - chance
