@@ -41,12 +41,13 @@ def npy(array: NDArray[Any]) -> bytes:
 
 def eventually(look: Callable[[], T | None], what: str) -> T:
     """The first true value that `look` gives; fails when there is none in time."""
-    until = time.monotonic() + PATIENCE
+    until, pause = time.monotonic() + PATIENCE, 0.01
     while time.monotonic() < until:
         value = look()
         if value:
             return value
-        time.sleep(0.01)
+        time.sleep(pause)
+        pause = min(1.5 * pause, 0.05)  # looking is often a request, which takes a processor from what is waited for
     raise AssertionError(f"expected {what} within {PATIENCE:g} s")
 
 
