@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import inlined, kernel
+from .kernels import bare_kernel, inlined
 
 __all__ = ["INDEX", "WEIGHT", "WIDEST", "code_bit", "code_five_mixed_bit", "code_mixed_bit", "finish", "start"]
 
@@ -56,7 +56,7 @@ _SQUASH = _squash_table()
 _STRETCH = np.clip(np.searchsorted(_SQUASH, 16 * np.arange(4096) + 8) - 2048, -2047, 2047).astype(np.int16)
 
 
-@kernel
+@bare_kernel
 def start(data: NDArray[np.uint8]) -> int:
     """The reader's ``low`` before the first bit: the first four bytes, zeros past the end."""
     low = 0
@@ -65,7 +65,7 @@ def start(data: NDArray[np.uint8]) -> int:
     return low
 
 
-@kernel
+@bare_kernel
 def _carry(place: int, data: NDArray[np.uint8]) -> None:
     """Add 1 to the number that ends before ``place``."""
     back = place - 1
@@ -75,7 +75,7 @@ def _carry(place: int, data: NDArray[np.uint8]) -> None:
     data[back] += np.uint8(1)
 
 
-@kernel
+@bare_kernel
 def _shift(decoding: bool, low: int, width: int, place: int, data: NDArray[np.uint8]) -> tuple[int, int, int]:
     """Move bytes until the interval is wide enough again; returns low, width, place."""
     if not decoding and low > WIDEST:
@@ -188,7 +188,7 @@ def code_mixed_bit(
     return bit, low, width, place
 
 
-@kernel
+@bare_kernel
 def code_five_mixed_bit(
     decoding: bool,
     bit: int,
@@ -225,7 +225,7 @@ def code_five_mixed_bit(
     return bit, low, width, place
 
 
-@kernel
+@bare_kernel
 def finish(low: int, width: int, place: int, data: NDArray[np.uint8]) -> int:
     """Write the fewest bytes that name a number in the interval, without zeros at the end; returns the length, >= 1."""
     if low > WIDEST:

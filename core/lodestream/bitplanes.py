@@ -45,7 +45,7 @@ from .band_fields import (
 )
 from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
 from .initial_contexts import CHANCES, SURENESS
-from .kernels import inlined, kernel
+from .kernels import bare_kernel, inlined, kernel
 from .trellis import ODD, TRANSITIONS
 
 __all__ = [
@@ -176,8 +176,8 @@ def _of_state(state: int) -> tuple[int, int, int]:
     )
 
 
-@kernel
-def code_passes(
+@bare_kernel
+def _code_passes(
     decoding: bool,
     bands: NDArray[np.int64],
     first: int,
@@ -191,42 +191,13 @@ def code_passes(
     data: NDArray[np.uint8],
     costs: NDArray[np.float64],
     trellis: bool,
+    sums: NDArray[np.uint32],
 ) -> int:
-    """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
-
-    Parameters
-    ----------
-    decoding : bool
-        Read ``data`` rather than write it.
-    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
-    known : int32, flat
-        Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
-    sign : int8, flat
-        -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
-    flags : uint8, flat
-        Whether a block has a significant coefficient; updated.
-    early : uint8, flat
-        1 + the plane in whose first pass a coefficient was coded last; updated.
-    true : int32, flat
-        The coefficients with their signs, where writing; not looked at where reading.
-    model : int32, see `new_model`
-        Updated.
-    data : uint8
-        Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
-    costs : float64, at least ``first + 1`` long
-        Where writing, the bits written when each pass ended. May be empty.
-    trellis : bool
-        The coefficients are indices with a trellis, see `trellis`; ``model`` is one of a trellis.
-
-    Returns
-    -------
-    int
-        Bytes of the run, where writing.
-    """
+    """`code_passes` with room for the ``sums`` of `_look`."""
     low, width, place, bit = 0, WIDEST, 0, 0
     if decoding:
         low, place = start(data), 4
-    sums = np.zeros(24, np.uint32)  # read through a mask, for a sum of signed and unsigned compiles to a float
+    # Sums are read through a mask, for a sum of signed and unsigned compiles to a float.
     for number in range(first, last - 1, -1):
         plane, begins = number >> 1, (number & 1) == 1
         unit = 1 << plane
@@ -346,6 +317,59 @@ def code_passes(
 
 
 @kernel
+def code_passes(
+    decoding: bool,
+    bands: NDArray[np.int64],
+    first: int,
+    last: int,
+    known: NDArray[np.int32],
+    sign: NDArray[np.int8],
+    flags: NDArray[np.uint8],
+    early: NDArray[np.uint8],
+    true: NDArray[np.int32],
+    model: NDArray[np.int32],
+    data: NDArray[np.uint8],
+    costs: NDArray[np.float64],
+    trellis: bool,
+) -> int:
+    """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
+
+    Parameters
+    ----------
+    decoding : bool
+        Read ``data`` rather than write it.
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
+    known : int32, flat
+        Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
+    sign : int8, flat
+        -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
+    flags : uint8, flat
+        Whether a block has a significant coefficient; updated.
+    early : uint8, flat
+        1 + the plane in whose first pass a coefficient was coded last; updated.
+    true : int32, flat
+        The coefficients with their signs, where writing; not looked at where reading.
+    model : int32, see `new_model`
+        Updated.
+    data : uint8
+        Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
+    costs : float64, at least ``first + 1`` long
+        Where writing, the bits written when each pass ended. May be empty.
+    trellis : bool
+        The coefficients are indices with a trellis, see `trellis`; ``model`` is one of a trellis.
+
+    Returns
+    -------
+    int
+        Bytes of the run, where writing.
+    """
+    sums = np.zeros(24, np.uint32)
+    return _code_passes(
+        decoding, bands, first, last, known, sign, flags, early, true, model, data, costs, trellis, sums
+    )
+
+
+@kernel
 def pass_gains(
     bands: NDArray[np.int64],
     weights: NDArray[np.float64],
@@ -389,7 +413,7 @@ def pass_gains(
             errors[remaining] += weights[band] * sums[remaining]
 
 
-@kernel
+@inlined
 def reconstruction_point(plane: int) -> int:
     """What is added to a significant magnitude whose bits below ``plane`` are unknown."""
     return (7 << plane) >> 4

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .axis import axis_step
 from .errors import InputError
-from .kernels import kernel
+from .kernels import bare_kernel, kernel
 from .surface import Closed
 
 __all__ = ["coarsen", "hierarchy"]
@@ -103,7 +103,7 @@ def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]
     return lines.reshape(rows.coarse, columns.coarse, *points.shape[2:])
 
 
-@kernel
+@bare_kernel
 def _detail(
     x: NDArray[np.float64], k: int, wraps: bool, midpoints: int, start: int, stop: int, out: NDArray[np.float64]
 ) -> None:
@@ -114,23 +114,20 @@ def _detail(
         out[i] = middle[i] - 0.5 * (before[i] + after[i])
 
 
-@kernel
-def _coarsen_columns(
+@bare_kernel
+def _coarsen_strips(
     x: NDArray[np.float64],
     out: NDArray[np.float64],
     midpoints: int,
     run: int,
     wraps: bool,
     table: NDArray[np.int64],
+    causal: NDArray[np.float64],
+    detail: NDArray[np.float64],
+    state: NDArray[np.float64],
 ) -> None:
-    """Nodes of the least-squares optimum along axis 0, strip by strip.
-
-    w is one recursion down the details and one back up, both started 32 details outside, where what is left out weighs
-    less than 1e-24.
-    """
+    """`_coarsen_columns` with its buffers."""
     length, columns = x.shape
-    causal = np.zeros((midpoints + 2 * _REACH, _STRIP))
-    detail, state = np.zeros(_STRIP), np.zeros(_STRIP)
     for start in range(0, columns, _STRIP):
         stop = min(start + _STRIP, columns)
         state[:] = 0.0
@@ -156,10 +153,29 @@ def _coarsen_columns(
             for i in range(_STRIP):
                 state[i] = w[i] + _RATIO * state[i]
         if run < out.shape[0]:
-            out[run, start:stop] = x[length - 1, start:stop]
+            for j in range(start, stop):
+                out[run, j] = x[length - 1, j]
 
 
 @kernel
+def _coarsen_columns(
+    x: NDArray[np.float64],
+    out: NDArray[np.float64],
+    midpoints: int,
+    run: int,
+    wraps: bool,
+    table: NDArray[np.int64],
+) -> None:
+    """Nodes of the least-squares optimum along axis 0, strip by strip.
+
+    w is one recursion down the details and one back up, both started 32 details outside, where what is left out weighs
+    less than 1e-24.
+    """
+    causal = np.zeros((midpoints + 2 * _REACH, _STRIP))
+    _coarsen_strips(x, out, midpoints, run, wraps, table, causal, np.zeros(_STRIP), np.zeros(_STRIP))
+
+
+@bare_kernel
 def _spread_sum(source: NDArray[np.float64], target: NDArray[np.float64], reach: int, weight: float) -> None:
     """Add the neighbours on both sides, weighted; what is within ``reach`` of an end is left alone."""
     inner = source.size - 2 * reach

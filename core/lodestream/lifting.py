@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
-from .kernels import inlined, kernel
+from .kernels import bare_kernel, inlined, kernel
 
 __all__ = ["CLAMP", "REACH", "TAPS", "forward_step", "inverse_step"]
 
@@ -48,7 +48,7 @@ _SMALL = 2**18
 _BIAS = _i32(3 * 2**21)
 
 
-@kernel
+@bare_kernel
 def _magnitude(values: NDArray[np.int32]) -> int:
     """Something at least as large as every magnitude, and less than twice the largest."""
     bits = _i32(0)
@@ -57,7 +57,7 @@ def _magnitude(values: NDArray[np.int32]) -> int:
     return int(bits) + 1
 
 
-@kernel
+@bare_kernel
 def _rise(nodes: NDArray[np.int32], gap: int) -> int:
     """Something at least as large as every difference of neighbours along the axis, see `_magnitude`."""
     bits = _i32(0)
@@ -67,19 +67,19 @@ def _rise(nodes: NDArray[np.int32], gap: int) -> int:
     return int(bits) + 1
 
 
-@kernel
+@bare_kernel
 def _copy(source: NDArray[np.int32], target: NDArray[np.int32]) -> None:
     for i in range(target.size):
         target[i] = source[i]
 
 
-@kernel
+@bare_kernel
 def _clamp(values: NDArray[np.int32]) -> None:
     for i in range(values.size):
         values[i] = min(max(values[i], -_CLAMP), _CLAMP)
 
 
-@kernel
+@bare_kernel
 def _move(outside: NDArray[np.int32], inside: NDArray[np.int32], loads: bool) -> None:
     if loads:
         _copy(outside, inside)
@@ -87,7 +87,7 @@ def _move(outside: NDArray[np.int32], inside: NDArray[np.int32], loads: bool) ->
         _copy(inside, outside)
 
 
-@kernel
+@bare_kernel
 def _extend(details: NDArray[np.int32], midpoints: int, table: NDArray[np.int64], gap: int) -> None:
     """Fill the ten places before and after the details."""
     for side in range(20):
@@ -97,7 +97,7 @@ def _extend(details: NDArray[np.int32], midpoints: int, table: NDArray[np.int64]
             details[target + i] = sign * details[source + i]
 
 
-@kernel
+@bare_kernel
 def _update(
     details: NDArray[np.int32], nodes: NDArray[np.int32], wide: NDArray[np.float64], run: int, sign: int, gap: int
 ) -> None:
@@ -141,7 +141,7 @@ def _update(
             c[i] += sign * _i32(np.floor(total + 0.375))
 
 
-@kernel
+@bare_kernel
 def _surround(nodes: NDArray[np.int32] | NDArray[np.float64], run: int, wraps: bool, gap: int) -> None:
     """Fill the two places before and the three after the nodes of a run."""
     first, last = 2 * gap, (run + 1) * gap
@@ -160,7 +160,7 @@ def _surround(nodes: NDArray[np.int32] | NDArray[np.float64], run: int, wraps: b
             nodes[q + 2 * gap] = 3 * nodes[q + gap] - 3 * nodes[q] + nodes[q - gap]
 
 
-@kernel
+@bare_kernel
 def _surplus(
     nodes: NDArray[np.int32],
     details: NDArray[np.int32],
@@ -202,7 +202,7 @@ def _surplus(
             d[i] = _i32(min(max(f, float(lowest)), float(highest)))
 
 
-@kernel
+@bare_kernel
 def _predict(
     nodes: NDArray[np.int32], details: NDArray[np.int32], midpoints: int, run: int, sign: int, gap: int
 ) -> None:
@@ -222,7 +222,7 @@ def _predict(
         _clamp(n[: run * gap])
 
 
-@kernel
+@bare_kernel
 def _lift(
     nodes: NDArray[np.int32],
     details: NDArray[np.int32],
@@ -247,8 +247,8 @@ def _lift(
             _surplus(nodes, details, wide, midpoints, run, a, b, 1 if inverse else -1, gap)
 
 
-@kernel
-def _step_columns(
+@bare_kernel
+def _step_strips(
     x: NDArray[np.int32],
     pitch: int,
     columns: int,
@@ -259,13 +259,13 @@ def _step_columns(
     a: int,
     b: int,
     inverse: bool,
+    nodes: NDArray[np.int32],
+    details: NDArray[np.int32],
+    wide: NDArray[np.float64],
+    tail: NDArray[np.int32],
 ) -> None:
-    """Step along columns in place: nodes to the first rows, details to those after, or back."""
+    """`_step_columns` with its buffers."""
     coarse = length - midpoints
-    nodes = np.zeros((run + 5) * _STRIP, np.int32)
-    details = np.zeros((midpoints + 20) * _STRIP, np.int32)
-    wide = np.empty(max(nodes.size, details.size), np.float64)
-    tail = np.zeros(_STRIP, np.int32)
     for start in range(0, columns, _STRIP):
         width = min(_STRIP, columns - start)
         for loads in (True, False):
@@ -285,6 +285,27 @@ def _step_columns(
                     _clamp(tail)
 
 
+@kernel
+def _step_columns(
+    x: NDArray[np.int32],
+    pitch: int,
+    columns: int,
+    length: int,
+    midpoints: int,
+    run: int,
+    table: NDArray[np.int64],
+    a: int,
+    b: int,
+    inverse: bool,
+) -> None:
+    """Step along columns in place: nodes to the first rows, details to those after, or back."""
+    nodes = np.zeros((run + 5) * _STRIP, np.int32)
+    details = np.zeros((midpoints + 20) * _STRIP, np.int32)
+    wide = np.empty(max(nodes.size, details.size), np.float64)
+    tail = np.zeros(_STRIP, np.int32)
+    _step_strips(x, pitch, columns, length, midpoints, run, table, a, b, inverse, nodes, details, wide, tail)
+
+
 @inlined
 def _nothing(line: NDArray[np.int32]) -> bool:
     """Whether a row holds zeros only."""
@@ -295,8 +316,8 @@ def _nothing(line: NDArray[np.int32]) -> bool:
     return bool(found == 0)
 
 
-@kernel
-def _step_rows(
+@bare_kernel
+def _step_each_row(
     x: NDArray[np.int32],
     pitch: int,
     rows: int,
@@ -307,12 +328,12 @@ def _step_rows(
     a: int,
     b: int,
     inverse: bool,
+    nodes: NDArray[np.int32],
+    details: NDArray[np.int32],
+    wide: NDArray[np.float64],
 ) -> None:
-    """Step along rows in place, see `_step_columns`."""
+    """`_step_rows` with its buffers."""
     coarse = length - midpoints
-    nodes = np.zeros(run + 5, np.int32)
-    details = np.zeros(midpoints + 20, np.int32)
-    wide = np.empty(max(nodes.size, details.size), np.float64)
     n, d = nodes[2 : run + 2], details[10 : midpoints + 10]
     for row in range(rows):
         line = x[row * pitch : row * pitch + length]
@@ -339,6 +360,26 @@ def _step_rows(
             _copy(d, line[coarse:])
         if run < coarse:
             line[(length if inverse else coarse) - 1] = tail
+
+
+@kernel
+def _step_rows(
+    x: NDArray[np.int32],
+    pitch: int,
+    rows: int,
+    length: int,
+    midpoints: int,
+    run: int,
+    table: NDArray[np.int64],
+    a: int,
+    b: int,
+    inverse: bool,
+) -> None:
+    """Step along rows in place, see `_step_columns`."""
+    nodes = np.zeros(run + 5, np.int32)
+    details = np.zeros(midpoints + 20, np.int32)
+    wide = np.empty(max(nodes.size, details.size), np.float64)
+    _step_each_row(x, pitch, rows, length, midpoints, run, table, a, b, inverse, nodes, details, wide)
 
 
 def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
