@@ -19,9 +19,9 @@ from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
 from .reconstruction import Coded, Progress, Reconstruction
 from .selection import Wish, select
+from .spreading import UNANNOUNCED
 from .surface import Surface
 from .target import Region
-from .tiles import UNANNOUNCED
 from .view import View
 
 __all__ = ["Decoder", "View", "decode"]

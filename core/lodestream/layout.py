@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 from .axis import AxisStep, axis_lengths, axis_step
 from .errors import InputError
 from .surface import Closed
 
-__all__ = ["Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
+__all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
 
+#: Layouts, and tables of their tiles, that are remembered: that of a surface in hand is asked for again and again.
+REMEMBERED = 4
 #: Small grids share their tiles as long as they have no more points together.
 GROUP_POINTS = 1 << 16
 
@@ -157,10 +159,11 @@ class Layout:
         self._shapes = [[grid.shape_at(level) for level in above] for grid in grids]
         self._steps = [[grid.steps_at(level) for level in above] for grid in grids]
 
-    @classmethod
-    def single(cls, shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> Layout:
+    @staticmethod
+    @lru_cache(maxsize=REMEMBERED)
+    def single(shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> Layout:
         """The layout of one block that shares no side."""
-        return cls([Grid(shape, closed)], tile)
+        return Layout([Grid(shape, closed)], tile)
 
     def shape(self, grid: int, level: int) -> tuple[int, int]:
         """Rows and columns of a grid at a level."""

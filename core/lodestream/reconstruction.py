@@ -19,8 +19,9 @@ from .errors import CorruptStreamError
 from .parts import assemble, level_masks
 from .picture import store_values
 from .predictors import COEFFICIENT_BITS
+from .spreading import UNANNOUNCED
 from .target import Region
-from .tiles import UNANNOUNCED, Tiles, TileTable
+from .tiles import Tiles, TileTable
 from .transform import allocate, inverse
 
 __all__ = [

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
-from .bitplanes import code_passes, new_model, reconstruction_point
-from .kernels import inlined, kernel
-from .layout import Band, Layout
-from .quantiser import Quantiser, spread_quantised, step_of
+from .bitplanes import code_passes, new_model
+from .kernels import kernel
+from .layout import REMEMBERED, Band, Layout
+from .quantiser import Quantiser, step_of
+from .spreading import UNANNOUNCED, spread_bands
 
-__all__ = ["UNANNOUNCED", "TileTable", "Tiles", "gather"]
+__all__ = ["TileTable", "Tiles", "gather"]
 
-#: Passes that remain of a tile that was not announced: more than any tile has.
-UNANNOUNCED = 57
 #: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
 _NO_PARENT = (1, 0, 31, 31)
 
@@ -52,8 +52,9 @@ class TileTable:
     windows: NDArray[np.int64]
     of_grid: list[NDArray[np.int64]]
 
-    @classmethod
-    def of(cls, layout: Layout, coordinate: bool = True) -> TileTable:
+    @staticmethod
+    @lru_cache(maxsize=REMEMBERED)
+    def of(layout: Layout, coordinate: bool = True) -> TileTable:
         """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
         rows: list[tuple[int, ...]] = []
         windows: list[tuple[int, int, int]] = []
@@ -82,7 +83,7 @@ class TileTable:
         places = np.array(windows, np.int64).reshape(-1, 3)
         of = [np.array(numbers, np.int64) for numbers in of_grid]
         described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
-        return cls(layout, members, described, first, size + 8, blocks, places, of)
+        return TileTable(layout, members, described, first, size + 8, blocks, places, of)
 
     def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
         """The step of each band, in lattice steps; int64, shape (band,)."""
@@ -178,7 +179,7 @@ class Tiles:
         rows, columns = array.shape
         pitch = array.strides[0] // array.itemsize
         line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        _spread(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
+        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
@@ -229,79 +230,6 @@ def _read(
             trellis,
         )
         start = stop
-
-
-@kernel
-def _spread(
-    known: NDArray[np.int32],
-    sign: NDArray[np.int8],
-    early: NDArray[np.uint8],
-    bands: NDArray[np.int64],
-    windows: NDArray[np.int64],
-    steps: NDArray[np.int64],
-    numbers: NDArray[np.int64],
-    state: NDArray[np.int8],
-    finer: int,
-    fraction: int,
-    out: NDArray[np.int32],
-    pitch: int,
-    first_row: int,
-    first_column: int,
-) -> None:
-    for band in numbers:
-        tile, top, left = windows[band, 0], windows[band, 1] - first_row, windows[band, 2] - first_column
-        passes, shift = int(state[tile]), fraction if tile >= finer else 0
-        width = bands[band, COLUMNS]
-        if steps[band] and passes < UNANNOUNCED:
-            place, row, step = top * pitch + left, bands[band], steps[band]
-            spread_quantised(known, sign, early, row, step, passes, out, place, pitch)
-            continue
-        for i in range(bands[band, ROWS]):
-            start = bands[band, OFFSET] + i * bands[band, STRIDE]
-            target = (top + i) * pitch + left
-            _spread_row(
-                known[start : start + width],
-                sign[start : start + width],
-                early[start : start + width],
-                passes,
-                shift,
-                out[target : target + width],
-            )
-
-
-@inlined
-def _spread_row(
-    magnitudes: NDArray[np.int32],
-    signs: NDArray[np.int8],
-    marks: NDArray[np.uint8],
-    remaining: int,
-    fraction: int,
-    out: NDArray[np.int32],
-) -> None:
-    begun = remaining >> 1  # the plane whose first pass is the last one known, if the number is odd
-    plane = begun + (remaining & 1)
-    shift = np.int32(fraction)
-    if remaining >= UNANNOUNCED:
-        for j in range(out.size):
-            out[j] = 0
-    elif remaining == 0:
-        for j in range(out.size):
-            out[j] = np.int32(np.int32(signs[j]) * magnitudes[j]) << shift
-    elif begun == plane:
-        low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
-        for j in range(out.size):
-            high = np.int32((magnitudes[j] >> low) << low)
-            value = np.int32(high + middle) if high != 0 else np.int32(0)
-            out[j] = np.int32(np.int32(signs[j]) * value) << shift
-    else:
-        low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
-        lower, mark = np.int32(begun), np.uint8(begun + 1)
-        middle_begun = np.int32((1 << begun) + reconstruction_point(begun))
-        for j in range(out.size):
-            high = np.int32((magnitudes[j] >> low) << low)
-            found = np.int32(magnitudes[j] >> lower) if marks[j] == mark else np.int32(0)
-            value = np.int32(high + middle) if high != 0 else middle_begun if found != 0 else np.int32(0)
-            out[j] = np.int32(np.int32(signs[j]) * value) << shift
 
 
 def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:

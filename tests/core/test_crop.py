@@ -19,8 +19,9 @@ from lodestream.layout import Layout
 from lodestream.reach import needed_tiles
 from lodestream.reconstruction import channel_picture
 from lodestream.selection import Wish
+from lodestream.spreading import UNANNOUNCED
 from lodestream.target import Region
-from lodestream.tiles import UNANNOUNCED, Tiles, TileTable, gather
+from lodestream.tiles import Tiles, TileTable, gather
 from lodestream.transform import allocate, forward
 
 if TYPE_CHECKING:

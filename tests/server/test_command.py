@@ -150,11 +150,20 @@ def test_registering_the_command_does_not_load_the_web_framework() -> None:
         "register(argparse.ArgumentParser().add_subparsers());"
         "print([name for name in ('fastapi', 'uvicorn', 'pydantic', 'numba', 'numpy') if name in sys.modules])"
     )
+    assert output_of(code) == "[]\n"
+
+
+def test_what_plans_and_sends_does_not_load_the_compiler() -> None:
+    assert output_of("import sys, lodestream_server.app; print('numba' in sys.modules)") == "False\n"
+
+
+def output_of(code: str) -> str:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=PATIENCE
     )
-    assert done.stdout == "[]\n", done.stderr
+    assert not done.returncode, done.stderr
+    return done.stdout
 
 
 def test_the_public_names_are_there() -> None:
