@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,20 +54,15 @@ class Lanes:
         """Run them all; after KeyboardInterrupt, those that are under way are ended and nothing is told of them."""
         by_name = {wish.part.name: wish for wish in wishes}
         for stage in STAGES:
-            threads = [
-                threading.Thread(target=self._lane, args=([by_name[name] for name in lane if name in by_name],))
-                for lane in stage
-            ]
-            try:
-                for thread in threads:
-                    thread.start()
-                for thread in threads:
-                    thread.join()
-            except KeyboardInterrupt:
-                self._over.set()
-                for thread in threads:
-                    thread.join()
-                raise
+            # Not threads: one whose join is interrupted counts as ended, and would be left behind with its process.
+            with ThreadPoolExecutor(len(stage)) as pool:
+                lanes = [pool.submit(self._lane, [by_name[name] for name in lane if name in by_name]) for lane in stage]
+                try:
+                    for lane in lanes:
+                        lane.result()
+                except BaseException:
+                    self._over.set()  # and the pool waits for all lanes
+                    raise
 
     def _lane(self, wishes: Sequence[Wish]) -> None:
         for wish in wishes:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
+
 from tests.server.helpers import eventually
 from tests.torture import streams
 from tests.torture.lanes import STAGES, Lanes, Wish
@@ -46,8 +48,12 @@ def test_a_run_that_is_interrupted_leaves_what_there_is(tmp_path: Path) -> None:
     page.write_text("# Reliability\n\n## One run\n\nan old one\n")
     with torture(page, "disk", "streams", "--count", "0.05", "--seconds", "disk=0") as process:
         eventually(lambda: "`disk` (requests)" in page.read_text(), "the first part to end")
+        parts = psutil.Process(process.pid).children(recursive=True)
+        assert any("streams" in part.cmdline() for part in parts)
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 130
+    _, left = psutil.wait_procs(parts, timeout=10)
+    assert all(part.status() == psutil.STATUS_ZOMBIE for part in left)  # at most, until somebody asks for them
     text = page.read_text()
     assert text.startswith("# Reliability\n\n## One run\n")
     assert "an old one" not in text
