@@ -67,6 +67,7 @@ class Channel:
                 data,
                 NO_COSTS,
                 False,
+                np.empty(bitplanes.SUMS, np.uint32),
             )
         return tiles, count
 

@@ -51,6 +51,7 @@ from .trellis import ODD, TRANSITIONS
 __all__ = [
     "BLOCK",
     "CONTEXTS",
+    "SUMS",
     "code_passes",
     "new_model",
     "pass_count",
@@ -60,6 +61,8 @@ __all__ = [
 
 #: Rows and columns of a block.
 BLOCK = 8
+#: What is summed up around the coefficients of a block's row, see `_look`.
+SUMS = 3 * BLOCK
 
 _KINDS = 4
 _ACROSS_CONTEXTS = 4 * 5 * 5 * _KINDS
@@ -177,7 +180,7 @@ def _of_state(state: int) -> tuple[int, int, int]:
 
 
 @bare_kernel
-def _code_passes(
+def code_passes(
     decoding: bool,
     bands: NDArray[np.int64],
     first: int,
@@ -193,7 +196,39 @@ def _code_passes(
     trellis: bool,
     sums: NDArray[np.uint32],
 ) -> int:
-    """`code_passes` with room for the ``sums`` of `_look`."""
+    """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
+
+    Parameters
+    ----------
+    decoding : bool
+        Read ``data`` rather than write it.
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
+    known : int32, flat
+        Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
+    sign : int8, flat
+        -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
+    flags : uint8, flat
+        Whether a block has a significant coefficient; updated.
+    early : uint8, flat
+        1 + the plane in whose first pass a coefficient was coded last; updated.
+    true : int32, flat
+        The coefficients with their signs, where writing; not looked at where reading.
+    model : int32, see `new_model`
+        Updated.
+    data : uint8
+        Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
+    costs : float64, at least ``first + 1`` long
+        Where writing, the bits written when each pass ended. May be empty.
+    trellis : bool
+        The coefficients are indices with a trellis, see `trellis`; ``model`` is one of a trellis.
+    sums : uint32, shape (`SUMS`,)
+        Room to work in.
+
+    Returns
+    -------
+    int
+        Bytes of the run, where writing.
+    """
     low, width, place, bit = 0, WIDEST, 0, 0
     if decoding:
         low, place = start(data), 4
@@ -314,59 +349,6 @@ def _code_passes(
         if costs.size:
             costs[number] = 8.0 * place + 32.0 - np.log2(float(width))
     return 0 if decoding else finish(low, width, place, data)
-
-
-@kernel
-def code_passes(
-    decoding: bool,
-    bands: NDArray[np.int64],
-    first: int,
-    last: int,
-    known: NDArray[np.int32],
-    sign: NDArray[np.int8],
-    flags: NDArray[np.uint8],
-    early: NDArray[np.uint8],
-    true: NDArray[np.int32],
-    model: NDArray[np.int32],
-    data: NDArray[np.uint8],
-    costs: NDArray[np.float64],
-    trellis: bool,
-) -> int:
-    """Code the passes ``first`` down to ``last`` of one tile of one channel; plane p has the passes 2 p + 1 and 2 p.
-
-    Parameters
-    ----------
-    decoding : bool
-        Read ``data`` rather than write it.
-    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
-    known : int32, flat
-        Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
-    sign : int8, flat
-        -1, +1, or 0 where no bit is known; updated. Where writing, +-1 must stand in ``true``'s sign.
-    flags : uint8, flat
-        Whether a block has a significant coefficient; updated.
-    early : uint8, flat
-        1 + the plane in whose first pass a coefficient was coded last; updated.
-    true : int32, flat
-        The coefficients with their signs, where writing; not looked at where reading.
-    model : int32, see `new_model`
-        Updated.
-    data : uint8
-        Bytes of this run of passes; where writing, long enough: a bit in a context takes at most 11 bits.
-    costs : float64, at least ``first + 1`` long
-        Where writing, the bits written when each pass ended. May be empty.
-    trellis : bool
-        The coefficients are indices with a trellis, see `trellis`; ``model`` is one of a trellis.
-
-    Returns
-    -------
-    int
-        Bytes of the run, where writing.
-    """
-    sums = np.zeros(24, np.uint32)
-    return _code_passes(
-        decoding, bands, first, last, known, sign, flags, early, true, model, data, costs, trellis, sums
-    )
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The one decorator behind every compiled loop."""
+"""The decorators behind every compiled loop."""
 
 from __future__ import annotations
 

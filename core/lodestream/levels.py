@@ -97,7 +97,8 @@ def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]
         _coarsen_rows(fine, lines, channels, columns.midpoints, columns.run, columns.wraps, table)
     if rows.midpoints:
         fine, lines = lines, np.empty((rows.coarse, lines.shape[1]))
-        _coarsen_columns(fine, lines, rows.midpoints, rows.run, rows.wraps, rows.extension(_REACH))
+        room = np.zeros((rows.midpoints + 2 * _REACH, _STRIP)), np.zeros(_STRIP), np.zeros(_STRIP)
+        _coarsen_columns(fine, lines, rows.midpoints, rows.run, rows.wraps, rows.extension(_REACH), *room)
     if not (rows.midpoints or columns.midpoints):
         lines = lines.copy()
     return lines.reshape(rows.coarse, columns.coarse, *points.shape[2:])
@@ -115,7 +116,7 @@ def _detail(
 
 
 @bare_kernel
-def _coarsen_strips(
+def _coarsen_columns(
     x: NDArray[np.float64],
     out: NDArray[np.float64],
     midpoints: int,
@@ -126,7 +127,11 @@ def _coarsen_strips(
     detail: NDArray[np.float64],
     state: NDArray[np.float64],
 ) -> None:
-    """`_coarsen_columns` with its buffers."""
+    """Nodes of the least-squares optimum along axis 0, strip by strip.
+
+    w is one recursion down the details and one back up, both started 32 details outside, where what is left out weighs
+    less than 1e-24. The last three are room to work in.
+    """
     length, columns = x.shape
     for start in range(0, columns, _STRIP):
         stop = min(start + _STRIP, columns)
@@ -155,24 +160,6 @@ def _coarsen_strips(
         if run < out.shape[0]:
             for j in range(start, stop):
                 out[run, j] = x[length - 1, j]
-
-
-@kernel
-def _coarsen_columns(
-    x: NDArray[np.float64],
-    out: NDArray[np.float64],
-    midpoints: int,
-    run: int,
-    wraps: bool,
-    table: NDArray[np.int64],
-) -> None:
-    """Nodes of the least-squares optimum along axis 0, strip by strip.
-
-    w is one recursion down the details and one back up, both started 32 details outside, where what is left out weighs
-    less than 1e-24.
-    """
-    causal = np.zeros((midpoints + 2 * _REACH, _STRIP))
-    _coarsen_strips(x, out, midpoints, run, wraps, table, causal, np.zeros(_STRIP), np.zeros(_STRIP))
 
 
 @bare_kernel

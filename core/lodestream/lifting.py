@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
-from .kernels import bare_kernel, inlined, kernel
+from .kernels import bare_kernel, inlined
 
 __all__ = ["CLAMP", "REACH", "TAPS", "forward_step", "inverse_step"]
 
@@ -248,7 +248,7 @@ def _lift(
 
 
 @bare_kernel
-def _step_strips(
+def _step_columns(
     x: NDArray[np.int32],
     pitch: int,
     columns: int,
@@ -264,7 +264,10 @@ def _step_strips(
     wide: NDArray[np.float64],
     tail: NDArray[np.int32],
 ) -> None:
-    """`_step_columns` with its buffers."""
+    """Step along columns in place: nodes to the first rows, details to those after, or back.
+
+    The last four are room to work in, see `_step`.
+    """
     coarse = length - midpoints
     for start in range(0, columns, _STRIP):
         width = min(_STRIP, columns - start)
@@ -285,27 +288,6 @@ def _step_strips(
                     _clamp(tail)
 
 
-@kernel
-def _step_columns(
-    x: NDArray[np.int32],
-    pitch: int,
-    columns: int,
-    length: int,
-    midpoints: int,
-    run: int,
-    table: NDArray[np.int64],
-    a: int,
-    b: int,
-    inverse: bool,
-) -> None:
-    """Step along columns in place: nodes to the first rows, details to those after, or back."""
-    nodes = np.zeros((run + 5) * _STRIP, np.int32)
-    details = np.zeros((midpoints + 20) * _STRIP, np.int32)
-    wide = np.empty(max(nodes.size, details.size), np.float64)
-    tail = np.zeros(_STRIP, np.int32)
-    _step_strips(x, pitch, columns, length, midpoints, run, table, a, b, inverse, nodes, details, wide, tail)
-
-
 @inlined
 def _nothing(line: NDArray[np.int32]) -> bool:
     """Whether a row holds zeros only."""
@@ -317,7 +299,7 @@ def _nothing(line: NDArray[np.int32]) -> bool:
 
 
 @bare_kernel
-def _step_each_row(
+def _step_rows(
     x: NDArray[np.int32],
     pitch: int,
     rows: int,
@@ -331,17 +313,18 @@ def _step_each_row(
     nodes: NDArray[np.int32],
     details: NDArray[np.int32],
     wide: NDArray[np.float64],
+    tail: NDArray[np.int32],
 ) -> None:
-    """`_step_rows` with its buffers."""
+    """Step along rows in place, see `_step_columns`."""
     coarse = length - midpoints
     n, d = nodes[2 : run + 2], details[10 : midpoints + 10]
     for row in range(rows):
         line = x[row * pitch : row * pitch + length]
         if _nothing(line):
             continue  # and so are zeros: of a picture on its way, many rows of details
-        tail = line[(coarse if inverse else length) - 1]
+        tail[0] = line[(coarse if inverse else length) - 1]
         if inverse:
-            tail = min(max(tail, -_CLAMP), _CLAMP)
+            _clamp(tail)
             _copy(line[:run], n)
             _copy(line[coarse:], d)
         else:
@@ -359,27 +342,7 @@ def _step_each_row(
             _copy(n, line[:run])
             _copy(d, line[coarse:])
         if run < coarse:
-            line[(length if inverse else coarse) - 1] = tail
-
-
-@kernel
-def _step_rows(
-    x: NDArray[np.int32],
-    pitch: int,
-    rows: int,
-    length: int,
-    midpoints: int,
-    run: int,
-    table: NDArray[np.int64],
-    a: int,
-    b: int,
-    inverse: bool,
-) -> None:
-    """Step along rows in place, see `_step_columns`."""
-    nodes = np.zeros(run + 5, np.int32)
-    details = np.zeros(midpoints + 20, np.int32)
-    wide = np.empty(max(nodes.size, details.size), np.float64)
-    _step_each_row(x, pitch, rows, length, midpoints, run, table, a, b, inverse, nodes, details, wide)
+            line[(length if inverse else coarse) - 1] = tail[0]
 
 
 def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
@@ -420,9 +383,12 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
         return
     pitch = values.strides[0] // values.itemsize
     flat = values.reshape(-1) if pitch == columns else _from_first_to_last(values, (rows - 1) * pitch + columns)
-    kernel_of_axis, across = (_step_columns, columns) if axis == 0 else (_step_rows, rows)
+    kernel_of_axis, across, gap = (_step_columns, columns, _STRIP) if axis == 0 else (_step_rows, rows, 1)
+    nodes, details = (np.zeros(count * gap, np.int32) for count in (step.run + 5, step.midpoints + 20))
+    wide, tail = np.empty(max(nodes.size, details.size), np.float64), np.zeros(gap, np.int32)
+    numbers = step.length, step.midpoints, step.run
     table = step.extension(REACH)
-    kernel_of_axis(flat, pitch, across, step.length, step.midpoints, step.run, table, *predictor, inverse)
+    kernel_of_axis(flat, pitch, across, *numbers, table, *predictor, inverse, nodes, details, wide, tail)
 
 
 def _from_first_to_last(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:

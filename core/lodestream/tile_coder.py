@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import COLUMNS, ROWS
-from .bitplanes import code_passes
+from .bitplanes import SUMS, code_passes
 from .quantiser import Quantiser
 from .tiles import Tiles, TileTable
 
@@ -74,6 +74,7 @@ class TileCoder:
             data,
             np.zeros(0, np.float64) if costs is None else costs,
             tiles.trellis,
+            np.empty(SUMS, np.uint32),
         )
         return data[:length].tobytes()
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
-from .bitplanes import code_passes, new_model
+from .bitplanes import SUMS, code_passes, new_model
 from .kernels import kernel
 from .layout import REMEMBERED, Band, Layout
 from .quantiser import Quantiser, step_of
@@ -209,7 +209,7 @@ def _read(
     data: NDArray[np.uint8],
     trellis: bool,
 ) -> None:
-    truth, costs = np.zeros(0, np.int32), np.zeros(0, np.float64)
+    truth, costs, sums = np.zeros(0, np.int32), np.zeros(0, np.float64), np.empty(SUMS, np.uint32)
     start = 0
     for run in range(runs.shape[0]):
         tile, stop = runs[run, 0], runs[run, 3]
@@ -228,6 +228,7 @@ def _read(
             coded,
             costs,
             trellis,
+            sums,
         )
         start = stop
 
