@@ -11,7 +11,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .aio import Stream, connect, delete, describe, describe_file, fetch_range, identify, list_surfaces, upload
+    from .aio import (
+        Stream,
+        connect,
+        delete,
+        describe,
+        describe_file,
+        fetch_range,
+        identify,
+        list_surfaces,
+        retry,
+        upload,
+    )
     from .aio import list_surfaces as list
     from .errors import SilenceError, UnreachableError
     from .requests import Description, Identity
@@ -30,6 +41,7 @@ _HOMES = {
     "identify": ("aio", "identify"),
     "list": ("aio", "list_surfaces"),
     "list_surfaces": ("aio", "list_surfaces"),
+    "retry": ("aio", "retry"),
     "upload": ("aio", "upload"),
 }
 
@@ -47,6 +59,7 @@ __all__ = [
     "identify",
     "list",
     "list_surfaces",
+    "retry",
     "upload",
 ]
 

@@ -5,27 +5,25 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import warnings
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
 
 import lodestream
-from lodestream.errors import FormatWarning, LodestreamError
+from lodestream.errors import LodestreamError
 
-from .commands import decode, demo, encode, formats, info, pull, push, surfaces
+from .commands import decode, demo, encode, formats, info, pull, push, retry, surfaces
 from .commands.arguments import Subparsers, add_command
-from .commands.output import note
+from .commands.interrupts import exit_code, unwrapping
+from .commands.output import Parser, clean_warnings, note
 
 __all__ = ["build_parser", "main"]
 
-_MODULES = (demo, encode, decode, info, push, pull, surfaces, formats)
+_MODULES = (demo, encode, decode, info, push, retry, pull, surfaces, formats)
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line, with the sub-commands that other packages add through ``lodestream.commands``."""
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
         description="Send structured surfaces coarsest first, refine them, stop early, and know the error.",
         epilog="A path - is standard input or output. Exit code: 0 done, 1 it could not be done, 2 wrong command line.",
@@ -71,39 +69,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = build_parser().parse_args(argv)
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", FormatWarning)
-            warnings.showwarning = partial(_show_warning, warnings.showwarning)
+        with clean_warnings(), unwrapping():
             code: int = args.run(args)
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read our output has seen enough. What is still buffered would raise again when Python exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as interrupt:
+        return exit_code(interrupt)
     except (LodestreamError, OSError) as error:
-        print(f"lodestream: {_one_line(error)}", file=sys.stderr)
+        note(_words(error))
         return 1
     return code
 
 
-def _show_warning(
-    others: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any, **more: Any
-) -> None:
-    """What a file leaves out is a note, not a line of the program."""
-    if issubclass(category, FormatWarning):
-        note(" ".join(str(message).split()))
-    else:
-        others(message, category, *place, **more)
-
-
-def _one_line(error: Exception) -> str:
+def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        text = f"{error.filename}: {error.strerror}"
-    else:
-        text = str(error) or type(error).__name__
-    return " ".join(text.split())
+        return f"{error.filename}: {error.strerror}"
+    return str(error) or type(error).__name__
 
 
 if __name__ == "__main__":

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import ipaddress
-from urllib.parse import urlsplit, urlunsplit
+import re
+from urllib.parse import urljoin, urlsplit, urlunsplit
 
-from lodestream.errors import OptionError
+from lodestream.errors import OptionError, RemoteProtocolError
 
 __all__ = [
     "container_url",
+    "counterpart",
     "is_loopback",
     "is_surface",
     "is_url",
+    "origin",
+    "resolved",
     "same_origin",
     "source_url",
     "stream_url",
@@ -20,6 +24,11 @@ __all__ = [
 ]
 
 _SURFACES = "/v1/surfaces"
+
+_SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
+_PORTS = {"http": 80, "https": 443}
+
+_ADDRESS = re.compile("https?://[!-~]+", re.IGNORECASE)
 
 
 def is_url(text: str) -> bool:
@@ -89,9 +98,61 @@ def container_url(url: str) -> str:
     return f"{surface_url(url)}/container" if is_surface(url) else url
 
 
+def origin(url: str) -> str:
+    """Scheme, host and port of an address: what a token given for it may be sent to, and nothing else.
+
+    A WebSocket counts as the HTTP that it begins as. What is no such address has no origin: an empty text.
+    """
+    try:
+        parts = urlsplit(url)
+        scheme = _SCHEMES.get(parts.scheme, "")
+        port = parts.port or _PORTS.get(scheme, 0)
+    except ValueError:
+        return ""
+    host = parts.hostname or ""
+    if not scheme or not host:
+        return ""
+    host = f"[{host}]" if ":" in host else host
+    return f"{scheme}://{host}" if port == _PORTS[scheme] else f"{scheme}://{host}:{port}"
+
+
 def same_origin(one: str, other: str) -> bool:
-    """Whether two addresses are of one server."""
-    return urlsplit(one)[:2] == urlsplit(other)[:2]
+    """Whether two addresses are of one server: the same scheme, host and port."""
+    return origin(one) == origin(other) != ""
+
+
+def counterpart(given: str, asked: str, landed: str) -> str:
+    """What to give instead of one address, where what was asked below it has led elsewhere.
+
+    Parameters
+    ----------
+    given : str
+        The address of a server, a surface or a file.
+    asked : str
+        What was asked for it: that address itself, or one that begins with it.
+    landed : str
+        Where a redirect led.
+    """
+    base, path, end = urlsplit(given).path.rstrip("/"), urlsplit(asked).path, urlsplit(landed).path
+    below = path.removeprefix(base)
+    return origin(landed) + (end.removesuffix(below) if path.startswith(base) and below else end)
+
+
+def resolved(base: str, address: str) -> str:
+    """An address that a server has told, seen from `base`.
+
+    Raises
+    ------
+    RemoteProtocolError
+        When it is no ``http`` or ``https`` address, written in characters that an address has.
+    """
+    try:
+        found = urljoin(base, address)
+    except ValueError:
+        found = ""
+    if not _ADDRESS.fullmatch(found) or not origin(found):
+        raise RemoteProtocolError(f"expected an address from {base}, got {address!a:.200}")
+    return found
 
 
 def is_loopback(url: str) -> bool:

@@ -14,14 +14,16 @@ Examples
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator, Mapping
+import threading
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from lodestream.target import Tolerance
 
 from . import problems, requests
 from .aio_stream import Stream, connect
-from .bodies import Body, Closure, Source, opened, surface_parameters
+from .answers import Answer, Incoming
+from .bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
 from .requests import Description, Flow, Identity, Progress
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "fetch_range",
     "identify",
     "list_surfaces",
+    "retry",
     "upload",
 ]
 
@@ -52,11 +55,22 @@ async def upload(
     token: str | None = None,
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
 ) -> Description:
-    """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`."""
-    parameters = surface_parameters(sources, precision, rms, closed, name, options, attribute_precision)
+    """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
+
+    A surface in memory is encoded in a thread, and files are read in threads; progress is told from there.
+    """
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {})
+    parcel = await _prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
-    with opened(sources, sent) as body:
-        return await _run(requests.upload(url, parameters, body, wait, progress), url, token)
+    with opened(parcel, sent) as body:
+        return await _run(requests.upload(url, parcel.parameters, body, wait, progress), url, token)
+
+
+async def retry(
+    url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None
+) -> Description:
+    """Have a surface built again that waits, failed or is missing; as `lodestream_client.sync.retry`."""
+    return await _run(requests.retry(url, wait, progress), url, token)
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
@@ -69,9 +83,12 @@ async def describe(url: str, *, token: str | None = None) -> Description:
     return await _run(requests.describe(url), url, token)
 
 
-async def describe_file(url: str, *, token: str | None = None) -> Mapping[str, Any]:
-    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints."""
-    return await _run(requests.describe_file(url), url, token)
+async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
+    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints.
+
+    What a surface of `max_vertices` takes is what the container's tables may, see `connect`.
+    """
+    return await _run(requests.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
@@ -84,16 +101,38 @@ async def delete(url: str, *, token: str | None = None) -> None:
     await _run(requests.delete(url), url, token)
 
 
-async def fetch_range(url: str, offset: int, length: int, *, token: str | None = None) -> bytes:
-    """Bytes of a surface's container, over HTTP."""
-    return await _run(requests.fetch_range(url, offset, length), url, token)
+async def fetch_range(
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = requests.TIMEOUT
+) -> bytes:
+    """Bytes of a surface's container, over HTTP; `timeout` is in seconds, for connecting and for each wait after it."""
+    return await _run(requests.fetch_range(url, offset, length), url, token, timeout)
 
 
-async def _run(flow: Flow[T], url: str, token: str | None) -> T:
+class _GivenUpError(Exception):
+    """Nobody waits for the encoder any more."""
+
+
+async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress | None) -> Parcel:
+    given_up = threading.Event()
+
+    def told(stage: str, fraction: float) -> None:
+        if given_up.is_set():
+            raise _GivenUpError  # a thread cannot be ended from outside, and a program waits for it at its end
+        if progress is not None:
+            progress(stage, fraction)
+
+    try:
+        return await asyncio.to_thread(prepared, sources, asked, told)
+    except asyncio.CancelledError:
+        given_up.set()
+        raise
+
+
+async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = requests.TIMEOUT) -> T:
     import httpx
 
-    answer: httpx.Response | None = None
-    async with httpx.AsyncClient(**requests.client_options(url)) as client:
+    answer: Answer | None = None
+    async with httpx.AsyncClient(**requests.client_options(url, timeout, asynchronous=True)) as client:
         while True:
             try:
                 step = flow.send(answer)
@@ -106,9 +145,13 @@ async def _run(flow: Flow[T], url: str, token: str | None) -> T:
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
-                async with client.stream(content=content, **requests.request_options(step, url, token)) as answer:
-                    if not (step.partial and answer.status_code == 200):
-                        await answer.aread()
+                async with client.stream(content=content, **requests.request_options(step, url, token)) as response:
+                    incoming = Incoming(response, step.most, step.url, url, token)
+                    if not (step.partial and response.status_code == 200):
+                        async for piece in response.aiter_raw():
+                            if not incoming.take(piece):
+                                break
+                answer = incoming.answer()
             except httpx.HTTPError as error:
                 raise problems.from_connection(error, url) from error
 

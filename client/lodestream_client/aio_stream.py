@@ -13,14 +13,14 @@ from lodestream.target import Region, Target
 
 from . import problems
 from .roads import Transport
-from .stream import LONGEST_PROBLEM, PARTS, BaseStream, Received
+from .stream import BaseStream, Received
 
 if TYPE_CHECKING:
     import httpx
     from websockets.asyncio.client import ClientConnection
 
     from lodestream.decoder import View
-    from lodestream.reception import Store
+    from lodestream.reception import Sink, Store
 
 __all__ = ["Stream", "connect"]
 
@@ -30,6 +30,10 @@ class Stream(BaseStream):
 
     It is an asynchronous context manager: entering it opens the connection, leaving it tells the server that no more is
     wanted. `connect` makes it.
+
+    An error that the iteration raises, such as that of a server that is gone, ends the stream and takes nothing away:
+    views until then can be used as before, `decoder` has all that came (``decoder.view()`` is the last whole layer),
+    and `ended` is truncated.
     """
 
     _socket: ClientConnection | None = None
@@ -130,12 +134,14 @@ class Stream(BaseStream):
             return False
 
     async def _dial(self, url: str) -> str | None:
+        from websockets.asyncio.client import ClientConnection
         from websockets.asyncio.client import connect as connect_socket
         from websockets.exceptions import WebSocketException
 
+        options = {**self._socket_options(), "create_connection": self._noting(ClientConnection, url)}
         try:
             # Awaited, not iterated: whether and when a connection is tried again is decided in one place.
-            self._socket = await connect_socket(url, **self._socket_options())
+            self._socket = await connect_socket(url, **options)
         except (OSError, WebSocketException) as error:
             raise problems.from_connection(error, self.url) from error
         return self._socket.subprotocol
@@ -193,18 +199,16 @@ class Stream(BaseStream):
         import httpx
 
         if self._client is None:
-            self._client = httpx.AsyncClient(**self._client_options())
+            self._client = httpx.AsyncClient(**self._client_options(asynchronous=True))
         await self._hang_up()
         request = self._client.build_request("GET", url, headers=self._part_headers(url, headers), timeout=seconds)
         try:
             answer = self._response = await self._client.send(request, stream=True)
-            if answer.status_code not in PARTS:
-                body = bytearray()
-                async for piece in answer.aiter_bytes():
-                    body += piece
-                    if len(body) > LONGEST_PROBLEM:
+            if (incoming := self._begun(answer, url)) is not None:
+                async for piece in answer.aiter_raw():
+                    if not incoming.take(piece):
                         break
-                raise self._refused(answer, bytes(body))
+                raise self._refused(incoming.answer(), str(answer.url))
         except httpx.HTTPError as error:
             raise problems.from_connection(error, self.url) from error
         self._body = answer.aiter_raw()
@@ -242,6 +246,8 @@ def connect(
     container: str | None = None,
     size: int | None = None,
     progress: Received | None = None,
+    sink: Sink | None = None,
+    max_vertices: int | None = None,
 ) -> Stream:
     """The stream of a surface, to be entered with ``async with``.
 
@@ -262,4 +268,6 @@ def connect(
         container=container,
         size=size,
         progress=progress,
+        sink=sink,
+        max_vertices=max_vertices,
     )

@@ -1,4 +1,4 @@
-"""What is uploaded: files opened for sending, counted while they are read."""
+"""What is uploaded: files opened for sending, counted while they are read; what is in memory as a container."""
 
 from __future__ import annotations
 
@@ -6,29 +6,36 @@ import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeAlias, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from lodestream.errors import InputError, OptionError
 from lodestream.target import Tolerance
 
+from .memory import Asked, Closure, encoded, in_memory
+
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from lodestream.surface import Surface
 
-__all__ = ["Body", "Closure", "Source", "opened", "surface_parameters"]
+__all__ = ["Asked", "Body", "Closure", "Parcel", "Source", "opened", "prepared"]
 
-#: What can be uploaded: a file by its name, one that is open, the bytes of one, or a surface in memory.
-Source: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes | Surface"
-#: Which axes of a grid wrap, in the words of the command line.
-Closure = Literal["auto", "none", "rows", "cols", "both"]
+File: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes"
+#: What can be uploaded: a file by its name, one that is open, the bytes of one, or a surface in memory: all that
+#: `lodestream.encode` takes.
+Source: TypeAlias = "File | Surface | ArrayLike"
 
-_CLOSURES: Mapping[tuple[bool, bool], Closure] = {
-    (False, False): "none",
-    (True, False): "rows",
-    (False, True): "cols",
-    (True, True): "both",
-}
 _CHUNK = 64 * 1024
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """What is sent: files, each with the name that it has unless its own is known, and the query of the upload."""
+
+    files: tuple[tuple[str, File], ...]
+    parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
 
 
 class Body:
@@ -87,95 +94,80 @@ def _length(file: BinaryIO) -> int:
     return end
 
 
+def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, float], None] | None) -> Parcel:
+    """Get ready what is to be uploaded; a surface in memory is encoded, which takes its time.
+
+    Raises
+    ------
+    OptionError
+        When there is nothing to send, an option has a value that it does not take, both a precision and an RMS error
+        are given, or there are options of a format for what is in memory.
+    InputError
+        When a source is of another kind, a surface in memory is not alone, or it cannot be encoded.
+    """
+    if not sources:
+        raise OptionError("expected at least one file to upload, got none")
+    kinds = [in_memory(source) for source in sources]
+    if any(kinds):
+        if len(sources) > 1:
+            raise InputError(f"expected one surface in memory by itself, got it among {len(sources)} sources")
+        return Parcel((("surface.lode", encoded(sources[0], asked, progress)),))
+    return Parcel(tuple(("", cast("File", source)) for source in sources), _parameters(asked))
+
+
 @contextmanager
-def opened(sources: Sequence[Source], sent: Callable[[float], None] | None = None) -> Iterator[Body]:
+def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Iterator[Body]:
     """Open what is to be uploaded.
 
     Raises
     ------
     OptionError
-        When there is nothing to send.
-    InputError
-        When a surface in memory is more than one array.
+        When there are options for a container, which says all that they could say itself.
     OSError
         When a file cannot be opened.
     """
-    if not sources:
-        raise OptionError("expected at least one file to upload, got none")
     with ExitStack() as stack:
         files: list[tuple[str, BinaryIO]] = []
-        for source in sources:
-            if isinstance(source, bytes):
-                files.append(("", io.BytesIO(source)))
-            elif isinstance(source, str | os.PathLike):
+        for name, source in parcel.files:
+            if isinstance(source, str | os.PathLike):
                 path = Path(source)
                 files.append((path.name, stack.enter_context(path.open("rb"))))
-            elif _is_surface(source):
-                files.append(("surface.npy", _as_npy(source)))
+            elif isinstance(source, bytes | bytearray | memoryview):
+                files.append((name, io.BytesIO(source)))
             else:
-                files.append(("", cast("BinaryIO", source)))
+                files.append((name, source))
+        options = [option for option in parcel.parameters if option != "name"]
+        if options and any(_is_container(file) for _, file in files):
+            raise OptionError(f"expected no {options[0]} for a container (.lode), which says it already")
         yield Body(files, sent)
 
 
-def _is_surface(source: Source) -> TypeGuard[Surface]:
-    """Whether this is a surface in memory; known without importing what surfaces are made of."""
-    return hasattr(type(source), "attributes")
-
-
-def _as_npy(surface: Surface) -> BinaryIO:
-    import numpy as np
-
-    points = surface.points  # refused where there are several blocks
-    if surface.attributes:
-        raise InputError("expected points alone, which can be sent from memory, got attributes; write them to a file")
-    if surface.mask is not None:
-        if points.dtype.kind != "f":
-            raise InputError(f"expected NaN for holes, got a mask of {points.dtype} points; write them to a file")
-        points = points.copy()
-        points[~surface.mask] = np.nan
-    file = io.BytesIO()
-    np.save(file, points, allow_pickle=False)
+def _is_container(file: BinaryIO) -> bool:
     file.seek(0)
-    return file
+    head = file.read(8)
+    if not head.startswith(b"\x89"):
+        return False
+    from lodestream.container.sections import MAGIC  # only where it may be one
+
+    return head.startswith(MAGIC)
 
 
-def surface_parameters(
-    sources: Sequence[Source],
-    precision: Tolerance | float | str | None,
-    rms: Tolerance | float | str | None,
-    closed: Closure,
-    name: str | None,
-    options: Mapping[str, str] | None,
-    attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
-) -> dict[str, str | list[str]]:
-    """The query of an upload.
-
-    A surface in memory tells its own closure and name, unless others are given.
-
-    Raises
-    ------
-    OptionError
-        When the precision or the error is not a tolerance, both are given, or an option of the format has the name of
-        one of the query's own.
-    """
+def _parameters(asked: Asked) -> dict[str, str | list[str]]:
+    """The query of an upload."""
     parameters: dict[str, str | list[str]] = {}
-    for source in sources:
-        if _is_surface(source):
-            closed = _CLOSURES[source.closed] if closed == "auto" else closed
-            name = name or source.metadata.get("name")
-    if precision is not None and rms is not None:
+    if asked.precision is not None and asked.rms is not None:
         raise OptionError("expected either a precision or a root mean square error, got both")
-    precisions = [] if precision is None else [_tolerance(precision)]
-    precisions += [f"{attribute}={_tolerance(value)}" for attribute, value in (attribute_precision or {}).items()]
+    precisions = [] if asked.precision is None else [_tolerance(asked.precision)]
+    precisions += [f"{attribute}={_tolerance(value)}" for attribute, value in asked.attribute_precision.items()]
     if precisions:
         parameters["precision"] = precisions
-    if rms is not None:
-        parameters["rms"] = _tolerance(rms)
-    if closed != "auto":
-        parameters["closed"] = closed
-    if name:
-        parameters["name"] = name
-    for key, value in (options or {}).items():
+    if asked.rms is not None:
+        parameters["rms"] = _tolerance(asked.rms)
+    if asked.closed != "auto":
+        parameters["closed"] = asked.closed
+    if asked.name:
+        parameters["name"] = asked.name
+    for key, value in asked.options.items():
         if key in ("precision", "rms", "closed", "name", "filename"):
             raise OptionError(f"{key} is not an option of a format")
         parameters[key] = value

@@ -3,24 +3,30 @@
 One file for each container, a log: a head, then a record for each piece of the container that came, with its place, its
 length and a checksum over all three. A piece is written at once and nothing that stands is ever changed, so a program
 that is killed loses nothing, and a machine that loses power loses at most what does not match its checksum.
+
+What a container is called comes from a server. So a name is 64 hexadecimal digits or refused, no symbolic link is
+followed, and no file is written or removed that does not begin as ours do.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
+import re
+import stat
 import struct
 import time
 import zlib
 from bisect import bisect_right, insort
 from pathlib import Path
 
-from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import InputError, LodestreamError
 from lodestream.ranges import RangeSet
 
-__all__ = ["Part", "cache_folder", "forget_old"]
+__all__ = ["Part", "cache_folder", "forget_old", "is_name"]
 
 _MAGIC = b"LODEPART"
 _VERSION = 1
@@ -29,11 +35,24 @@ _RECORD = struct.Struct("<QII")  # offset, length, CRC-32 of both and of the dat
 
 _DAYS_KEPT = 30
 
+_NAME = re.compile(r"[0-9a-f]{64}")
+# Not a link, and not a wait for whoever is at the other end of what is no file.
+_OPENING = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+class _TakenError(Exception):
+    """Another program has the file open."""
+
 
 def cache_folder() -> Path:
     """The folder of ``LODESTREAM_CACHE``, or the user's own for such things."""
     chosen = os.environ.get("LODESTREAM_CACHE")
     return Path(chosen) if chosen else user_cache_path("lodestream", appauthor=False)
+
+
+def is_name(name: object) -> bool:
+    """Whether a container can be called so: 64 hexadecimal digits, as a SHA-256 is written."""
+    return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
 class Part:
@@ -42,45 +61,48 @@ class Part:
     Parameters
     ----------
     folder : Path
-        Made when it is not there.
+        Made, for the user alone, when it is not there.
     name : str
-        What the container is known by.
+        What the container is known by: 64 hexadecimal digits.
     size : int
         Bytes of the container.
 
     Attributes
     ----------
+    folder : Path
     ranges : RangeSet
         What is kept.
     discarded : bool
-        Whether closing removes it.
+        Whether closing removes it. What holds nothing is removed in any case.
 
     Raises
     ------
+    InputError
+        When the name is another.
     LodestreamError
         When another program has it open.
     OSError
-        When the folder cannot be written.
+        When the folder cannot be written, or what stands there under this name is none of these files: a symbolic
+        link, a file of another user or with other content. It is left as it is.
     """
 
     def __init__(self, folder: Path, name: str, size: int) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        if not is_name(name):
+            raise InputError(f"expected a container's name of 64 hexadecimal digits, got {name!a}")
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder = folder
         self._path = folder / f"{name}.part"
-        self._lock = FileLock(folder / f"{name}.lock")
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise LodestreamError(
-                f"another program is receiving the same surface into {folder}; wait for it, or do without --resume"
-            ) from None
         self.ranges = RangeSet()
         self.discarded = False
         self._pieces: list[tuple[int, int, int]] = []  # offset, length, place in the file
         try:
-            self._handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
+            self._handle = _held(self._path, os.O_CREAT)
+        except _TakenError:
+            raise LodestreamError(f"another program is receiving the same surface into {folder}") from None
+        try:
             self._end = self._recover(size)
         except BaseException:
-            self._lock.release()
+            os.close(self._handle)
             raise
 
     def read(self, offset: int, length: int) -> bytes:
@@ -108,10 +130,10 @@ class Part:
 
     def close(self) -> None:
         """Let others have it, or remove it."""
-        if self.discarded:
+        if self.discarded or not self.ranges.total:
+            # Whoever opens it just now finds that it has no name any more, and makes another.
             self._path.unlink(missing_ok=True)
         os.close(self._handle)
-        self._lock.release()
 
     def _add(self, offset: int, length: int, place: int) -> None:
         insort(self._pieces, (offset, length, place))
@@ -145,17 +167,63 @@ class Part:
 
 
 def forget_old(folder: Path) -> None:
-    """Remove what nobody has come back to for a month."""
+    """Remove what nobody has come back to for a month; other files in the folder are left alone."""
     if not folder.is_dir():
         return
     before = time.time() - _DAYS_KEPT * 24 * 3600
     for path in folder.glob("*.part"):
         try:
-            if path.stat().st_mtime < before:
-                with FileLock(path.with_suffix(".lock"), timeout=0):
-                    path.unlink(missing_ok=True)
-        except (OSError, Timeout):
+            if not is_name(path.stem) or path.lstat().st_mtime >= before:
+                continue
+            handle = _held(path)
+        except (OSError, _TakenError):
             continue
+        try:
+            path.unlink(missing_ok=True)
+        finally:
+            os.close(handle)
+
+
+def _held(path: Path, create: int = 0) -> int:
+    """Open a file of ours, locked until it is closed.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened, or is not ours.
+    """
+    while True:
+        handle = os.open(path, _OPENING | create, 0o600)
+        try:
+            _check_ours(handle, path)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise _TakenError from None
+            if _is_at(handle, path):
+                return handle
+            # It was removed by whoever held it. Without O_CREAT the next attempt finds none.
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _check_ours(handle: int, path: Path) -> None:
+    """Refuse what is no file that this program made, before anything is done to it."""
+    found = os.fstat(handle)
+    own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
+    # A program that was killed may have left less than a head.
+    if not own or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
+        raise FileExistsError(errno.EEXIST, "not a file that an earlier pull left; it is left alone", str(path))
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether this is still the file of that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.lstat())
+    except FileNotFoundError:
+        return False
 
 
 def _checksum(offset: int, data: bytes) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import ssl
 from collections.abc import Mapping
 from typing import Any
@@ -20,7 +19,10 @@ from lodestream.errors import (
     TruncatedStreamError,
     UnsupportedVersionError,
 )
+from lodestream.messages import CODES
 
+from . import addresses
+from .answers import parse
 from .errors import SilenceError, UnreachableError
 
 __all__ = ["NoStreamError", "blocks_sockets", "elsewhere", "from_code", "from_connection", "from_response", "passes"]
@@ -50,6 +52,10 @@ _PASSING = {"restarting", "idle", "busy", "too-many", "internal"}
 _PASSING |= {f"http-{status}" for status in (408, 425, 429, 500, 502, 503, 504)}
 
 
+# What is answered to the handshake of a WebSocket that has lost its Upgrade, or the subprotocol, on its way.
+_NO_HANDSHAKE = {400, 404, 405, 426}
+
+
 class NoStreamError(RemoteProtocolError):
     """What answers is a WebSocket that carries no streams."""
 
@@ -77,6 +83,8 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
     message = str(detail)[:_LONGEST] if detail else f"the server answered {status} {reason} for {url}"
     code = document.get("code")
     if isinstance(code, str):
+        if status >= 500 and detail and document.get("title") not in (None, detail):
+            message = f"{document['title']}: {message}"[:_LONGEST]  # the detail may be no more than where to look
         return from_code(code, message)
     return _BY_STATUS[status](message) if status in _BY_STATUS else RemoteError(f"http-{status}", message)
 
@@ -90,7 +98,7 @@ def passes(error: LodestreamError) -> bool:
 
 def elsewhere(error: LodestreamError) -> bool:
     """Whether the same attempt may go well at another address."""
-    return not isinstance(error, OptionError | CorruptStreamError | UnsupportedVersionError)
+    return not isinstance(error, OptionError | CorruptStreamError | TooLargeError | UnsupportedVersionError)
 
 
 def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
@@ -102,10 +110,14 @@ def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
 
     cause = error.__cause__
     if isinstance(cause, ws.InvalidStatus):
-        return "code" not in _document(bytes(cause.response.body or b""))
+        # A server that is asked for a stream by a plain GET, since something between took the rest of the handshake
+        # away, knows no such path. What else it says in its own words it would say by the other road too.
+        code = _document(bytes(cause.response.body or b"")).get("code")
+        own = isinstance(code, str) and code in CODES
+        return not own or cause.response.status_code in _NO_HANDSHAKE
     if _broke_off(error):
         return not met
-    return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake)
+    return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake | ws.InvalidURI)
 
 
 def _broke_off(error: BaseException) -> bool:
@@ -122,10 +134,9 @@ def _broke_off(error: BaseException) -> bool:
 
 def _document(body: bytes) -> Mapping[str, Any]:
     try:
-        document = json.loads(body)
+        return parse(body)
     except ValueError:  # also what is not UTF-8
         return {}
-    return document if isinstance(document, dict) else {}
 
 
 def from_connection(error: Exception, url: str) -> LodestreamError:
@@ -138,6 +149,9 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
     if isinstance(error, ws.InvalidStatus):
         response = error.response
         return from_response(response.status_code, response.reason_phrase, bytes(response.body or b""), url)
+    if isinstance(error, ws.InvalidURI):  # ours is one
+        use = addresses.counterpart(url, addresses.stream_url(url), error.uri)
+        return RemoteProtocolError(f"{url} redirects its stream to what is no WebSocket's address; use {use}")
     if isinstance(error, (ws.InvalidHandshake, httpx.RemoteProtocolError, httpx.DecodingError)):
         return RemoteProtocolError(f"{url} does not answer like a Lodestream server: {error}")
     if isinstance(error, (ssl.SSLError, ssl.CertificateError)):

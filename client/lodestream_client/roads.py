@@ -12,7 +12,7 @@ from typing import Literal
 
 from tenacity import RetryCallState, Retrying, wait_random_exponential
 
-from lodestream.errors import LodestreamError, OptionError
+from lodestream.errors import LodestreamError, NotFoundError, OptionError
 
 from . import addresses, problems
 
@@ -101,7 +101,9 @@ class Roads:
         if place.road == "ws" and "http" in place.allowed and problems.blocks_sockets(error, met=self.met):
             place.road, place.blocked = "http", error
             return 0.0
-        if place.road == "http" and place.blocked is not None and not self.met:
+        # A wrong address is one by either road.
+        twice = isinstance(error, NotFoundError) and isinstance(place.blocked, NotFoundError)
+        if place.road == "http" and place.blocked is not None and not self.met and not twice:
             error.args = (f"{error} (and by WebSocket: {place.blocked})", *error.args[1:])
         self._current = (number + 1) % len(self._places)
         if not problems.passes(error):

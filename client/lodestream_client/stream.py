@@ -14,16 +14,25 @@ from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from lodestream.download import Download, Ended
-from lodestream.errors import LodestreamError, RemoteError, RemoteProtocolError, TruncatedStreamError
+from lodestream.errors import (
+    InputError,
+    LodestreamError,
+    NotFoundError,
+    RemoteError,
+    RemoteProtocolError,
+    TruncatedStreamError,
+)
 from lodestream.messages import MAX_MESSAGE, MIN_WINDOW, SUBPROTOCOL
 from lodestream.opening import OPENED, to_address
 from lodestream.range_download import RangeDownload
-from lodestream.reception import Reception, Store
+from lodestream.reception import Reception, Sink, Store
 from lodestream.target import Region, Target
 
-from . import addresses, problems, requests
+from . import addresses, answers, problems, requests
+from .answers import Answer, Incoming
 from .errors import SilenceError
 from .pacing import Link, window_for
+from .requests import Identity, identity_of_file
 from .roads import Roads, Transport
 
 if TYPE_CHECKING:
@@ -33,13 +42,10 @@ if TYPE_CHECKING:
     from lodestream.messages import Header
     from lodestream.reception import DownloadEvent
 
-__all__ = ["LONGEST_PROBLEM", "PARTS", "BaseStream", "Received"]
+__all__ = ["PARTS", "BaseStream", "Received"]
 
 #: Statuses of answers that say something of the file asked for; with others, the body says what is wrong.
 PARTS = {200, 206, 416}
-
-#: The most of such a body that is read.
-LONGEST_PROBLEM = 64 * 1024
 
 #: Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is None
 #: until it is known.
@@ -80,6 +86,8 @@ class BaseStream:
         container: str | None,
         size: int | None,
         progress: Received | None,
+        sink: Sink | None,
+        max_vertices: int | None,
     ) -> None:
         self._roads = Roads([url] if isinstance(url, str) else url, transport, deadline)
         self.silence = silence
@@ -87,7 +95,9 @@ class BaseStream:
         self._close_timeout = close_timeout
         self._link = Link(limit_rate) if limit_rate is not None else None
         self._window = window_for(limit_rate) if window is None and limit_rate is not None else window
-        self._reception = Reception(target, store=store, container=container, size=size)
+        self._reception = Reception(
+            target, store=store, container=container, size=size, sink=sink, max_vertices=max_vertices
+        )
         self.target = self._reception.target
         self._progress = progress
         self._download: Download | None = None
@@ -98,8 +108,10 @@ class BaseStream:
         self._stopped = False
         self._turns = 0  # how often the focus has changed
         self._abandoned = False
+        self._truncated = False
         self._close_by: float | None = None
         self._connections = 0
+        self._withheld = ""  # what to say of a token that a redirect did not take along
         self._way: Way = self._travel()
         self._answer: Any = None
 
@@ -128,6 +140,15 @@ class BaseStream:
     def header(self) -> Header | None:
         """What the server said first over the WebSocket: the container's hash and size, and how much is planned."""
         return self._download.header if self._download is not None else None
+
+    @property
+    def identity(self) -> Identity:
+        """What the container is known by, as far as the server has told."""
+        container, size = self._reception.container, self._reception.size
+        if container is not None:
+            return Identity(container, container, size)
+        download = self._parts.get(self.url)
+        return identity_of_file(self.url, download.version if download is not None else None, size)
 
     @property
     def planned(self) -> int | None:
@@ -166,7 +187,12 @@ class BaseStream:
 
     @property
     def ended(self) -> str | None:
-        """Why nothing more comes: complete, level, rms, max, bytes, seconds or stopped; None while more may come."""
+        """Why nothing more comes; None while more may come.
+
+        complete, level, rms, max, bytes or seconds, as the target says; stopped by this side; truncated by an error.
+        """
+        if self._reception.ended is None and self._truncated:
+            return "truncated"
         if self._reception.ended is None and self._abandoned:
             return "stopped"
         return self._reception.ended
@@ -214,16 +240,22 @@ class BaseStream:
     def _travel(self) -> Way:
         self._roads.start(time.monotonic())
         while True:
-            before = self._reception.held.total
+            before, self._withheld = self._reception.held.total, ""
             try:
                 yield from self._by_socket() if self._roads.place.road == "ws" else self._by_parts()
                 return
             except LodestreamError as error:
+                if isinstance(error, RemoteError | InputError | NotFoundError):
+                    error.args = (f"{error}{self._withheld}", *error.args[1:])
                 yield self._drop()
                 if self._over():
                     return
                 progressed = self._reception.held.total > before
-                pause = self._roads.failed(error, time.monotonic(), progressed=progressed)
+                try:
+                    pause = self._roads.failed(error, time.monotonic(), progressed=progressed)
+                except LodestreamError:
+                    self._truncated = True
+                    raise
             left = self._reception.tick(time.monotonic())
             yield self._wait(pause if left is None else min(pause, left))
             if self._over():
@@ -403,8 +435,22 @@ class BaseStream:
             options["proxy"] = None
         return options
 
-    def _client_options(self) -> dict[str, Any]:
-        return requests.client_options(self.url)
+    def _client_options(self, asynchronous: bool) -> dict[str, Any]:
+        return requests.client_options(self.url, asynchronous=asynchronous, home=lambda: self.url)
+
+    def _noting(self, make: Callable[..., Any], asked: str) -> Callable[..., Any]:
+        """What makes a WebSocket's connections, one for each redirect, and notes where they lead."""
+
+        def noted(*given: Any, **options: Any) -> Any:
+            connection = make(*given, **options)
+            uri = connection.protocol.uri
+            self._arrived(asked, f"{'wss' if uri.secure else 'ws'}://{_bracketed(uri.host)}:{uri.port}{uri.path}")
+            return connection
+
+        return noted
+
+    def _arrived(self, asked: str, landed: str) -> None:
+        self._withheld = answers.withheld(self._token, self.url, asked, landed)
 
     def _part_headers(self, url: str, headers: dict[str, str]) -> dict[str, str]:
         # The token is only for the server itself, wherever an answer may point.
@@ -417,9 +463,16 @@ class BaseStream:
             f"expected more of the stream, but {self.url} has sent nothing for {self.silence:g} seconds"
         )
 
-    def _refused(self, answer: httpx.Response, body: bytes) -> LodestreamError:
+    def _begun(self, response: httpx.Response, asked: str) -> Incoming | None:
+        """What reads an answer that has come as far as its headers; None where it is read as part of the container."""
+        self._arrived(asked, str(response.url))
+        if response.status_code in PARTS:
+            return None
+        return Incoming(response, answers.LONGEST_PROBLEM, asked, self.url, None)
+
+    def _refused(self, answer: Answer, url: str) -> LodestreamError:
         """The error that an answer over HTTP stands for."""
-        return problems.from_response(answer.status_code, answer.reason_phrase, body, str(answer.url))
+        return problems.from_response(answer.status, answer.reason, answer.content, url)
 
     def _broke(self, error: Exception) -> LodestreamError:
         """The error that a broken answer over HTTP stands for."""
@@ -444,3 +497,7 @@ class BaseStream:
             except RemoteError as refusal:
                 raise problems.from_code(refusal.code, str(refusal)) from error
         raise problems.from_connection(error, self.url) from error
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

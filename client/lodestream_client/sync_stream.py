@@ -15,14 +15,14 @@ from lodestream.target import Region, Target
 
 from . import problems
 from .roads import Transport
-from .stream import LONGEST_PROBLEM, PARTS, BaseStream, Received
+from .stream import BaseStream, Received
 
 if TYPE_CHECKING:
     import httpx
     from websockets.sync.client import ClientConnection
 
     from lodestream.decoder import View
-    from lodestream.reception import Store
+    from lodestream.reception import Sink, Store
 
 __all__ = ["Stream", "connect"]
 
@@ -31,6 +31,10 @@ class Stream(BaseStream):
     """One surface being received; iterate over it for a `View` per layer.
 
     It is a context manager: leaving it tells the server that no more is wanted. `connect` makes it.
+
+    An error that the iteration raises, such as that of a server that is gone, ends the stream and takes nothing away:
+    views until then can be used as before, `decoder` has all that came (``decoder.view()`` is the last whole layer),
+    and `ended` is truncated.
     """
 
     _socket: ClientConnection | None = None
@@ -65,8 +69,11 @@ class Stream(BaseStream):
     ) -> None:
         if kind is None:
             self.close()
-        else:
-            self._abandon()
+            return
+        if isinstance(error, KeyboardInterrupt):
+            # Whoever sits there waits for the end: no time for taking leave of a server that may be silent.
+            self._drop()
+        self._abandon()
 
     def stop(self) -> None:
         """Ask for no more, at once: no further view is yielded.
@@ -125,11 +132,13 @@ class Stream(BaseStream):
 
     def _dial(self, url: str) -> str | None:
         from websockets.exceptions import WebSocketException
+        from websockets.sync.client import ClientConnection
         from websockets.sync.client import connect as connect_socket
 
+        options = {**self._socket_options(), "create_connection": self._noting(ClientConnection, url)}
         # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
         try:
-            self._socket = self._held.enter_context(connect_socket(url, **self._socket_options()))
+            self._socket = self._held.enter_context(connect_socket(url, **options))
         except (OSError, WebSocketException) as error:
             raise problems.from_connection(error, self.url) from error
         return self._socket.subprotocol
@@ -186,19 +195,17 @@ class Stream(BaseStream):
         import httpx
 
         if self._client is None:
-            self._client = httpx.Client(**self._client_options())
+            self._client = httpx.Client(**self._client_options(asynchronous=False))
         self._held.close()
         try:
             answer = self._held.enter_context(
                 self._client.stream("GET", url, headers=self._part_headers(url, headers), timeout=seconds)
             )
-            if answer.status_code not in PARTS:
-                body = bytearray()
-                for piece in answer.iter_bytes():
-                    body += piece
-                    if len(body) > LONGEST_PROBLEM:
+            if (incoming := self._begun(answer, url)) is not None:
+                for piece in answer.iter_raw():
+                    if not incoming.take(piece):
                         break
-                raise self._refused(answer, bytes(body))
+                raise self._refused(incoming.answer(), str(answer.url))
         except httpx.HTTPError as error:
             raise problems.from_connection(error, self.url) from error
         self._body = answer.iter_raw()
@@ -231,6 +238,8 @@ def connect(
     container: str | None = None,
     size: int | None = None,
     progress: Received | None = None,
+    sink: Sink | None = None,
+    max_vertices: int | None = None,
 ) -> Stream:
     """Open the stream of a surface.
 
@@ -267,6 +276,12 @@ def connect(
     progress : callable or None
         Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is
         None until it is known.
+    sink : callable or None
+        Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come, before they
+        are decoded; `Stream.identity` says of which container.
+    max_vertices : int or None
+        What the surface may have at most, told from its header before memory is taken for it; 128 bytes are allowed for
+        each, whatever they are of. None for what suits the memory that this process can have.
 
     Returns
     -------
@@ -278,6 +293,8 @@ def connect(
         When there is no connection.
     NotFoundError, RemoteError, RemoteProtocolError
         When the server refuses, or is none.
+    TooLargeError
+        When the surface takes more memory than it may.
     """
     stream = Stream(
         url,
@@ -293,6 +310,8 @@ def connect(
         container=container,
         size=size,
         progress=progress,
+        sink=sink,
+        max_vertices=max_vertices,
     )
     stream._open()
     return stream

@@ -7,17 +7,20 @@ in common: the first of them holds it.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
+from heapq import heappop, heappush
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .joints import Groups
 from .layout import Grid, Source
 from .sides import Arrangement, Part, Side
 from .surface import Closed
 
-__all__ = ["VertexCounter", "covers", "grids_of"]
+__all__ = ["VertexCounter", "covers", "grids_of", "shared_points"]
 
 
 def grids_of(arrangement: Arrangement) -> list[Grid]:
@@ -110,6 +113,32 @@ class VertexCounter:
         self._known.update(held)
 
 
+def shared_points(arrangement: Arrangement, shapes: Sequence[tuple[int, int]]) -> Groups:
+    """The points of blocks of these shapes that are one, since they are the same point of a curve.
+
+    They are numbered over all blocks, one after another, each in row order.
+    """
+    starts = np.cumsum([0, *(height * width for height, width in shapes)], dtype=np.int64)
+    curves = starts[-1] + np.cumsum([0, *(curve.length for curve in arrangement.curves)], dtype=np.int64)
+    pairs = [np.empty((0, 2), np.int64)]
+    for part in arrangement.parts:
+        shape = shapes[part.block]
+        rows, columns = (
+            np.arange(*window, dtype=np.int64)[:: -1 if flipped else 1] % length
+            for window, flipped, length in zip((part.rows, part.columns), part.flipped, shape, strict=True)
+        )
+        lines = (rows[:1], columns), (rows[-1:], columns), (rows, columns[:1]), (rows, columns[-1:])
+        for side, (down, right) in zip(part.sides, lines, strict=True):
+            if side is not None:
+                points = starts[part.block] + (down * shape[1] + right)
+                along = np.arange(points.size)[:: -1 if side.reversed else 1]
+                along = np.minimum(along, arrangement.curves[side.curve].length - 1)  # all of a pole are one
+                pairs.append(np.stack([points, curves[side.curve] + along], axis=-1))
+    found = Groups.of(np.concatenate(pairs))
+    real = found.points < starts[-1]  # the points of curves have but helped
+    return Groups.of(np.stack([found.points[real], found.firsts[real]], axis=-1))
+
+
 def covers(shape: tuple[int, int], closed: Closed, parts: Sequence[Part]) -> bool:
     """Whether parts of a block cover each of its cells once; along a closed axis the last cells wrap."""
     cells = [
@@ -120,9 +149,26 @@ def covers(shape: tuple[int, int], closed: Closed, parts: Sequence[Part]) -> boo
     ]
     whole = [n if wraps else max(n - 1, 1) for n, wraps in zip(shape, closed, strict=True)]
     area = sum((b - a) * (d - c) for (a, b), (c, d) in cells)
-    return area == whole[0] * whole[1] and not any(
-        a < f and e < b and c < h and g < d for k, ((a, b), (c, d)) in enumerate(cells) for (e, f), (g, h) in cells[:k]
-    )
+    return area == whole[0] * whole[1] and not _overlap(cells)
+
+
+def _overlap(cells: list[tuple[tuple[int, int], tuple[int, int]]]) -> bool:
+    """Whether any two rectangles, each (rows, columns), have a cell in common.
+
+    Row after row the columns that are taken are kept in order, so that each is compared with two others: there may be
+    tens of thousands.
+    """
+    taken: list[tuple[int, int]] = []
+    ends: list[tuple[int, tuple[int, int]]] = []
+    for (first, last), columns in sorted(cells):
+        while ends and ends[0][0] <= first:
+            taken.pop(bisect_left(taken, heappop(ends)[1]))
+        place = bisect_left(taken, columns)
+        if (place < len(taken) and taken[place][0] < columns[1]) or (place and taken[place - 1][1] > columns[0]):
+            return True
+        taken.insert(place, columns)
+        heappush(ends, (last, columns))
+    return False
 
 
 def _cells(length: int, wraps: bool, closed: bool, window: tuple[int, int]) -> Iterator[tuple[int, int]]:

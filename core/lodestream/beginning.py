@@ -20,6 +20,7 @@ __all__ = ["in_file_order", "sure"]
 
 _SIGNATURE = len(sections.MAGIC) + 1
 _LONGEST_START = 10
+_BEGINNING = (sections.HEADER, sections.MASKS, sections.KEPT_MASKS, sections.LAYER)
 
 
 def in_file_order(target: Target) -> bool:
@@ -52,7 +53,7 @@ def sure(target: Target, decoder: Decoder, position: int, run: int, read: Callab
         return _SIGNATURE if run >= _SIGNATURE else 0
     start = read(position, min(run, _LONGEST_START))
     extent = section_extent(start, position)
-    if extent is None or run < extent[1] or start[0] not in (sections.HEADER, sections.MASKS, sections.LAYER):
+    if extent is None or run < extent[1] or start[0] not in _BEGINNING:
         return 0
     end = position + extent[1]
     return 0 if start[0] == sections.LAYER and _met(target, decoder, end) else extent[1]

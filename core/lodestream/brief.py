@@ -56,7 +56,8 @@ def roughen(array: NDArray[np.int32], layout: Layout, norms: NDArray[np.float64]
         halves = (slice(0, above), slice(above, rows)), (slice(0, left), slice(left, columns))
         bands = [(kind, array[halves[0][kind[0]], halves[1][kind[1]]]) for kind in _DETAILS]
         for kind, band in bands if level else [((0, 0), array[:rows, :columns])]:
-            places = int(max(np.log2(step / np.sqrt(norms[level][kind])), 0.0))
+            ratio = step / np.sqrt(norms[level][kind])
+            places = int(np.log2(ratio)) if ratio > 1 else 0  # of a level surface the step is 0
             magnitudes = (np.abs(band) + int(_ROUNDED_UP * 2**places)) >> places << places
             band[...] = np.where(band < 0, -magnitudes, magnitudes)
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .capacity import Capacity
 from .container import headers, sections
 from .container.frames import Frame, FrameReader, section_extent
 from .container.model import ByteRange, Header, Index, Piece
 from .container.pieces import windows
-from .container.reader import index_from, read_metadata, with_level_bytes
+from .container.reader import INDEX_GROWTH, index_from, read_metadata, with_level_bytes
 from .container.slices import Slices, State
 from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
@@ -25,6 +26,9 @@ from .target import Region
 from .view import View
 
 __all__ = ["Decoder", "View", "decode"]
+
+# What an entry of a layer's table becomes until its segment has been decoded.
+_ENTRY = 256
 
 Bytes = bytes  # the name within classes that have a property of this name
 
@@ -40,10 +44,24 @@ class Decoder:
     wish : Wish, optional
         A window of the surface, or some of its attributes, which alone the views then show. Errors of a window are not
         known (NaN) before it is complete.
+    max_vertices : int or None
+        What a surface may have, before which nothing of it is decoded, see `capacity.Capacity`; None for what suits
+        the memory that this process can have.
+    level : int or None
+        The finest level that the caller looks at, when it is not the surface itself: only what this one takes has to
+        be allowed.
+
+    Raises
+    ------
+    TooLargeError
+        From what takes bytes of the container: when the header promises a surface that takes more, or more than such
+        a surface has comes.
     """
 
-    def __init__(self, wish: Wish | None = None) -> None:
+    def __init__(self, wish: Wish | None = None, *, max_vertices: int | None = None, level: int | None = None) -> None:
         self._wish = wish or Wish()
+        self._finest = level
+        self.capacity = Capacity(max_vertices)
         self.header: Header | None = None
         self.index: Index | None = None
         self.metadata: dict[str, Any] | None = None
@@ -67,6 +85,7 @@ class Decoder:
         CorruptStreamError, UnsupportedVersionError
             The layers before the damage stay decodable.
         """
+        self.capacity.take(len(chunk))
         if self._frames.ended:
             self._take_footer(bytes(chunk))
             return []
@@ -84,6 +103,7 @@ class Decoder:
         """
         before = len(self.layers)
         if self._slices is not None:
+            self.capacity.take(len(chunk))
             self._take_slice(offset, bytes(chunk))
         elif offset == self._frames.position + self._frames.pending:
             self.feed(chunk)
@@ -91,10 +111,12 @@ class Decoder:
                 early, self._early = self._early, []
                 for place, data in early:
                     self._take_loose(place, data)
-        elif self.header is None or (self.header.masked and not self.header.holes):
-            self._early.append((offset, bytes(chunk)))
         else:
-            self._take_loose(offset, bytes(chunk))
+            self.capacity.take(len(chunk))
+            if self.header is None or (self.header.masked and not self.header.holes):
+                self._early.append((offset, bytes(chunk)))
+            else:
+                self._take_loose(offset, bytes(chunk))
         return self.layers[before:]
 
     def focus(self, region: Region | None) -> None:
@@ -177,7 +199,7 @@ class Decoder:
             self._take_header(frame)
         elif self.header is None:
             raise CorruptStreamError(f"expected the header, got a section of kind {frame.kind}", frame.offset)
-        elif frame.kind == sections.MASKS:
+        elif frame.kind in (sections.MASKS, sections.KEPT_MASKS):
             self._take_masks(frame, self.header)
         elif self.header.masked and not self.header.holes:
             raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
@@ -189,6 +211,7 @@ class Decoder:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
         else:
             place = ByteRange(frame.offset, frame.end - frame.offset)
+            self.capacity.take(INDEX_GROWTH * place.length)
             index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
             known = with_level_bytes(index)
             self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
@@ -207,11 +230,12 @@ class Decoder:
         if self.header is not None:
             raise CorruptStreamError("expected one header, got a second", frame.offset)
         self.header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
+        self._wish.check(self.header)
+        self._wish.check_size(self.header, self.capacity, self._finest)
         if not self.header.masked:
             self._begin(self.header)
 
     def _begin(self, header: Header) -> None:
-        self._wish.check(header)
         self._wanted = self._wish.tiles(header)
         self._progress = Progress(header)
         self._reconstruction = Reconstruction(header)
@@ -220,7 +244,7 @@ class Decoder:
     def _take_masks(self, frame: Frame, header: Header) -> None:
         if not header.masked or header.holes:
             raise CorruptStreamError("expected layers, got masks", frame.offset)
-        self.header = headers.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
+        self.header = headers.parse_masks(header, frame)
         self._begin(self.header)
 
     def _take_layer(self, frame: Frame, header: Header) -> None:
@@ -228,6 +252,7 @@ class Decoder:
         if number >= header.layer_count:
             raise CorruptStreamError(f"expected {header.layer_count} layers, got more", frame.offset)
         rms, max_error, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+        self.capacity.take(_ENTRY * len(entries))
         segments = []
         for entry in entries:
             place = frame.payload_offset + start
@@ -265,6 +290,7 @@ class Decoder:
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
         length, state = self._reconstruction.length, self._progress.snapshot(made.all_planes)
+        self.capacity.take(state.nbytes)
         if self.header is not None and made.whole_level >= 0:
             # The index says that there is nothing more of these levels.
             levels = state[: self.header.layout.tiles_of(made.whole_level).stop]
@@ -308,6 +334,7 @@ class Decoder:
         if kind == sections.METADATA:
             self._take_metadata(read_metadata(bytes(run), place))
         elif self.header is not None:
+            self.capacity.take(INDEX_GROWTH * len(run))
             self.index = index_from(bytes(run), place, self.header)
             chosen = select(self.index, self._wish)
             partial = self._wish.region is not None
@@ -352,12 +379,14 @@ class Decoder:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
 
 
-def decode(container: bytes | bytearray | memoryview) -> Surface:
+def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | None = None) -> Surface:
     """The surface of a complete container.
 
     Parameters
     ----------
     container : bytes
+    max_vertices : int or None
+        What it may have at most, see `Decoder`.
 
     Returns
     -------
@@ -369,8 +398,10 @@ def decode(container: bytes | bytearray | memoryview) -> Surface:
     CorruptStreamError, UnsupportedVersionError
     TruncatedStreamError
         When the container is cut; use `Decoder` for a prefix.
+    TooLargeError
+        When it takes more memory than it may.
     """
-    decoder = Decoder()
+    decoder = Decoder(max_vertices=max_vertices)
     decoder.feed(container)
     decoder.finish()
     return decoder.surface()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 from numpy.typing import ArrayLike
 
+from . import metadata
 from .brief import expected_length, may_be_brief, worth
 from .encoding import Encoding, UnreachableError
 from .errors import InputError, OptionError
@@ -64,12 +65,14 @@ def encode(
     Raises
     ------
     InputError
-        When the surface cannot be encoded, or not with this precision.
+        When the surface cannot be encoded, or not with this precision; or its metadata are larger than
+        `lodestream.metadata.MAX_BYTES`.
     OptionError
         When there is no such attribute, or both a precision and an error are given.
     """
     if not isinstance(surface, Surface):
         surface = Surface(surface)
+    metadata.check(surface.metadata)
     rising = _rising(progress or (lambda fraction: None))
     precisions = {name: _tolerance(wanted) for name, wanted in (attribute_precision or {}).items()}
     unknown = [name for name in precisions if name not in surface.blocks[0].attributes]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,7 +146,9 @@ class Encoding:
             hole=_hole(surface),
             holes=tuple(block.holes for block in surface.blocks),
             quantiser=self.quantiser,
+            joint_changes=prepared.joint_changes,
             mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
+            **_kept(prepared),
         )
 
     def _fraction(self) -> int:
@@ -342,6 +345,17 @@ def _encode_mask(mask: NDArray[np.bool_]) -> bytes:
     from .mask import encode_mask  # only where there is one
 
     return encode_mask(mask)
+
+
+def _kept(prepared: Preparation) -> dict[str, Any]:
+    """The fields of a header that tell which holes have values that come back."""
+    if all(kept is None for kept in prepared.kept):
+        return {}
+    counts, coded = [], []
+    for kept, block in zip(prepared.kept, prepared.surface.blocks, strict=True):
+        counts.append(0 if kept is None else int(np.count_nonzero(kept)))
+        coded.append(b"" if kept is None or counts[-1] == block.holes else _encode_mask(kept))
+    return {"kept": tuple(counts), "kept_data": tuple(coded)}
 
 
 def _hole(surface: Surface) -> int:

@@ -5,8 +5,10 @@
     LodestreamError
     ├── InputError (ValueError)          what you gave cannot be used
     │   ├── FormatError                  a file is not what it says, is cut short, or holds no structured surface
+    │   │   └── SwitchedOffError         its format may not be read here
     │   ├── TooLargeError                more bytes or vertices than allowed
     │   └── OptionError                  an option, level or format that does not exist; names those that do
+    ├── UnavailableError                 what is needed is not here now: a library, a process that was ended
     ├── NotFoundError (LookupError)      no such surface
     ├── StreamError                      the bytes of a container cannot be used
     │   ├── CorruptStreamError           damaged, with the offset
@@ -37,8 +39,10 @@ __all__ = [
     "RemoteError",
     "RemoteProtocolError",
     "StreamError",
+    "SwitchedOffError",
     "TooLargeError",
     "TruncatedStreamError",
+    "UnavailableError",
     "UnsupportedVersionError",
 ]
 
@@ -55,6 +59,10 @@ class FormatError(InputError):
     """A file is not what it says, is cut short, or holds no structured surface."""
 
 
+class SwitchedOffError(FormatError):
+    """A file is of a format that may not be read here, whatever is in it."""
+
+
 class FormatWarning(UserWarning):
     """A file cannot say all of a surface, or does not say all that was needed; what was left out or assumed."""
 
@@ -65,6 +73,10 @@ class TooLargeError(InputError):
 
 class OptionError(InputError):
     """An option, level or format that does not exist, or a value that it does not take."""
+
+
+class UnavailableError(LodestreamError):
+    """What is needed is not here now, whatever was given: a library that is not installed, a process that was ended."""
 
 
 class NotFoundError(LodestreamError, LookupError):

@@ -66,11 +66,12 @@ def focused(
                     head.append(ByteRange(*gap))
                     ahead += gap[1]
                     continue
+                outside = list(near.missing(*gap))
                 first.extend(ByteRange(*part) for part in near.overlap(*gap))
-                rest.extend(ByteRange(*part) for part in near.missing(*gap))
-                inside = sum(length for _, length in near.overlap(*gap))
-                ahead += inside
-                behind += gap[1] - inside
+                rest.extend(ByteRange(*part) for part in outside)
+                far = sum(length for _, length in outside)
+                ahead += gap[1] - far
+                behind += far
         steps.append(_Step(mark, ahead, behind, kept))
     service = [[ByteRange(*gap) for gap in held.missing(p.offset, p.length)] for p in (index.index, *chosen.after)]
     tables = service[0] if first or rest else []

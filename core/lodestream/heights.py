@@ -25,8 +25,14 @@ __all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz", "window_axes
 _STRIP = 1 << 18
 
 
-def to_heights(surface: Surface) -> Surface | None:
+def to_heights(surface: Surface, exactly: bool = True) -> Surface | None:
     """Take xyz over a regular lattice for heights.
+
+    Parameters
+    ----------
+    surface : Surface
+    exactly : bool
+        The rules have to hold under the holes that are kept (`Block.kept`) as well.
 
     Returns
     -------
@@ -36,9 +42,14 @@ def to_heights(surface: Surface) -> Surface | None:
     """
     if len(surface.blocks) != 1 or surface.points.ndim != 3 or surface.points.shape[2] != 3 or min(surface.shape) < 2:
         return None
+    mask, kept = surface.mask, surface.blocks[0].kept
+    if mask is not None and kept is not None and exactly:
+        mask = mask | kept
+        if not np.isfinite(surface.points[..., :2][mask]).all():
+            return None
     rules = []
     for channel in (0, 1):
-        rule = _fit(surface.points[..., channel], surface.mask, down=channel == 1)
+        rule = _fit(surface.points[..., channel], mask, down=channel == 1)
         if rule is None:
             return None
         rules.append(rule)
@@ -47,14 +58,21 @@ def to_heights(surface: Surface) -> Surface | None:
     return Surface(heights, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
 
 
-def to_xyz(surface: Surface) -> Surface:
+def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
     """Put x and y beside heights; surfaces of another kind come back as they are.
+
+    Parameters
+    ----------
+    surface : Surface
+    kept : bool, shape (H, W), optional
+        Holes that have x and y; by default those of infinite height.
 
     Returns
     -------
     Surface
         xyz in the type of the heights where it came as xyz, otherwise in one that holds the coordinates as well
-        (float64). Float coordinates of holes are NaN. What says where the heights lie is gone from the metadata.
+        (float64). Float coordinates of holes that are not kept are NaN. What says where the heights lie is gone from
+        the metadata.
     """
     if len(surface.blocks) != 1 or surface.points.ndim != 2:
         return surface
@@ -64,7 +82,8 @@ def to_xyz(surface: Surface) -> Surface:
     for channel, values in enumerate((x, y, surface.points)):
         points[..., channel] = values
     if surface.mask is not None and dtype.kind == "f":
-        points[~surface.mask] = np.nan
+        kept = surface.blocks[0].kept if kept is None else kept
+        points[~surface.mask if kept is None else ~(surface.mask | kept)] = np.nan
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("grid", "axes", "nodes")}
     if metadata.pop("angles", None):
         metadata.pop("turn", None)

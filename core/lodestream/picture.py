@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrangement import VertexCounter
 from .kernels import strict_kernel
 from .lattice import Lattice
 from .measure import distances
+from .sides import Arrangement, stored
 
-__all__ = ["Original", "coordinate_distances", "store_values"]
+__all__ = ["Original", "coordinate_distances", "originals_of", "store_values"]
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
 
@@ -212,6 +214,31 @@ class Original:
         if self.counted is None:
             return int(self.points.shape[0] * self.points.shape[1])
         return int(np.count_nonzero(self.counted))
+
+
+def originals_of(
+    arrangement: Arrangement | None, points: Sequence[NDArray[Any]], masks: Sequence[NDArray[np.bool_] | None]
+) -> list[Original]:
+    """What the pictures of each part are compared with; each vertex of several parts is counted in one of them.
+
+    Parameters
+    ----------
+    arrangement : Arrangement or None
+        None: there is one block, which is one part.
+    points : C-contiguous arrays, shape (row, column, channel), one for each block
+    masks : bool, shape (row, column), or None, one for each block
+        True where a point is valid.
+    """
+    if arrangement is None:
+        return [Original(points[0], masks[0])]
+    originals = []
+    counter = VertexCounter(arrangement)
+    for part in arrangement.parts:
+        mask = masks[part.block]
+        counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
+        counter.count(part, counted)
+        originals.append(Original(stored(part, points[part.block]), counted))
+    return originals
 
 
 def coordinate_distances(

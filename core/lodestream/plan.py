@@ -274,12 +274,18 @@ def _less(chosen: Plan, held: RangeSet) -> Plan:
     mark = next(todo, None)
     planned = sent = 0
     for place, gaps in missing:
+        # Marks and gaps both go forward: each gap is looked at once, however many marks there are.
+        passed = 0
         while mark is not None and mark.sent <= planned + place.length:
             end = place.offset + mark.sent - planned
-            marks.append(replace(mark, sent=sent + sum(max(min(gap.end, end) - gap.offset, 0) for gap in gaps)))
+            while passed < len(gaps) and gaps[passed].end <= end:
+                sent += gaps[passed].length
+                passed += 1
+            begun = max(end - gaps[passed].offset, 0) if passed < len(gaps) else 0
+            marks.append(replace(mark, sent=sent + begun))
             mark = next(todo, None)
         planned += place.length
-        sent += sum(gap.length for gap in gaps)
+        sent += sum(gap.length for gap in gaps[passed:])
     before, after = (
         tuple(gap for place in part for gap in _missing(place, held)) for part in (chosen.before, chosen.after)
     )

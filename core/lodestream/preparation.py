@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrangement import VertexCounter, grids_of
+from .arrangement import grids_of, shared_points
 from .container.headers import LARGE_TILE_BITS, TILE_BITS
-from .container.model import AttributeKind
+from .container.model import AttributeKind, JointChanges
 from .heights import to_heights
+from .joints import Groups
 from .lattice import Lattice, find_lattice, offset_lattice, precision_lattice
 from .layout import Layout
 from .measure import extent_of
-from .picture import Original
+from .mesh.joining import change_of
+from .picture import originals_of
 from .quantise import DEFAULT_STEPS, attribute_lattices, channel_of, choose_lattices
 from .sides import Arrangement, Curve, LatticeBlock, Part, Side, arrange, stored, whole_part
 from .steps import default_steps
@@ -25,7 +27,7 @@ from .surface import Block, Surface
 from .target import Tolerance
 from .transform import allocate
 
-__all__ = ["Precisions", "Preparation"]
+__all__ = ["Precisions", "Preparation", "given_channel"]
 
 #: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
 _FINEST, _COARSEST = 128, 8
@@ -52,6 +54,8 @@ class Preparation:
     ----------
     given, surface : Surface
         As it came, and as it is coded: heights alone where x and y follow a rule.
+    kept : list of bool arrays, shape (row, column), or None, one for each block
+        Holes whose values come back.
     plane : mapping or None
         That rule.
     arrays : list, one for each block, of lists of arrays, shape (row, column, channel)
@@ -70,12 +74,15 @@ class Preparation:
         None where the surface is one block that shares no side.
     parts : tuple of Part
     originals : list of Original, one for each part
+    joint_changes : JointChanges or None
+        See `Header`.
     """
 
     def __init__(
         self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None, large_tiles: bool = False
     ) -> None:
         self.given = surface
+        self.kept = [block.kept for block in surface.blocks]
         surface, self.plane = _heights(surface)
         self.surface = surface
         self.arrays = [_filled(block) for block in surface.blocks]
@@ -112,7 +119,9 @@ class Preparation:
         else:
             self.parts, self.tile = self.arrangement.parts, (TILE_BITS // 2, TILE_BITS // 2)
             self.layout = Layout(grids_of(self.arrangement), self.tile)
-        self.originals = self._originals()
+        masks = [block.mask for block in surface.blocks]
+        self.originals = originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks)
+        self.joint_changes = self._joint_changes()
 
     def lattices(self, bits: int | None) -> list[Lattice]:
         """A lattice for each channel; ``bits``: keep no more than so many of any channel's range."""
@@ -163,9 +172,13 @@ class Preparation:
         curves = len(arrays) - len(self.parts)
         if self.arrangement is None:
             lattice.coordinates(self.channel(0, channel), out=arrays[0])
-            if (mask := self.surface.blocks[0].mask) is not None:
+            block = self.surface.blocks[0]
+            if block.mask is not None:
                 from .fill import settle_holes  # only where there is one
 
+                coordinate = channel < self.geometric
+                mask = block.mask if block.kept is None else _known(given_channel(block, channel), block, coordinate)
+                assert mask is not None  # there are holes
                 arrays[0][...] = settle_holes(arrays[0], mask, self.layout)
             return arrays
         known: set[int] = set()
@@ -233,17 +246,12 @@ class Preparation:
             return None
         return Arrangement(tuple(parts), tuple(curves))
 
-    def _originals(self) -> list[Original]:
-        if self.arrangement is None:
-            return [Original(self.arrays[0][0], self.surface.blocks[0].mask)]
-        originals = []
-        counter = VertexCounter(self.arrangement)
-        for part in self.parts:
-            mask = self.surface.blocks[part.block].mask
-            counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
-            counter.count(part, counted)
-            originals.append(Original(stored(part, self.arrays[part.block][0]), counted))
-        return originals
+    def _joint_changes(self) -> JointChanges | None:
+        shapes = [block.shape for block in self.given.blocks]
+        places = Groups.none() if self.arrangement is None else shared_points(self.arrangement, shapes)
+        to_places, to_vertices = change_of(self.given, places)
+        nothing = not any(array.size for array in (*to_places, *to_vertices))
+        return None if nothing else (to_places.runs, to_vertices.runs)
 
 
 #: Most rows or columns of a tile, as an exponent of two.
@@ -279,6 +287,16 @@ def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
     return heights, {"grid": rules}
 
 
+def given_channel(block: Block, channel: int) -> NDArray[Any]:
+    """One channel of a block as it was given, shape (row, column), a view."""
+    for values in (block.points, *block.attributes.values()):
+        array = values if values.ndim == 3 else values[..., np.newaxis]
+        if channel < array.shape[2]:
+            return array[..., channel]
+        channel -= array.shape[2]
+    raise IndexError(channel)
+
+
 def _lines(array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
     """First row, last row, first column, last column; views."""
     return array[0], array[-1], array[:, 0], array[:, -1]
@@ -289,17 +307,35 @@ def _filled(block: Block) -> Arrays:
     arrays = []
     for number, values in enumerate((block.points, *block.attributes.values())):
         array = values if values.ndim == 3 else values[..., np.newaxis]
-        mask = block.mask
-        if array.dtype.kind == "f" and (number or array.shape[2] > 3):
-            # An attribute may have no value where the point has a place; exactness gives it back.
-            finite = np.isfinite(array).all(axis=2)
-            mask = finite if mask is None else mask & finite
-        if mask is not None and not mask.all():
+        known = [_known(array[..., k], block, not number and k < 3) for k in range(array.shape[2])]
+        if not all(mask is None or mask.all() for mask in known):
             from .fill import fill_holes  # only where there is one
 
-            array = fill_holes(array, mask, block.closed)
+            array = array.copy()
+            for channel, mask in enumerate(known):
+                if mask is not None:
+                    array[..., channel] = fill_holes(array[..., channel], mask, block.closed)
         arrays.append(np.ascontiguousarray(array))
     return arrays
+
+
+def _known(values: NDArray[Any], block: Block, coordinate: bool) -> NDArray[np.bool_] | None:
+    """Where one channel has numbers that are worth coding, shape (row, column); None: everywhere.
+
+    A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; exactness gives both
+    back. Numbers that lie further out than all valid ones are left to it as well.
+    """
+    if values.dtype.kind != "f" or (coordinate and block.kept is None):
+        return block.mask
+    valid: NDArray[np.bool_] = np.isfinite(values)
+    if block.mask is not None:
+        valid &= block.mask
+    if block.kept is None or not valid.any():
+        return valid
+    low, high = values[valid].min(), values[valid].max()
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        valid |= block.kept & (values >= low) & (values <= high)
+    return valid
 
 
 def _valid_points(blocks: tuple[Block, ...], arrays: Arrays) -> NDArray[Any]:

@@ -98,6 +98,11 @@ class RangeDownload:
         """Why nothing more will come, as in `Ended`."""
         return self.reception.ended
 
+    @property
+    def version(self) -> str | None:
+        """What tells this version of the file from another: its entity tag, or else its date; None without either."""
+        return self._validator
+
     def request(self, now: float | None = None) -> tuple[RangeRequest | None, list[DownloadEvent]]:
         """What to ask for next, None when there is nothing; and what follows from what has come.
 
@@ -286,6 +291,7 @@ class RangeDownload:
         return _FIRST if limited else _FIRST_MOST
 
     def _read_index(self) -> list[DownloadEvent]:
+        from .capacity import Capacity
         from .container import read_index
 
         store, size = self.reception.keep(), self.reception.size or 0
@@ -297,7 +303,7 @@ class RangeDownload:
 
         self._needed = None
         try:
-            index = read_index(read, size)
+            index = read_index(read, size, Capacity(self.reception.decoder.capacity.max_vertices))
         except _MissingError as missing:
             self._needed = missing.place
             return []

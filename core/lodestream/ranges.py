@@ -21,7 +21,14 @@ class RangeSet:
         self._starts: list[int] = []
         self._ends: list[int] = []
         for offset, length in sorted(ranges):
-            self.add(offset, length)
+            if length <= 0:
+                continue
+            # In order, so that nothing is searched for or moved.
+            if self._ends and offset <= self._ends[-1]:
+                self._ends[-1] = max(self._ends[-1], offset + length)
+            else:
+                self._starts.append(offset)
+                self._ends.append(offset + length)
 
     def add(self, offset: int, length: int) -> None:
         """Add bytes; some of them, or all, may be there already."""

@@ -7,12 +7,13 @@ reception goes on: whoever starts the next one hands it over, and what is held i
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
-from .errors import RemoteError, RemoteProtocolError, TruncatedStreamError
+from .errors import RemoteError, RemoteProtocolError, TooLargeError, TruncatedStreamError
 from .messages import MAX_DATA
+from .metadata import check_length
 from .ranges import RangeSet
 from .target import Region, Target, check_spans
 
@@ -21,8 +22,13 @@ if TYPE_CHECKING:
     from .decoder import Decoder, View
     from .plan import Plan
 
-__all__ = ["DownloadEvent", "Ended", "MemoryStore", "Reception", "Store"]
+__all__ = ["DownloadEvent", "Ended", "MemoryStore", "Reception", "Sink", "Store"]
 
+#: Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come.
+Sink: TypeAlias = Callable[[int, bytes], None]
+
+# What is kept for a piece beside its bytes.
+_PIECE = 256
 
 # Whoever reads a container's index reads its first bytes too.
 _HEAD = 4096
@@ -104,6 +110,11 @@ class Reception:
         given everything in the order of the target's plan, whenever it came.
     container, size : str or None, int or None
         SHA-256 and bytes of the container, where they are known.
+    sink : callable or None
+        Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come. Which
+        container that is has been told by then.
+    max_vertices : int or None
+        What the surface may have at most, see `Decoder`.
 
     Attributes
     ----------
@@ -143,13 +154,15 @@ class Reception:
         store: Store | None = None,
         container: str | None = None,
         size: int | None = None,
+        sink: Sink | None = None,
+        max_vertices: int | None = None,
     ) -> None:
         # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
         from .decoder import Decoder
         from .selection import wish_of
 
         self.target = Target() if target is None else target
-        self.decoder: Decoder = Decoder(wish_of(self.target))
+        self.decoder: Decoder = Decoder(wish_of(self.target), max_vertices=max_vertices, level=self.target.level)
         self.held = RangeSet() if store is None else store.ranges.copy()
         self.container = container
         self.size = size
@@ -164,6 +177,7 @@ class Reception:
         self.ended: str | None = None
         self.stopped_for: str | None = None
         self._store = store
+        self._sink = sink
         self._aside = MemoryStore()
         self._fed = RangeSet()
         self._order: deque[tuple[int, int]] | None = None
@@ -171,6 +185,7 @@ class Reception:
         self._wanted: RangeSet | None = None
         self._service: tuple[tuple[int, int], ...] = ()
         self._deadline: float | None = None
+        self._kept = 0
 
     def identify(self, container: str | None, size: int) -> None:
         """Tell which container is being received, before its bytes are.
@@ -189,7 +204,14 @@ class Reception:
         self.container, self.size = container or self.container, size
 
     def expect(self, planned: int, index: tuple[int, int], metadata: tuple[int, int], prefix: bool) -> list[View]:
-        """Tell what the other side is about to send; the views that the store makes up for already."""
+        """Tell what the other side is about to send; the views that the store makes up for already.
+
+        Raises
+        ------
+        CorruptStreamError
+            When the metadata are longer than any container has them.
+        """
+        check_length(metadata[1], metadata[0], section=True)
         self.planned, self._service = planned, (index, metadata)
         if prefix and self._order is None:
             self._follow([(0, planned)], [], [metadata])
@@ -237,6 +259,8 @@ class Reception:
             From the decoder.
         RemoteProtocolError
             When they lie outside the container.
+        TooLargeError
+            From the decoder, or when there are more than its capacity.
         """
         if self.size is not None and offset + len(data) > self.size:
             raise RemoteProtocolError(f"expected bytes of {self.size}, got those to {offset + len(data)}")
@@ -244,8 +268,13 @@ class Reception:
         views = []
         for start, length in list(self.held.missing(offset, len(data))):
             piece = data[start - offset : start - offset + length]
+            self._kept += length + _PIECE
+            if self._kept > self.decoder.capacity.bytes:
+                raise TooLargeError(f"expected at most {self.decoder.capacity.bytes:,} bytes of a container, got more")
             self.held.add(start, length)
             self._count(start, length)
+            if self._sink is not None:
+                self._sink(start, piece)
             if self._store is not None:
                 self._store.write(start, piece)
             else:
@@ -381,7 +410,9 @@ class Reception:
     def _learn(self) -> list[View] | None:
         """The order of slices stands in the index, which needs the header to be read; None: not all is there."""
         from .container import ByteRange, index_from
+        from .container.reader import INDEX_GROWTH
         from .decoder import Decoder
+        from .selection import wish_of
 
         store = self._store
         if store is None or not self._service or not store.ranges.covers(*self._service[0]):
@@ -389,9 +420,12 @@ class Reception:
         place = self._service[0]
         header = self.decoder.header
         if header is None:
-            scratch = Decoder()
+            scratch = Decoder(
+                wish_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
+            )
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):
             return None
+        self.decoder.capacity.take(INDEX_GROWTH * place[1])
         return self.follow(index_from(store.read(*place), ByteRange(*place), header))

@@ -16,7 +16,7 @@ from .container.model import Header
 from .container.pieces import Window, windows
 from .crop import window_picture
 from .errors import CorruptStreamError
-from .parts import assemble, level_masks
+from .parts import assemble, level_masks, numbered_by_block
 from .picture import store_values
 from .predictors import COEFFICIENT_BITS
 from .spreading import UNANNOUNCED
@@ -102,21 +102,28 @@ class Reconstruction:
             When ``corrected`` is asked for and a piece of the exactness section does not fit.
         """
         header = self.header
-        with self._lock:
-            self._decode(length)
-            pictures: list[Picture] = []
-            for channel, tiles in enumerate(self._tiles):
-                if chosen is None or chosen[channel]:
-                    pictures.append(channel_picture(header, channel, tiles, state[:, channel], level))
-                else:
-                    pictures.append(pictures[0])  # of the right shapes
-        blocks = to_values(header, pictures, level)
+        blocks = to_values(header, self.pictures(length, state, level, chosen), level)
         if corrected:
             self._correct(blocks)
-        for block, mask in zip(blocks, level_masks(header.parts, header.layout, level, header.masks), strict=True):
+        masks = level_masks(header.parts, header.layout, level, header.masks)
+        for block, mask, kept in zip(blocks, masks, header.kept_masks, strict=True):
             if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
-                block.clear(~mask, header.hole)
+                block.clear(~(mask | kept) if corrected and kept is not None else ~mask, header.hole)
         return blocks
+
+    def pictures(
+        self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
+    ) -> list[Picture]:
+        """The grids of ``level`` of each channel, in lattice coordinates, see `blocks`."""
+        pictures: list[Picture] = []
+        with self._lock:
+            self._decode(length)
+            for channel, tiles in enumerate(self._tiles):
+                if chosen is None or chosen[channel]:
+                    pictures.append(channel_picture(self.header, channel, tiles, state[:, channel], level))
+                else:
+                    pictures.append(pictures[0])  # of the right shapes
+        return pictures
 
     def window(
         self,
@@ -150,6 +157,8 @@ class Reconstruction:
         if corrected:
             self._correct([values], region)
         if (mask := header.masks[0]) is not None:
+            if corrected and (kept := header.kept_masks[0]) is not None:
+                mask = mask | kept
             values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
         return values
 
@@ -163,13 +172,14 @@ class Reconstruction:
             )
             if number in self._pieces and inside:
                 values = blocks[window.block].window(window, top, left)
-                mask, (data, offset) = self.header.masks[window.block], self._pieces[number]
+                masks = self.header.kept_masks if window.kept else self.header.masks
+                mask, (data, offset) = masks[window.block], self._pieces[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
-                if data[:1] == exactness.NEIGHBOURS:
-                    lattice = self.header.lattices[window.channel]
-                    values[...] = neighbours.decode_window(values, valid, lattice, data[1:], offset + 1)
-                    continue
                 chosen = slice(None) if valid is None else valid
+                if data[:1] == exactness.NEIGHBOURS and not window.kept:
+                    lattice = self.header.lattices[window.channel]
+                    values[chosen] = neighbours.decode_window(values, valid, lattice, data[1:], offset + 1)[chosen]
+                    continue
                 known = values[chosen]
                 values[chosen] = exactness.decode_piece(known.ravel(), data, offset).reshape(known.shape)
 
@@ -332,6 +342,6 @@ def to_values(header: Header, pictures: Sequence[Picture], level: int) -> list[V
             channel += 1
         grids.append(arrays)
     return [
-        Values([np.ascontiguousarray(assemble(parts, layout, level, block, shape, arrays)) for arrays in grids])
-        for block, (shape, _) in enumerate(header.blocks)
+        Values([np.ascontiguousarray(assemble(own, layout, level, shape, arrays)) for arrays in grids])
+        for own, (shape, _) in zip(numbered_by_block(parts, len(header.blocks)), header.blocks, strict=True)
     ]

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .surface import Block, Closed, Surface
+from .errors import InputError
+from .surface import DTYPES, Block, Closed, Surface
 
 __all__ = ["merge", "restore", "unwrap", "wrapped"]
 
@@ -73,27 +74,32 @@ def merge(surface: Surface, closed: Closed | None = None, *, angle: Turns | None
 
 def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
     """The turn by which the last line differs from the first, 0 for none; None where it does not repeat it."""
-    valid = np.ones(block.shape[1 - axis], np.bool_)
+    valid = told = np.ones(block.shape[1 - axis], np.bool_)
     if block.mask is not None:
         mask = np.moveaxis(block.mask, axis, 0)
         if not np.array_equal(mask[0], mask[-1]) or not mask[0].any():
             return None
-        valid = mask[0]
+        valid = told = mask[0]
+        if block.kept is not None:
+            kept = np.moveaxis(block.kept, axis, 0)
+            if not np.array_equal(kept[0], kept[-1]):
+                return None
+            told = valid | kept[0]
     for array in block.attributes.values():
         lines = np.moveaxis(array, axis, 0)
-        if lines[0][valid].tobytes() != lines[-1][valid].tobytes():
+        if lines[0][told].tobytes() != lines[-1][told].tobytes():
             return None
     points = np.moveaxis(block.points, axis, 0)
-    first, last, turn = points[0][valid], points[-1][valid], 0.0
+    first, last, turn = points[0], points[-1], 0.0
     if angle is not None and first.ndim == 2:
         channel, period = angle
-        turn = float(np.sign(last[0, channel] - first[0, channel])) * period
+        turn = float(np.sign(last[valid][0, channel] - first[valid][0, channel])) * period
         first = first.copy()
-        first[:, channel] += first.dtype.type(turn)
-        if turn and first.tobytes() != last.tobytes():
-            return None
-    if first.tobytes() != last.tobytes():
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            first[:, channel] += first.dtype.type(turn)
+    if first[told].tobytes() != last[told].tobytes():
         return None
+    first = first[valid]
     collapsed = first.ndim == 2 and len(first) > 1 and bool((first == first[0]).all())
     return None if collapsed else turn
 
@@ -128,6 +134,7 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
     """
     angles = surface.points[..., channel]
     valid = np.isfinite(angles) if surface.mask is None else surface.mask
+    told = valid if surface.blocks[0].kept is None else valid | surface.blocks[0].kept
     least, greatest = angles[valid].min(), angles[valid].max()
     # The angle of a hole is often known, and then tells how its neighbours hang together.
     known = valid | ((angles >= least) & (angles <= greatest))
@@ -136,10 +143,11 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
         return surface
     low = float((least + (greatest - period)) / 2)
     for dtype in dict.fromkeys((surface.dtype, np.dtype(np.float64))):
-        points = surface.points.astype(dtype)
-        points[..., channel] += (turns * period).astype(dtype)
-        back = wrapped(points[..., channel], period, low).astype(surface.dtype)
-        if back[valid].tobytes() == angles[valid].tobytes():
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            points = surface.points.astype(dtype)
+            points[..., channel] += (turns * period).astype(dtype)
+            back = wrapped(points[..., channel], period, low).astype(surface.dtype)
+        if back[told].tobytes() == angles[told].tobytes():
             break
     else:
         return surface
@@ -180,10 +188,10 @@ def _jumps(angles: NDArray[np.float64], period: float) -> int:
 
 
 def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float64]:
-    """Angles between low and low + period, by whole turns."""
+    """Angles between low and low + period, by whole turns; what is no number stays as it is."""
     values = angles.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        values -= period * np.floor((values - low) / period)
+        values -= np.where(np.isfinite(values), period * np.floor((values - low) / period), 0.0)
     return values
 
 
@@ -191,6 +199,11 @@ def restore(surface: Surface) -> Surface:
     """Give a surface the rows, columns, angles and type that it came with; its metadata no longer say so then.
 
     The ``angles`` of a height field stay: they are those of coordinates that are made where they are needed.
+
+    Raises
+    ------
+    InputError
+        When the metadata name a type that points cannot have.
     """
     metadata = dict(surface.metadata)
     seam, turn, dtype = (metadata.pop(key, None) for key in ("seam", "turn", "dtype"))
@@ -198,9 +211,12 @@ def restore(surface: Surface) -> Surface:
     angles = () if heights else metadata.pop("angles", ())
     if not angles and seam is None and dtype is None:
         return surface
+    if dtype is not None and dtype not in DTYPES:
+        # Whoever made the container may have written anything: a long text, of which each point would be one.
+        raise InputError(f"expected a type of points in the metadata, got {dtype!a:.80}")
     words = [seam] if isinstance(seam, str) else list(seam or ())
     words += [""] * (len(surface.blocks) - len(words))
-    blocks = []
+    blocks, nodes = [], []
     for block, word in zip(surface.blocks, words, strict=False):
         points = block.points.copy() if angles else block.points
         for angle in angles:
@@ -213,7 +229,11 @@ def restore(surface: Surface) -> Surface:
         mask = None if block.mask is None else _with_last(block.mask, repeat)
         closed = (block.closed[0] and not repeat[0], block.closed[1] and not repeat[1])
         blocks.append(Block(points, closed, mask=mask, attributes=attributes))
-    return Surface(blocks=blocks, metadata=metadata)
+        rows, columns = (np.arange(length + again) % length for length, again in zip(block.shape, repeat, strict=True))
+        nodes.append((rows, columns))
+    restored = Surface(blocks=blocks, metadata=metadata)
+    restored.joints = None if surface.joints is None else surface.joints.at(nodes)
+    return restored
 
 
 def _with_last(array: NDArray[Any], repeat: Closed, turn: tuple[int, float, int] | None = None) -> NDArray[Any]:

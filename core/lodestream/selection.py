@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .capacity import Capacity
 from .container.model import Header, Index, Piece, Segment
 from .container.pieces import windows
 from .errors import OptionError
@@ -46,6 +47,33 @@ class Wish:
         for kind in header.attributes:
             chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
         return np.array(chosen)
+
+    def check_size(self, header: Header, capacity: Capacity, level: int | None = None) -> None:
+        """Refuse what takes more memory than there may be.
+
+        Parameters
+        ----------
+        header : Header
+        capacity : Capacity
+        level : int or None
+            The finest level that is wanted, if not all of them.
+
+        Raises
+        ------
+        TooLargeError
+        """
+        sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
+        layout = header.layout
+        if self.region is not None and header.arrangement is None:
+            rows, columns = restored(header, self.region)
+            shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
+        elif level is not None and level < layout.levels:
+            shapes = [layout.shape(grid, level) for grid in range(len(layout.grids))]
+        else:
+            shapes = [shape for shape, _ in header.blocks]
+        vertices = sum(rows * columns for rows, columns in shapes)
+        masked = sum(rows * columns for (rows, columns), _ in header.blocks) if header.masked else 0
+        capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
 
     def tiles(self, header: Header) -> NDArray[np.bool_]:
         """Which tiles are wanted."""

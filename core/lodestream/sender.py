@@ -9,7 +9,7 @@ from .container import ByteRange, Index
 from .errors import CorruptStreamError, OptionError
 from .focus import focused
 from .messages import CODES, MAX_DATA, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
-from .plan import Mark, plan
+from .plan import Mark, Plan, plan
 from .protocol import Connection, Side, State
 from .ranges import RangeSet
 from .selection import Wish
@@ -21,9 +21,11 @@ __all__ = ["Sender"]
 _SHARES = 4
 _LEAST = 4096
 
-# A change of order takes milliseconds, and asking for it a few bytes: so many are free, the others are earned.
+# A change of order takes milliseconds, and asking for it a few bytes: so many are free, the others are earned. One
+# among many pieces takes longer, and counts for several.
 _FREE_TURNS = 16
 _BYTES_A_TURN = 4096
+_PIECES_A_TURN = 1024
 
 
 class Sender:
@@ -69,6 +71,7 @@ class Sender:
         self._focus: Region | None = None
         self._changed = False  # the focus, and the order has not followed yet
         self._turns = 0
+        self._whole: Plan | None = None  # of the target alone: orders are made of it
         self._window = 0
         self._ended = "complete"
 
@@ -76,6 +79,16 @@ class Sender:
     def state(self) -> State:
         """Where the stream is; closed and failed are final once `next_message` gives None."""
         return self._connection.state
+
+    @property
+    def turning(self) -> bool:
+        """Whether the next `wanted` makes a new order first, since the focus has changed."""
+        return self._changed and self._ready() and self._turns < _FREE_TURNS + self._provided // _BYTES_A_TURN
+
+    @property
+    def pieces(self) -> int:
+        """How many pieces an order is made of, which is how long it takes to make one."""
+        return len(self._index.segments) + len(self.held) + len(self._given)
 
     def receive(self, message: bytes) -> Event:
         """Take one message; the event that it stands for.
@@ -122,9 +135,9 @@ class Sender:
 
     def wanted(self) -> ByteRange | None:
         """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
-        if self.state is not State.STREAMING or self._outbox or not self._slices or not self._connection.credit:
+        if not self._ready():
             return None
-        if self._changed and self._turns < _FREE_TURNS + self._provided // _BYTES_A_TURN:
+        if self.turning:
             # Not before now: of many changes, only the last one costs anything.
             self._reorder()
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
@@ -135,6 +148,10 @@ class Sender:
         share = min(credit, max(self._window // _SHARES, _LEAST))
         slice_ = self._slices[0]
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
+
+    def _ready(self) -> bool:
+        """Whether something may be read now."""
+        return self.state is State.STREAMING and not self._outbox and bool(self._slices and self._connection.credit)
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
         """Hand over the bytes of a slice that `wanted` has named; after a stop, or a change of order, they are dropped.
@@ -197,9 +214,11 @@ class Sender:
 
     def _reorder(self) -> None:
         self._changed = False
-        self._turns += 1
+        self._turns += 1 + self.pieces // _PIECES_A_TURN
         known = RangeSet((*self.held, *self._given))
-        slices, marks = focused(self._index, plan(self._index, self._target), known, self._focus)
+        if self._whole is None:
+            self._whole = plan(self._index, self._target)
+        slices, marks = focused(self._index, self._whole, known, self._focus)
         self._follow(slices, marks, 0)
 
     def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .joints import Joints
 
-__all__ = ["Block", "Closed", "Surface"]
+__all__ = ["DTYPES", "Block", "Closed", "Surface"]
 
 #: Whether the rows and the columns of a grid wrap: ``(True, False)`` means that axis 0 is a circle.
 Closed = tuple[bool, bool]
 
-_DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
+#: Names of the types that points and attributes have.
+DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
 
 
 class Block:
@@ -25,19 +28,22 @@ class Block:
     ----------
     points : array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3)
         Heights; planar points; x, y, z; x, y, z and C - 3 attributes. A curve is (N, 1, C). Integers of 8 to 64 bits
-        or float32/float64, of either byte order; not copied when already in native order and C-contiguous.
+        or float32/float64, of either byte order; not copied when already in native order and C-contiguous. Where a
+        coordinate of a masked array is masked, there is a hole.
     closed : (bool, bool)
         ``(rows, columns)``: ``rows`` says that axis 0 wraps, so that row H - 1 is followed by row 0.
     mask : bool array of shape (H, W), optional
         True where a point is valid; the others are holes, whose values mean nothing. Points with a coordinate that is
-        NaN or infinite are holes as well. None: only those.
+        NaN or infinite are holes as well; those that say something (`kept`) come back all the same. None: only those.
     attributes : mapping of str to arrays of shape (H, W) or (H, W, K), optional
         What belongs to the points beside their place, each of one of the types above; NaN and infinities are values.
+        What is masked of a masked array is NaN.
 
     Raises
     ------
     InputError
-        When an array is not of such a shape or type, there are fewer than two points, or none of them is valid.
+        When an array is not of such a shape or type, there are fewer than two points, none of them is valid, or an
+        attribute is masked at a valid point and its type has no NaN.
     """
 
     def __init__(
@@ -59,8 +65,13 @@ class Block:
             raise InputError(f"expected closed=(rows, columns), got {closed!r}")
         self.points: NDArray[Any] = _native(array, "points")
         self.closed: Closed = (bool(closed[0]), bool(closed[1]))
+        hidden = _hidden(points)
+        self.mask: NDArray[np.bool_] | None = self._valid(mask, hidden)
+        if hidden is not None:
+            # A masked coordinate makes a hole; a masked attribute needs a value that says so.
+            values = hidden if hidden.ndim == 2 or self.points.dtype.kind == "f" else hidden[..., 3:]
+            self.points = self._shown(self.points, values, "channels beyond the third")
         self.attributes = {name: self._attribute(name, values) for name, values in (attributes or {}).items()}
-        self.mask: NDArray[np.bool_] | None = self._valid(mask)
 
     def _attribute(self, name: str, values: ArrayLike) -> NDArray[Any]:
         array = np.asarray(values)
@@ -68,14 +79,29 @@ class Block:
             raise InputError(
                 f"expected attribute {name!r} of shape {self.shape} or {self.shape} and components, got {array.shape}"
             )
-        return _native(array, f"attribute {name!r}")
+        shown, hidden = _native(array, f"attribute {name!r}"), _hidden(values)
+        return shown if hidden is None else self._shown(shown, hidden, f"attribute {name!r}")
 
-    def _valid(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
-        valid = None
+    def _shown(self, values: NDArray[Any], hidden: NDArray[np.bool_], what: str) -> NDArray[Any]:
+        """Values that are NaN where they are hidden."""
+        if values.dtype.kind == "f":
+            return np.where(hidden, values.dtype.type(np.nan), values)
+        anywhere: NDArray[np.bool_] = hidden if hidden.ndim == 2 else np.asarray(hidden.any(axis=2))
+        if (anywhere if self.mask is None else anywhere & self.mask).any():
+            raise InputError(
+                f"expected values of {what} at all valid points, got masked ones of {values.dtype}, which has no NaN"
+            )
+        return values
+
+    def _valid(self, mask: ArrayLike | None, hidden: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        valid: NDArray[np.bool_] | None = None
+        if hidden is not None:
+            valid = ~(hidden if hidden.ndim == 2 else np.asarray(hidden[..., :3].any(axis=2)))
         if mask is not None:
-            valid = np.array(mask)
-            if valid.shape != self.shape or valid.dtype != np.bool_:
-                raise InputError(f"expected a mask of booleans of shape {self.shape}, got {valid.dtype} {valid.shape}")
+            given = np.array(mask)
+            if given.shape != self.shape or given.dtype != np.bool_:
+                raise InputError(f"expected a mask of booleans of shape {self.shape}, got {given.dtype} {given.shape}")
+            valid = given if valid is None else valid & given
         if self.points.dtype.kind == "f":
             coordinates = self.points if self.points.ndim == 2 else self.points[..., : min(self.points.shape[2], 3)]
             with np.errstate(over="ignore", invalid="ignore"):
@@ -93,6 +119,24 @@ class Block:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the grid."""
         return self.points.shape[0], self.points.shape[1]
+
+    @cached_property
+    def kept(self) -> NDArray[np.bool_] | None:
+        """The holes whose values come back bit for bit, shape (H, W); None where there are none.
+
+        They are those with an infinite coordinate, and those with coordinates of which some are NaN and some are not.
+        """
+        if self.mask is None or self.points.dtype.kind != "f":
+            return None
+        coordinates = self.points[..., np.newaxis] if self.points.ndim == 2 else self.points[..., :3]
+        under = coordinates[~self.mask]
+        missing = np.isnan(under)
+        said = np.isinf(under).any(axis=1) | (missing.any(axis=1) & ~missing.all(axis=1))
+        if not said.any():
+            return None
+        kept = np.zeros(self.shape, np.bool_)
+        kept[~self.mask] = said
+        return kept
 
     @property
     def holes(self) -> int:
@@ -117,6 +161,12 @@ class Surface:
         numbers in GDAL's order), source format, ...
     blocks : iterable of Block
         In place of the first four: blocks of the same type and number of channels, with the same attributes.
+
+    Attributes
+    ----------
+    joints : Joints or None
+        Of what comes out of a container, which points are one, whatever their values are so far. None, as of what is
+        made of arrays in memory: those with the same values, see `lodestream.mesh`.
 
     Raises
     ------
@@ -144,6 +194,7 @@ class Surface:
             if mask is not None or attributes is not None or tuple(closed) != (False, False):
                 raise InputError("expected closed, mask and attributes with each block, got them beside blocks")
         self.metadata: dict[str, Any] = dict(metadata or {})
+        self.joints: Joints | None = None
         if not self.blocks:
             raise InputError("expected at least one block, got none")
         first = _kind(self.blocks[0])
@@ -192,9 +243,15 @@ class Surface:
         return f"Surface({', '.join(map(repr, self.blocks))})"
 
 
+def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
+    """What is masked of a masked array, of its shape; None where nothing is."""
+    hidden = values.mask if isinstance(values, np.ma.MaskedArray) else np.ma.nomask
+    return np.broadcast_to(hidden, np.shape(values)) if np.any(hidden) else None
+
+
 def _native(array: NDArray[Any], what: str) -> NDArray[Any]:
     dtype = array.dtype.newbyteorder("=")
-    if dtype.name not in _DTYPES:
+    if dtype.name not in DTYPES:
         raise InputError(f"expected {what} as integers of 8 to 64 bits or float32 or float64, got {array.dtype}")
     return np.ascontiguousarray(array, dtype=dtype)
 

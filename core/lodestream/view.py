@@ -13,7 +13,8 @@ from .container.model import Header
 from .digest import DIGEST, values_digest
 from .errors import CorruptStreamError, InputError, OptionError
 from .heights import level_metadata, to_xyz
-from .parts import level_masks
+from .joints import Nodes
+from .parts import level_masks, level_positions, numbered_by_block
 from .reconstruction import Reconstruction, Values
 from .selection import Wish, restored
 from .surface import Block, Closed, Surface
@@ -186,7 +187,7 @@ class View:
                 surface.metadata.update(window_grid(header.plane["grid"], header.shape, region))
         if header.plane is not None:
             try:
-                surface = to_xyz(surface)
+                surface = to_xyz(surface, self._kept(finest))
             except InputError as error:
                 raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
         if region is not None:
@@ -196,7 +197,24 @@ class View:
             if digest != found:
                 raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
         surface.metadata = values
+        surface.joints = header.joints.at(self._nodes(level))
         return surface
+
+    def _nodes(self, level: int) -> list[Nodes]:
+        """Which rows and columns of each block are shown at a level, or in the window."""
+        header, region = self._reconstruction.header, self._wish.region
+        if region is not None:
+            return [(np.arange(*region[0]), np.arange(*region[1]))]
+        owned = zip(numbered_by_block(header.parts, len(header.blocks)), header.blocks, strict=True)
+        return [level_positions(own, len(header.parts), header.layout, level, shape) for own, (shape, _) in owned]
+
+    def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
+        """Which holes of the only block have values."""
+        kept = self._reconstruction.header.kept_masks[0]
+        if kept is None or not (finest and self._corrected):
+            return None
+        region = self._wish.region
+        return kept if region is None else kept[slice(*region[0]), slice(*region[1])]
 
     def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
         """Points and attributes of a window of the only block."""

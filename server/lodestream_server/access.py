@@ -11,7 +11,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fastapi.requests import HTTPConnection
 
@@ -20,14 +20,17 @@ from lodestream.errors import LodestreamError
 from .problems import BadTokenError, ForeignOriginError, NoTokenError, SmallScopeError
 from .settings import Settings
 from .tickets import Tickets
-from .tokens import Tokens
+from .tokens import Token, Tokens
 
-__all__ = ["Access", "Caller", "anybody", "is_loopback", "needed_scope"]
+__all__ = ["Access", "Caller", "anybody", "is_loopback", "key_of"]
 
-# Nobody needs a token to learn that the server is there and how it is used.
-_OPEN = {"/", "/docs", "/docs/oauth2-redirect", "/healthz", "/openapi.json", "/readyz"}
-_ADMIN = {"/metrics"}
-_READING = {"GET", "HEAD", "OPTIONS"}
+# What the key of somebody without a token begins with.
+_ADDRESS = "address "
+
+# Origins that the page of any site can have: one in a frame of a certain kind is called null.
+_ANY_SITE = {"*", "null"}
+
+_NO_LONGER = "expected a token that is still valid, got one that was revoked or has expired"
 
 _AUTHORITY = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^\s:/@\[\]]+))(?::(\d{1,5}))?", re.ASCII)
 _DEFAULT_PORTS = {"http": "80", "https": "443"}
@@ -43,10 +46,23 @@ class Caller:
         What limits for one client count by: a token, or an address (of IPv6 the network).
     name : str
         What stands in the log.
+    owner : str or None
+        Name of the token, to which belongs what is uploaded with it.
+    admin : bool
+        May do what the scope ``admin`` allows.
+    token : str or None
+        Hash of the token.
     """
 
     key: str
     name: str
+    owner: str | None = None
+    admin: bool = False
+    token: str | None = None
+
+    def may_delete(self, owner: str | None) -> bool:
+        """Whether a surface of this owner may be removed: by its owner and by an admin."""
+        return self.admin or (owner is not None and owner == self.owner)
 
 
 class Access:
@@ -59,8 +75,8 @@ class Access:
     Raises
     ------
     LodestreamError, OSError
-        When the token file cannot be used, or the address can be reached by others and there is neither a token nor
-        ``insecure``.
+        When the token file cannot be used; when there is no token, and the address can be reached by others without
+        ``insecure``, or pages of any site would be let in.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -73,6 +89,18 @@ class Access:
                 "make one with `lodestream token create`, or serve everything to everybody with --insecure"
             )
 
+        anywhere = _ANY_SITE & set(settings.origins)
+        if anywhere and not self._tokens.used:
+            raise LodestreamError(
+                f"expected a token, since LODESTREAM_ORIGINS={min(anywhere)} lets the pages of all sites in, and there "
+                f"is none in {settings.tokens}: make one with `lodestream token create`, or name the sites"
+            )
+
+    @property
+    def alone(self) -> bool:
+        """Whether only somebody who sits at this machine can write, so that there is nobody to share with."""
+        return not (self._tokens.used or self._settings.insecure)
+
     def check_origin(self, connection: HTTPConnection) -> None:
         """Refuse what the page of another site asks.
 
@@ -82,7 +110,8 @@ class Access:
             When there is an Origin, and it is neither our own nor one that the settings name.
         """
         for origin in connection.headers.getlist("origin"):
-            if origin not in self._settings.origins and not _is_own(origin, connection):
+            named = self._settings.origins
+            if origin not in named and "*" not in named and not _is_own(origin, connection):
                 raise ForeignOriginError(
                     f"expected a page of this server or of its origins to ask, got {origin[:80]!a}"
                 )
@@ -105,11 +134,11 @@ class Access:
                 raise BadTokenError("expected a token that this server knows, got one that it does not, or no longer")
             if not token.allows(scope):
                 raise SmallScopeError(f"expected a token that allows to {scope}, got one for {', '.join(token.scopes)}")
-            return Caller(f"token {token.name}", token.name)
+            return _holder_of(token)
         hindrance = self._hindrance(connection, scope)
         if hindrance is not None:
             raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none, and {hindrance}")
-        return anybody(connection)
+        return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
         """Who opens a stream; None when they have to show a ticket.
@@ -124,6 +153,10 @@ class Access:
         except NoTokenError:
             return None
 
+    def ticket(self, caller: Caller) -> str:
+        """A ticket for whoever asks; it is worth nothing any more once their token is not."""
+        return self.tickets.issue(caller.token or caller.key)
+
     def redeem(self, ticket: str | None) -> Caller:
         """Who shows a ticket.
 
@@ -134,12 +167,28 @@ class Access:
         """
         if ticket is None:
             raise NoTokenError("expected a token with the handshake or a ticket in open, got neither")
-        key = self.tickets.holder(ticket)
-        if key is None:
+        holder = self.tickets.holder(ticket)
+        if holder is None:
             raise BadTokenError(
                 f"expected a ticket that this server gave in the last {self.tickets.seconds:g} s, got another"
             )
-        return Caller(key, key.removeprefix("token "))
+        if holder.startswith(_ADDRESS):
+            return Caller(holder, holder.removeprefix(_ADDRESS))
+        token = self._tokens.known(holder)
+        if token is None:
+            raise BadTokenError(_NO_LONGER)
+        return _holder_of(token)
+
+    def check(self, caller: Caller) -> None:
+        """Look whether somebody who was let in earlier still may be here.
+
+        Raises
+        ------
+        BadTokenError
+            When their token was revoked or has expired.
+        """
+        if caller.token is not None and self._tokens.known(caller.token) is None:
+            raise BadTokenError(_NO_LONGER)
 
     def _hindrance(self, connection: HTTPConnection, scope: str) -> str | None:
         # Why somebody without a token may not do this; None when they may.
@@ -150,6 +199,10 @@ class Access:
         if self._settings.insecure:
             return None
         return next(_signs_of_others(connection, self._settings), None)
+
+
+def _holder_of(token: Token) -> Caller:
+    return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
 
 def _signs_of_others(connection: HTTPConnection, settings: Settings) -> Iterator[str]:
@@ -166,13 +219,9 @@ def _signs_of_others(connection: HTTPConnection, settings: Settings) -> Iterator
             yield f"the header {name} says that a proxy is in between"
 
 
-def needed_scope(method: str, path: str) -> str | None:
-    """The scope that a request needs, None for what is open to everybody; a path that nobody has thought of is not."""
-    if path in _ADMIN:
-        return "admin"
-    if method not in _READING:
-        return "read" if path == "/v1/tickets" else "write"
-    return None if path in _OPEN else "read"
+def key_of(owner: str | None) -> str:
+    """The key of whoever has a token of this name; one for all those who have none, where nothing else is known."""
+    return "nobody" if owner is None else f"token {owner}"
 
 
 def is_loopback(host: str) -> bool:
@@ -213,7 +262,7 @@ def anybody(connection: HTTPConnection) -> Caller:
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
-        return Caller(f"address {host[:80]}", host[:80])
+        return Caller(f"{_ADDRESS}{host[:80]}", host[:80])
     # One household or machine has at least a /64.
     network = ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address
-    return Caller(f"address {network}", host)
+    return Caller(f"{_ADDRESS}{network}", host)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -16,6 +17,8 @@ from .access import Access
 from .containers import Containers
 from .gate import Gate
 from .jobs import Builder
+from .level_files import LevelFiles
+from .level_queue import LevelQueue
 from .limits import Limits
 from .metrics import Metrics
 from .observation import Observation
@@ -29,6 +32,11 @@ _DESCRIPTION = """Structured surfaces, coarsest level first.
 
 Upload a surface, wait until it is ready, stream it: `WS /v1/surfaces/{id}/stream`, subprotocol `lodestream.v1`,
 MessagePack messages, described in `docs/protocol.md`. Errors are problem documents (RFC 9457)."""
+
+
+# What levels take of the disk where the settings say nothing, unless the disk is small.
+_LEVEL_DISK = 4 << 30
+_LEAST_LEVEL_DISK = 2 << 20
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -54,15 +62,22 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
-        storage = await asyncio.to_thread(Storage, chosen.data)
+        # A server has opened it before, so that it can say in one line why it does not start.
+        opened: Storage | None = getattr(app.state, "storage", None)
+        storage = await asyncio.to_thread(Storage, chosen.data) if opened is None else opened
         builder = Builder(storage, chosen, metrics.built)
-        limits = Limits(chosen, storage.root, lambda: len(storage), lambda: builder.pending)
+        limits = Limits(
+            chosen, storage.root, lambda: len(storage), builder.pending_of, storage.kept, lambda: access.alone
+        )
         metrics.watch(storage.root, lambda: len(storage), lambda: builder.pending)
-        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics)
+        files_of_levels = await asyncio.to_thread(_level_files, chosen, storage, limits)
+        levels = LevelQueue(chosen, storage, files_of_levels, builder.fork_server)
+        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics, levels)
         try:
-            builder.start()
+            builder.start(limits.check_owner)
             yield
         finally:
+            await levels.close()
             await builder.close()
             storage.close()
 
@@ -71,7 +86,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=lodestream.__version__,
         description=_DESCRIPTION,
         lifespan=life,
+        # The pages of the framework load scripts from another host; ours are in `pages`.
+        docs_url=None,
         redoc_url=None,
+        openapi_url=None,
         # A path with a slash too many is answered 404; a redirect would make a client send an upload twice.
         redirect_slashes=False,
     )
@@ -94,3 +112,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         )
     app.add_middleware(Observation, metrics=metrics)
     return app
+
+
+def _level_files(settings: Settings, storage: Storage, limits: Limits) -> LevelFiles:
+    most = settings.level_disk
+    if most is None:
+        most = max(min(_LEVEL_DISK, shutil.disk_usage(storage.root).total // 20), _LEAST_LEVEL_DISK)
+    return LevelFiles(storage.levels, most, limits.room)

@@ -61,17 +61,21 @@ def serve(args: argparse.Namespace) -> int:
     ------
     OptionError
         When a variable of the environment has a value that cannot be used.
-    LodestreamError
-        When others can reach the address, and there is no token.
+    LodestreamError, OSError
+        When others can reach the address, and there is no token; or the data folder cannot be used, or not all of it
+        is there.
     """
     settings = chosen_settings(args)
     from .logs import configure
-    from .running import make_server, raise_file_limit
+    from .open_files import raise_file_limit
+    from .running import make_server
 
-    server = make_server(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
     configure(settings.log_format, settings.log_level)
     raise_file_limit(settings)
+    server = make_server(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
     server.run()
+    if server.refusal is not None:
+        raise server.refusal
     return 0 if server.started else 1
 
 

@@ -1,27 +1,55 @@
-"""HTTP connections that do not wait for ever: for the head of a request, or for a client to take an answer."""
+"""HTTP connections that do not wait for ever, and read only so much that nobody wants.
+
+They wait for the head of a request, and for a client to take an answer, only so long. What comes is looked at in small
+pieces, so that others have their turn between them. Of a request that was answered before it was whole a bounded rest
+is read, so that the client sees the answer; then the connection is cut.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
-from typing import Any
+from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from .bodies import MOST_REST, CountedConnection
+from .cuts import Cuts
+from .open_files import most_connections
 from .settings import Settings
 
 __all__ = ["connections"]
 
+# What is given to h11 at once where a body does not say how long it is: little where chunks are small, since each costs
+# as much as many bytes, and more from one piece to the next where they are not.
+_LEAST_PIECE = 1024
+_LARGEST_PIECE = 8 * 1024
 
-def connections(settings: Settings) -> type[H11Protocol]:
+# Chunks of a piece that are few, and chunks after which others have their turn.
+_FEW_CHUNKS = 4
+_CHUNKS_A_TURN = 16
+
+# How long a client has to see the answer to a request that it has not sent whole.
+_REST_SECONDS = 3.0
+
+_TITLES = {
+    "bad-request": "Not a request",
+    "busy": "As much to do as the server can; come back",
+    "idle": "Nothing was heard for too long",
+    "small-chunks": "A body in chunks that are too small",
+}
+
+
+def connections(settings: Settings, cuts: Cuts) -> type[H11Protocol]:
     """The class of a server's connections; uvicorn makes one for each."""
 
     class Chosen(_Connection):
         head_seconds = settings.head_seconds
         idle_seconds = settings.idle_seconds
-        most = settings.max_connections
+        most = most_connections(settings)
 
+    Chosen.cuts = cuts
     return Chosen
 
 
@@ -36,20 +64,32 @@ class _Connection(H11Protocol):
         How long a client may take nothing of what is to be sent.
     most : int
         How many connections there may be.
+    cuts : Cuts
+        Where it is written down when the connection is cut.
     """
 
     head_seconds: float
     idle_seconds: float
     most: int
+    cuts: Cuts
+    conn: CountedConnection
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.conn = CountedConnection()
         self._head_timer: asyncio.TimerHandle | None = None
+        self._rest_timer: asyncio.TimerHandle | None = None
+        self._turn: asyncio.Handle | None = None
+        self._held = bytearray()
+        self._piece = _LEAST_PIECE
+        self._rest = 0
         self._watch: _Watch | None = None
         self._upgraded = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
+        self._socket = transport
+        self._guarded = _Transport(self, transport)
+        super().connection_made(cast(asyncio.Transport, self._guarded))
         self._watch = _Watch(transport, self.loop, self.idle_seconds)
         if len(self.connections) > self.most:
             self._refuse(503, "busy", f"expected at most {self.most} connections; come back in a few seconds")
@@ -57,9 +97,14 @@ class _Connection(H11Protocol):
             self._follow_head()
 
     def data_received(self, data: bytes) -> None:
-        if not self.transport.is_closing():
-            super().data_received(data)
-            self._follow_head()
+        if self._rest_timer is not None:
+            self._rest += len(data)
+            if self._rest > MOST_REST:
+                self._socket.pause_reading()
+        elif not self._socket.is_closing():
+            self._held += data
+            if self._turn is None:
+                self._feed()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -69,23 +114,115 @@ class _Connection(H11Protocol):
         self._upgraded = True
         if self._watch is not None:
             self._watch.upgraded = True
+        self.transport = self._socket
+        self._guarded.let_go()
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._forget_head()
+        for handle in (self._turn, self._rest_timer):
+            if handle is not None:
+                handle.cancel()
+        self._held.clear()
         super().connection_lost(exc)
+        self._guarded.let_go()
 
     def resume_writing(self) -> None:
         if self._watch is not None:
             self._watch.moved = True
         super().resume_writing()
 
+    def send_400_response(self, msg: str) -> None:
+        code = "bad-request" if self.conn.offence is None else "small-chunks"
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            self.cuts.note(code, self.client)
+            self._refuse(400, code, self.conn.offence or "expected a request of HTTP/1.1 that can be read")
+        else:
+            # The answer is under way already, or was sent.
+            self._cut(code)
+
+    def resume_reading(self) -> None:
+        """Go on with what has come already; then with what comes."""
+        if self._held and not self._upgraded:
+            if self._turn is None:
+                self._turn = self.loop.call_soon(self._feed)
+        else:
+            self._socket.resume_reading()
+
+    def is_closing(self) -> bool:
+        """Whether no other request is taken."""
+        return self._rest_timer is not None or self._socket.is_closing()
+
+    def close(self) -> None:
+        """Close, but let a client that is still sending see the answer first.
+
+        A socket that is closed before everything was read from it sends a reset, which may overtake the answer.
+        """
+        unread = self._held or self.conn.their_state in (h11.SEND_BODY, h11.ERROR)
+        if self._upgraded or self.is_closing() or not unread:
+            self._socket.close()
+            return
+        self._forget_head()
+        self._leave_request()
+        self._rest = len(self._held)
+        self._held.clear()
+        self._socket.write_eof()
+        if self._rest <= MOST_REST:
+            self._socket.resume_reading()
+        self._rest_timer = self.loop.call_later(_REST_SECONDS, self._rest_is_over)
+
+    def _feed(self) -> None:
+        self._turn = None
+        before = self.conn.chunks
+        while self._may_feed() and self.conn.chunks - before < _CHUNKS_A_TURN:
+            size, chunks = max(self._piece, self.conn.remaining), self.conn.chunks
+            piece = bytes(self._held[:size])
+            del self._held[:size]
+            super().data_received(piece)
+            few = self.conn.chunks - chunks <= _FEW_CHUNKS
+            self._piece = min(2 * self._piece, _LARGEST_PIECE) if few else _LEAST_PIECE
+        if self._upgraded:
+            # A client waits for the answer to its handshake before it sends anything else.
+            self._held.clear()
+            self._socket.resume_reading()
+        elif not self.is_closing():
+            # While some of it waits no more is read.
+            if self._held:
+                self._socket.pause_reading()
+            elif not self.flow.read_paused:
+                self._socket.resume_reading()
+            if self._may_feed():
+                self._turn = self.loop.call_soon(self._feed)
+        self._follow_head()
+
+    def _may_feed(self) -> bool:
+        return bool(self._held) and not (self._upgraded or self.flow.read_paused or self.is_closing())
+
+    def _rest_is_over(self) -> None:
+        if self._socket.get_write_buffer_size():
+            # A client that takes nothing of the answer is found out by the watch.
+            self._rest_timer = self.loop.call_later(_REST_SECONDS, self._rest_is_over)
+        elif self._rest > MOST_REST:
+            self._cut("refused-body")
+        else:
+            self._socket.abort()
+
+    def _leave_request(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+
+    def _cut(self, reason: str) -> None:
+        self.cuts.note(reason, self.client)
+        self._held.clear()
+        self._socket.abort()
+
     def _follow_head(self) -> None:
         # The clock is not set back by a byte: a head that comes byte by byte is late like one that does not come. The
         # rest of a body that was answered before it was whole is read, since a client may look only after it.
         answered = self.cycle is not None and self.cycle.response_complete
         waiting = self.conn.their_state is h11.IDLE or (answered and self.conn.their_state is h11.SEND_BODY)
-        if self._upgraded or self.transport.is_closing() or not waiting:
+        if self._upgraded or self.is_closing() or not waiting:
             self._forget_head()
         elif self._head_timer is None:
             self._head_timer = self.loop.call_later(self.head_seconds, self._head_is_late)
@@ -100,22 +237,43 @@ class _Connection(H11Protocol):
         if self.conn.our_state is h11.IDLE:
             self._refuse(408, "idle", f"expected the whole head of a request within {self.head_seconds:g} s")
         else:
-            self.transport.close()
+            self._cut("refused-body")
 
     def _refuse(self, status: int, code: str, detail: str) -> None:
-        title = "Nothing was heard for too long" if status == 408 else "As much to do as the server can; come back"
-        problem = {"type": f"urn:lodestream:{code}", "title": title, "status": status, "code": code, "detail": detail}
-        body = json.dumps({**problem, "instance": None}).encode()
+        self._leave_request()
+        problem = {"type": f"urn:lodestream:{code}", "title": _TITLES[code], "status": status, "code": code}
+        body = json.dumps({**problem, "detail": detail, "instance": None}).encode()
         headers = [
             ("content-type", "application/problem+json"),
             ("content-length", str(len(body))),
-            ("retry-after", "5"),
             ("connection", "close"),
         ]
-        events = (h11.Response(status_code=status, headers=headers), h11.Data(data=body), h11.EndOfMessage())
-        for event in events:
+        if status != 400:
+            headers.append(("retry-after", "5"))
+        asked_for_head = self.conn.our_state is h11.SEND_RESPONSE and self.scope["method"] == "HEAD"
+        sent = h11.Data(data=b"" if asked_for_head else body)
+        for event in (h11.Response(status_code=status, headers=headers), sent, h11.EndOfMessage()):
             self.transport.write(self.conn.send(event))
         self.transport.close()
+
+
+class _Transport:
+    """What a connection and its requests see of their transport: closing and reading are left to the connection."""
+
+    def __init__(self, connection: _Connection, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        self.close = connection.close
+        self.is_closing = connection.is_closing
+        self.resume_reading = connection.resume_reading
+
+    def let_go(self) -> None:
+        """Forget the connection, which so needs no garbage collection."""
+        self.close = self._transport.close
+        self.is_closing = self._transport.is_closing
+        self.resume_reading = self._transport.resume_reading
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
 
 
 class _Watch:

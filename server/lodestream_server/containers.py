@@ -6,18 +6,19 @@ import os
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, BinaryIO
-
-from lodestream.errors import NotFoundError
+from weakref import WeakValueDictionary
 
 from .storage import Storage
 
 if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
 
-__all__ = ["Containers", "OpenContainer"]
+__all__ = ["Containers", "OpenContainer", "read_from"]
 
-# An index holds a record per segment, a few megabytes for the largest surfaces: streams of one surface share it.
+# An index holds a record per segment, a few megabytes for the largest surfaces: so many are kept when nobody has the
+# container open any more.
 _INDEXES_KEPT = 16
 
 # Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
@@ -34,7 +35,7 @@ class OpenContainer:
 
     def read(self, place: ByteRange) -> bytes:
         """The bytes of a slice, fewer where the file ends; from any thread."""
-        return os.pread(self.file.fileno(), place.length, place.offset)
+        return read_from(self.file.fileno(), place.offset, place.length)
 
     def read_at_once(self, place: ByteRange) -> bytes | None:
         """The same without waiting for a disk: None where the system would have to, or cannot tell."""
@@ -54,12 +55,14 @@ class OpenContainer:
 
 
 class Containers:
-    """The containers of a storage, with the indexes used last."""
+    """The containers of a storage, with the indexes used last and those of all that are open."""
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
-        self._indexes: OrderedDict[str, Index] = OrderedDict()
         self._lock = threading.Lock()
+        self._used: OrderedDict[str, Index] = OrderedDict()
+        self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
+        self._readers: WeakValueDictionary[str, _Reader] = WeakValueDictionary()
 
     def open(self, sha256: str) -> OpenContainer:
         """Open a container.
@@ -68,13 +71,15 @@ class Containers:
         ------
         NotFoundError
             When there is none.
+        MissingError
+            When it is not on the disk.
         StreamError
             When it is damaged.
         """
         try:
             file = self._storage.container(sha256).open("rb")
-        except FileNotFoundError:  # deleted since it was looked for
-            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}") from None
+        except FileNotFoundError:
+            raise self._storage.gone(sha256) from None
         try:
             return OpenContainer(sha256, self._index(sha256, file), file)
         except BaseException:
@@ -83,16 +88,53 @@ class Containers:
 
     def _index(self, sha256: str, file: BinaryIO) -> Index:
         with self._lock:
-            known = self._indexes.get(sha256)
+            known = self._known(sha256)
             if known is not None:
-                self._indexes.move_to_end(sha256)
                 return known
-        from lodestream.container import read_index
+            reader = self._readers.get(sha256)
+            if reader is None:
+                reader = self._readers[sha256] = _Reader()
+        # Of many who open one container at the same time one reads its index.
+        with reader.lock:
+            with self._lock:
+                known = self._known(sha256)
+            if known is None:
+                known = _read_index(file)
+                with self._lock:
+                    self._indexes[sha256] = known
+                    self._known(sha256)
+            return known
 
-        handle = file.fileno()
-        index = read_index(lambda offset, length: os.pread(handle, length, offset), os.fstat(handle).st_size)
-        with self._lock:
-            self._indexes[sha256] = index
-            while len(self._indexes) > _INDEXES_KEPT:
-                self._indexes.popitem(last=False)
+    def _known(self, sha256: str) -> Index | None:
+        index = self._indexes.get(sha256)
+        if index is not None:
+            self._used[sha256] = index
+            self._used.move_to_end(sha256)
+            while len(self._used) > _INDEXES_KEPT:
+                self._used.popitem(last=False)
         return index
+
+
+class _Reader:
+    """Whoever reads an index, and those who wait for it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+
+def _read_index(file: BinaryIO) -> Index:
+    from lodestream.container import read_index
+
+    handle = file.fileno()
+    return read_index(partial(read_from, handle), os.fstat(handle).st_size)
+
+
+def read_from(handle: int, offset: int, length: int) -> bytes:
+    """Bytes of a file, fewer where it ends; the system may give fewer at a time for other reasons."""
+    data = bytearray()
+    while len(data) < length:
+        piece = os.pread(handle, length - len(data), offset + len(data))
+        if not piece:
+            break
+        data += piece
+    return bytes(data)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -20,13 +21,13 @@ class Disk:
     """The steps in which the server changes its folder, each of which may fail for want of space."""
 
     def make_folder(self, path: Path) -> None:
-        """Make a folder."""
-        path.mkdir()
+        """Make a folder, its owner's alone."""
+        path.mkdir(0o700)
 
     def create(self, path: Path) -> BinaryIO:
-        """Open a new file for writing."""
+        """Open a new file for writing, its owner's alone from the first byte."""
         # Unbuffered: the bytes reach the file in `write`, and nothing is left to fail when it is closed.
-        return path.open("xb", buffering=0)
+        return open(path, "xb", buffering=0, opener=_private)
 
     def write(self, file: BinaryIO, data: bytes) -> None:
         """Append bytes, all of them."""
@@ -48,7 +49,30 @@ class Disk:
 
     def remove_folder(self, path: Path) -> None:
         """Remove a folder with what is in it."""
-        shutil.rmtree(path, ignore_errors=True)
+        with suppress(RecursionError):  # one that was made to be too deep
+            shutil.rmtree(path, ignore_errors=True)
+        if path.is_dir():
+            with suppress(OSError):
+                _remove_deep(path)
+
+
+def _remove_deep(top: Path) -> None:
+    """Remove a folder however deep its folders are, and whatever may be done in them."""
+    while inner := [entry.path for entry in os.scandir(top) if entry.is_dir(follow_symlinks=False)]:
+        for folder in inner:
+            os.chmod(folder, 0o700)
+            for entry in list(os.scandir(folder)):
+                if entry.is_dir(follow_symlinks=False):
+                    os.chmod(entry.path, 0o700)
+                    os.rename(entry.path, top / f".{secrets.token_hex(8)}")
+                else:
+                    os.unlink(entry.path)
+            os.rmdir(folder)
+    shutil.rmtree(top)
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 #: What the functions below work on.
@@ -101,16 +125,16 @@ def write_file(path: Path, data: bytes) -> None:
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(8)}.new")
     with NewFile(temporary) as file:
         file.write(data)
-    rename(temporary, path)
+    try:
+        rename(temporary, path)
+    except OSError:
+        disk.unlink(temporary)
+        raise
 
 
 def rename(source: Path, target: Path) -> None:
-    """Give a file or folder that is on disk its final place; it is gone if that fails."""
-    try:
-        disk.rename(source, target)
-    except OSError:
-        remove(source)
-        raise
+    """Give a file or folder that is on disk its final place; where that fails it keeps its own."""
+    disk.rename(source, target)
     sync_folder(target.parent)
 
 

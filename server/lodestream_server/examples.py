@@ -12,6 +12,7 @@ QUEUED: dict[str, Any] = {
     "id": "5f1c0a9b3d7e42a68c10",
     "url": "/v1/surfaces/5f1c0a9b3d7e42a68c10",
     "name": "Jacksboro",
+    "owner": "ci",
     "state": "queued",
     "progress": 0.0,
     "reason": None,

@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
-from collections.abc import AsyncIterator
-from typing import Annotated, BinaryIO
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
+from fastapi.responses import FileResponse, RedirectResponse, Response
+from starlette.types import Receive, Scope, Send
 
-from lodestream.errors import NotFoundError, OptionError
+from lodestream.errors import OptionError, StreamError
 
 from . import examples
-from .levels import MEDIA_TYPES, write_level
-from .problems import BuildFailedError, NotReadyError, responses
+from .access import anybody
+from .gate import caller_of
+from .level_files import Key
+from .level_queue import Loan
+from .levels import MEDIA_TYPES
+from .problems import BuildFailedError, MissingError, NotReadyError, PostponedError, responses
 from .ranges import sort_out
 from .records import Record
 from .routing import Parts, State, matches, readable
+from .scopes import needs
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["files"])
-
-_CHUNK = 64 * 1024
 
 
 @readable(
@@ -32,8 +33,9 @@ _CHUNK = 64 * 1024
     status_code=307,
     summary="Find a surface's container",
     response_class=Response,
-    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 424)},
+    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 424, 503)},
 )
+@needs("read")
 async def find(request: Request, parts: Parts, surface: str) -> Response:
     """Redirect to the container; while it is being built, 409 with Retry-After."""
     record = ready(parts, surface)
@@ -50,9 +52,10 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
         200: {"description": "The whole container", "content": {examples.CONTAINER_TYPE: {}}},
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
-        **responses(404, 416),
+        **responses(404, 416, 503),
     },
 )
+@needs("read")
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     """A container never changes: its name is the hash of its content, which is its strong ETag."""
     path = parts.storage.container(sha256)
@@ -66,8 +69,11 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
         return unchanged
     try:
         status = path.stat()
-    except FileNotFoundError:  # deleted since it was looked for
-        raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}") from None
+    except FileNotFoundError:
+        raise parts.storage.gone(sha256) from None
+    kept = parts.storage.container_bytes(sha256)
+    if kept not in (None, status.st_size):
+        raise StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
     sort_out(request, status.st_size, etag)
     return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
 
@@ -77,8 +83,14 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     "/surfaces/{surface}/levels/{level}",
     summary="Fetch one level as a file",
     response_class=Response,
-    responses={200: examples.LEVEL, 304: {"description": "The client has it"}, **responses(404, 409, 422, 424, 503)},
+    responses={
+        200: examples.LEVEL,
+        206: {"description": "The range asked for"},
+        304: {"description": "The client has it"},
+        **responses(404, 409, 413, 416, 422, 424, 429, 501, 503, 507),
+    },
 )
+@needs("read")
 async def level(
     request: Request,
     parts: Parts,
@@ -94,11 +106,29 @@ async def level(
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         return unchanged
-    async with parts.decoding:
-        file = await asyncio.to_thread(_cut, parts, record, level, format_name)
-    headers["content-length"] = str(os.fstat(file.fileno()).st_size)
-    headers["content-disposition"] = f'attachment; filename="{record.id}-{level}.{format_name}"'
-    return StreamingResponse(_pieces(file), headers=headers, media_type=MEDIA_TYPES[format_name])
+    key = Key(record.container or "", level, format_name)
+    loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
+    try:
+        sort_out(request, loan.size, etag)
+        headers["content-disposition"] = f'attachment; filename="{record.id}-{level}.{format_name}"'
+        return _Borrowed(loan, headers, MEDIA_TYPES[format_name])
+    except BaseException:
+        loan.release()
+        raise
+
+
+class _Borrowed(FileResponse):
+    """A file that is given back once it was sent, or the client has gone."""
+
+    def __init__(self, loan: Loan, headers: dict[str, str], media_type: str) -> None:
+        super().__init__(loan.path, headers=headers, media_type=media_type, stat_result=loan.path.stat())
+        self._loan = loan
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._loan.release()
 
 
 def ready(parts: State, surface: str) -> Record:
@@ -108,12 +138,18 @@ def ready(parts: State, surface: str) -> Record:
     ------
     NotFoundError
         When there is no such surface.
-    NotReadyError, BuildFailedError
-        When it has none yet, or never will.
+    NotReadyError, PostponedError, BuildFailedError
+        When it has none yet, has to be tried again, or never will.
+    MissingError
+        When it is not on the disk now.
     """
     record = parts.storage.get(surface)
     if record.state == "failed":
         raise BuildFailedError(f"{surface} could not be built: {record.reason}")
+    if record.state == "waiting":
+        raise PostponedError(f"{surface} could not be built and waits for another attempt: {record.reason}")
+    if record.state == "missing":
+        raise MissingError(f"expected {surface} on the server's disk: {record.reason}")
     if record.state != "ready":
         state, progress = parts.builder.state(record)
         raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); come back soon")
@@ -126,19 +162,3 @@ def _check(record: Record, level: int, format_name: str) -> None:
         raise OptionError(f"expected a level of 0 to {finest}, got {level}")
     if format_name not in MEDIA_TYPES:
         raise OptionError(f"expected format to be one of {', '.join(MEDIA_TYPES)}, got {format_name[:80]!a}")
-
-
-def _cut(parts: State, record: Record, level: int, format_name: str) -> BinaryIO:
-    container = parts.containers.open(record.container or "")
-    try:
-        return write_level(container, level, format_name, parts.storage.temporary)
-    finally:
-        container.close()
-
-
-async def _pieces(file: BinaryIO) -> AsyncIterator[bytes]:
-    try:
-        while piece := await asyncio.to_thread(file.read, _CHUNK):
-            yield piece
-    finally:
-        file.close()

@@ -7,25 +7,27 @@ say where. An upload is compared with the hash that was taken while it came in. 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
-from lodestream.container import FrameReader, Index, describe, read_index
+from lodestream.container import FrameReader, Index, read_index
 from lodestream.errors import LodestreamError
 
-from .records import Record, plain
-from .storage import Folders
-from .uploads import digest_of
+from . import markers
+from .finished import figures_of
+from .folders import Folders, is_file, is_folder
+from .records import Record, read_record
+from .recovery import stray_containers
+from .uploads import check_upload
 
-__all__ = ["Finding", "Report", "What", "check", "check_container", "check_upload", "read_record"]
+__all__ = ["Finding", "Report", "What", "check", "check_container"]
 
-What = Literal["record", "upload", "container", "figures", "leftover"]
+What = Literal["marker", "record", "upload", "container", "figures", "leftover"]
 
 _CHUNK = 1 << 20
 
@@ -38,8 +40,9 @@ class Finding:
     ----------
     what : str
         ``record``, ``upload`` or ``container``: it is damaged or gone. ``figures``: a record says something else of its
-        container than the container itself. ``leftover``: a file that nothing refers to, as a process leaves them that
-        is killed; the server removes them when it starts, and they are no damage.
+        container than the container itself. ``marker``: the folders do not belong together, or are not all there.
+        ``leftover``: a file that nothing refers to, as a process leaves them that is killed; the next start removes or
+        sets aside what it finds, and it is no damage.
     path : Path
     surface : str or None
         Whose it is.
@@ -47,8 +50,10 @@ class Finding:
         What was expected and what came.
     repair : str or None
         What was done about it.
+    repaired : bool
+        Another look, after that, found nothing any more.
     lost : bool
-        The surface could not be saved.
+        The surface cannot be served, nor built again from what is here.
     """
 
     what: What
@@ -56,7 +61,13 @@ class Finding:
     surface: str | None
     problem: str
     repair: str | None = None
+    repaired: bool = False
     lost: bool = False
+
+    @property
+    def key(self) -> tuple[What, Path, str | None]:
+        """What it is found again by."""
+        return self.what, self.path, self.surface
 
 
 @dataclass
@@ -80,7 +91,7 @@ class Report:
     @property
     def clean(self) -> bool:
         """Nothing is damaged, or everything that was has been repaired."""
-        return all(finding.repair is not None and not finding.lost for finding in self.damage)
+        return all(finding.repaired for finding in self.damage)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -99,6 +110,7 @@ class Report:
                     "surface": finding.surface,
                     "problem": finding.problem,
                     "repair": finding.repair,
+                    "repaired": finding.repaired,
                     "lost": finding.lost,
                 }
                 for finding in self.findings
@@ -113,13 +125,18 @@ def check(root: Path) -> Report:
     ------
     LodestreamError
         When it is no folder of a server.
+    OSError
+        When something in it cannot be looked at.
     """
     at = Folders(root)
-    if not at.records.is_dir() or not at.containers.is_dir():
-        raise LodestreamError(f"expected the data folder of a server, with records and containers in it, got {root}")
+    if not any(is_folder(folder) for folder in at.kept):
+        raise LodestreamError(f"expected the data folder of a server, with records, uploads and containers, got {root}")
     started = time.monotonic()
     report = Report(root)
-    for path in sorted(at.records.glob("*.json")):
+    problem = markers.fault(at)
+    if problem is not None:
+        report.findings.append(Finding("marker", root, None, problem))
+    for path in at.all_records():
         report.surfaces += 1
         try:
             record = read_record(path)
@@ -127,52 +144,31 @@ def check(root: Path) -> Report:
             report.findings.append(Finding("record", path, path.stem, f"expected a record: {error}"))
         else:
             report.records[record.id] = record
+    uploads: dict[str, str | None] = {}
     indexes: dict[str, Index | str] = {}
     for record in report.records.values():
-        if record.state == "queued" or (record.state == "ready" and not record.upload_lost):
-            report.findings.extend(_upload(at, record, report))
+        report.findings.extend(_upload(at, record, report, uploads))
         if record.state == "ready":
             report.findings.extend(_container(at, record, report, indexes))
-    report.findings.extend(_leftovers(at, report))
+    report.findings.extend(_strays(at, report))
     report.seconds = time.monotonic() - started
     return report
 
 
-def read_record(path: Path) -> Record:
-    """The record in a file.
-
-    Raises
-    ------
-    ValueError
-        When it is none, or that of another surface; in one line.
-    """
-    record = Record.from_json(json.loads(path.read_bytes()))
-    if path.name != "record.json" and record.id != path.stem:
-        raise ValueError(f"expected that of {path.stem}, got that of {record.id[:80]!a}")
-    return record
-
-
-def _upload(at: Folders, record: Record, report: Report) -> Iterator[Finding]:
-    report.uploads += 1
-    report.bytes += record.upload_bytes
-    problem = check_upload(at, record)
+def _upload(at: Folders, record: Record, report: Report, known: dict[str, str | None]) -> Iterator[Finding]:
+    path = at.upload(record)
+    # Of what was damaged nothing is left here; and earlier versions dropped the upload of what had failed.
+    dropped = record.upload_lost or (record.state == "failed" and record.upload is None)
+    if dropped and not any(is_file(file) for file in at.files(record)):
+        return
+    # Several surfaces may have the same upload.
+    if record.folder not in known:
+        report.uploads += 1
+        report.bytes += record.upload_bytes
+        known[record.folder] = check_upload(at.files(record), record)
+    problem = known[record.folder]
     if problem is not None:
-        yield Finding("upload", at.uploads / record.id, record.id, problem)
-
-
-def check_upload(at: Folders, record: Record) -> str | None:
-    """What is wrong with an upload; None where nothing is."""
-    files = at.upload(record)
-    try:
-        found = sum(path.stat().st_size for path in files)
-        if found != record.upload_bytes:
-            return f"expected {record.upload_bytes} bytes, got {found}"
-        digest = digest_of(files) if record.upload_sha256 else None
-    except OSError as error:
-        return f"expected {len(files)} files: {error.strerror}"
-    if digest != record.upload_sha256:
-        return f"expected files with the SHA-256 {record.upload_sha256}, got {digest}"
-    return None
+        yield Finding("upload", path, record.id, problem)
 
 
 def _container(at: Folders, record: Record, report: Report, indexes: dict[str, Index | str]) -> Iterator[Finding]:
@@ -187,13 +183,19 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
     index = indexes[sha256]
     if isinstance(index, str):
         yield Finding("container", path, record.id, index)
-    elif plain(describe(index)) != record.info:
+    elif figures_of(index, record.info, at.files(record)) != record.info:
         problem = "expected the figures that the container has, got others"
         yield Finding("figures", at.record(record.id), record.id, problem)
 
 
 def check_container(path: Path, sha256: str) -> Index | str:
-    """The index of a container that is whole, or what is wrong with it."""
+    """The index of a container that is whole, or what is wrong with it.
+
+    Raises
+    ------
+    OSError
+        When it is there and cannot be read: what is wrong then is the disk, and perhaps for a moment only.
+    """
     frames, digest = FrameReader(), hashlib.sha256()
     place = None
     try:
@@ -209,36 +211,51 @@ def check_container(path: Path, sha256: str) -> Index | str:
             if digest.hexdigest() != sha256:
                 where = f"; {place}" if place else ""
                 return f"expected bytes with the SHA-256 of the name, got {digest.hexdigest()}{where}"
-            return place or _index(file.fileno())
-    except OSError as error:
+            return place or _index(file)
+    except (FileNotFoundError, NotADirectoryError) as error:
         return f"expected a container: {error.strerror}"
 
 
-def _index(handle: int) -> Index | str:
+def _index(file: BinaryIO) -> Index | str:
+    def read(offset: int, length: int) -> bytes:
+        file.seek(offset)
+        return file.read(length)  # buffered: as many bytes as there are, however few the system gives at a time
+
     try:
-        index = read_index(lambda offset, length: os.pread(handle, length, offset), os.fstat(handle).st_size)
+        index = read_index(read, os.fstat(file.fileno()).st_size)
     except LodestreamError as error:
         return str(error)
     for segment in index.segments:
-        if zlib.crc32(os.pread(handle, segment.range.length, segment.range.offset)) != segment.crc:
+        if zlib.crc32(read(segment.range.offset, segment.range.length)) != segment.crc:
             return f"expected segments that match the index, got another one (at byte {segment.range.offset})"
     return index
 
 
-def _leftovers(at: Folders, report: Report) -> Iterator[Finding]:
-    unreadable = {finding.surface for finding in report.findings if finding.what == "record"}
-    kept = {record.id for record in report.records.values() if record.state != "failed"} | unreadable
-    containers = {at.container(record.container).name for record in report.records.values()}
-    known: dict[Path, set[str | None]] = {
-        at.uploads: {*kept},
-        at.containers: {*containers},
-        at.incoming: set(),
-        at.work: set(),
-    }
-    for folder, names in known.items():
-        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-            if path.name not in names:
-                yield Finding("leftover", path, None, "expected what a record refers to, got something else")
-    for path in sorted(at.records.iterdir()):
-        if path.suffix != ".json":
-            yield Finding("leftover", path, None, "expected a record, got a file that was being written")
+def _strays(at: Folders, report: Report) -> Iterator[Finding]:
+    folders = {record.folder for record in report.records.values()}
+    # Who knows what the records that cannot be used speak of?
+    unusable = any(finding.what == "record" for finding in report.findings)
+    deleted = {path.stem for path in at.tombstones()}
+    for upload in at.all_uploads():
+        owned = False
+        for copy in at.copies(upload):
+            try:
+                record = read_record(copy)
+            except ValueError:
+                continue
+            if record.folder != upload.name:
+                continue
+            owned = True
+            if record.id not in deleted and not is_file(at.record(record.id)):
+                yield Finding("record", at.record(record.id), record.id, "expected a record, got none")
+        if not (owned or unusable or upload.name in folders):
+            yield Finding("leftover", upload, None, "expected what a record refers to, got something else")
+    for container in () if unusable else stray_containers(at, report.records.values()):
+        yield Finding("leftover", container, None, "expected what a record refers to, got something else")
+    for path in at.tombstones():
+        yield Finding("leftover", path, path.stem, "expected no surface that is still being deleted, got one")
+    for path in at.unfinished():
+        yield Finding("leftover", path, None, "expected a record, got a file that was being written")
+    for folder in (at.incoming, at.work, at.levels):
+        for path in sorted(folder.iterdir()) if is_folder(folder) else ():
+            yield Finding("leftover", path, None, "expected nothing under way, got something")

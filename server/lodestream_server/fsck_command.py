@@ -7,11 +7,17 @@ import asyncio
 import json
 import os
 import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lodestream.errors import LodestreamError, OptionError
+from lodestream.text import printable
+
 if TYPE_CHECKING:
     from .fsck import Report
+    from .records import Record
 
 __all__ = ["fsck", "register"]
 
@@ -23,7 +29,7 @@ def register(subparsers: Any) -> None:
         help="check a server's folder, and repair it",
         description="Check everything in a server's folder: records, uploads by the hash that was taken when they "
         "came, containers by their name, sections and segments. No server may be running there. Exit code 0: all is "
-        "well, or was repaired without a loss; 1: something is damaged.",
+        "well, or was repaired without a loss; 1: something is damaged, or with --retry waits still.",
         allow_abbrev=False,
     )
     parser.add_argument("data", metavar="DIR", type=Path, help="folder of a server")
@@ -31,6 +37,17 @@ def register(subparsers: Any) -> None:
         "--repair",
         action="store_true",
         help="move what is damaged into DIR/damaged, and build it again from its upload",
+    )
+    parser.add_argument(
+        "--adopt",
+        action="store_true",
+        help="say that records, uploads and containers in DIR belong together, after they were moved there: their "
+        "markers are written anew, and uploads that have a record of their own are taken in",
+    )
+    parser.add_argument(
+        "--retry",
+        action="store_true",
+        help="build again what waits, since it could not be built for a reason that may have passed",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)
@@ -44,45 +61,90 @@ def fsck(args: argparse.Namespace) -> int:
     LodestreamError
         When it is no folder of a server, or another process works in it.
     """
-    report = _checked(args.data, args.repair)
-    if args.repair and report.findings:
-        from .command import chosen_settings
-        from .repair import rebuild
+    from .folders import Folders
 
-        asyncio.run(rebuild(report, chosen_settings(args)))
+    folder: Path = args.data
+    if args.adopt and args.repair:
+        raise OptionError("expected --adopt or --repair, got both: adopt first, and see that all is there")
+    if not any(place.is_dir() for place in Folders(folder).kept):
+        raise LodestreamError(
+            f"expected the data folder of a server, with records, uploads and containers, got {folder}"
+        )
+    report, records = _looked_through(folder, args)
+    waiting = [record for record in records.values() if record.state == "waiting"]
     if args.json:
-        print(json.dumps(report.to_json()))
+        print(json.dumps({**report.to_json(), "waiting": [record.id for record in waiting]}))
     else:
-        _print(report)
-    return 0 if report.clean else 1
+        _print(report, waiting)
+    return 0 if report.clean and not (args.retry and waiting) else 1
 
 
-def _checked(folder: Path, repair: bool) -> Report:
+def _looked_through(folder: Path, args: argparse.Namespace) -> tuple[Report, Mapping[str, Record]]:
+    from .fsck import check
+
+    # Whoever only looks makes no lock where there is none: nobody has worked there.
+    changes = args.repair or args.adopt or args.retry
+    with _alone(folder) if changes or (folder / "lock").is_file() else nullcontext():
+        report = _first(folder, args)
+    if not changes:
+        return report, report.records
+    from .command import chosen_settings
+    from .repair import compare, rebuild
+
+    if report.findings or args.adopt or args.retry:
+        records = asyncio.run(rebuild(folder, chosen_settings(args), retry=args.retry))
+        with _alone(folder):
+            again = check(folder)
+        if args.repair:
+            compare(report, again, records)
+        else:
+            report = again
+        return report, records
+    return report, report.records
+
+
+def _first(folder: Path, args: argparse.Namespace) -> Report:
+    from . import markers
+    from .folders import Folders
     from .fsck import check
     from .repair import set_aside
+
+    if args.adopt:
+        markers.adopt(Folders(folder))
+    elif args.repair or args.retry:
+        markers.establish(Folders(folder))  # or it says why nothing may be changed here
+    report = check(folder)
+    if args.repair:
+        set_aside(report)
+    return report
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
     from .storage import claim
 
-    # The folder is looked at before a lock is made in it: it may be no folder of a server at all.
-    if not (folder / "lock").is_file():
-        return check(folder)
     guard = claim(folder)
     try:
-        report = check(folder)
-        if repair:
-            set_aside(report)
-        return report
+        yield
     finally:
         os.close(guard)
 
 
-def _print(report: Report) -> None:
+def _print(report: Report, waiting: Sequence[Record]) -> None:
+    for record in waiting:
+        print(printable(f"surface {record.id} waits: {record.reason}"))
     for finding in report.findings:
         place = finding.path.relative_to(report.folder)
         of = f" of surface {finding.surface}" if finding.surface and finding.what != "record" else ""
         repair = f" - {finding.repair}" if finding.repair else ""
-        print(f"{finding.what}{of}, {place}: {finding.problem}{repair}")
+        print(printable(f"{finding.what}{of}, {place}: {finding.problem}{repair}"))
     found = len(report.damage)
-    problems = "nothing is damaged" if not found else f"{found} damaged" + (", repaired" if report.clean else "")
+    repaired = sum(finding.repaired for finding in report.damage)
+    lost = sum(finding.lost for finding in report.damage)
+    problems = "nothing is damaged" if not found else f"{found} damaged"
+    problems += f", {repaired} of these repaired" if repaired else ""
+    problems += f", {lost} lost" if lost else ""
+    problems += f", {len(waiting)} surfaces wait for another attempt" if waiting else ""
     leftovers = len(report.findings) - found
     print(
         f"{report.surfaces} surfaces, {report.uploads} uploads, {report.containers} containers, "

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 from fastapi import Request
 from fastapi.requests import HTTPConnection
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import LodestreamError, NotFoundError
 
-from .access import Access, Caller, needed_scope
+from .access import Access, Caller
 from .problems import answer
+from .scopes import needed_scope
 
 __all__ = ["Gate", "caller_of"]
 
@@ -17,9 +20,7 @@ _CALLER = "lodestream.caller"
 
 
 class Gate:
-    """ASGI middleware that asks `Access`.
-
-    A route that nobody has thought of needs a token, so that forgetting one opens nothing.
+    """ASGI middleware that asks `Access` for the scope that the route declares (`scopes`).
 
     Parameters
     ----------
@@ -42,14 +43,18 @@ class Gate:
         await self._app(scope, receive, send)
 
     def _admit(self, scope: Scope) -> Caller | None:
+        _check_path(scope)
         connection = HTTPConnection(scope)
+        needed = needed_scope(scope)
         if scope["type"] == "websocket":
             self._access.check_origin(connection)
-            return self._access.reader(connection)
+            return self._access.reader(connection) if needed == "read" else self._authorize(connection, needed)
         request = Request(scope)
-        needed = needed_scope(request.method, _path(scope))
         if request.method not in ("GET", "HEAD"):
             self._access.check_origin(connection)
+        return self._authorize(connection, needed)
+
+    def _authorize(self, connection: HTTPConnection, needed: str | None) -> Caller | None:
         return None if needed is None else self._access.authorize(connection, needed)
 
 
@@ -59,8 +64,10 @@ def caller_of(connection: HTTPConnection) -> Caller | None:
     return found
 
 
-def _path(scope: Scope) -> str:
-    path: str = scope["path"]
-    root: str = scope.get("root_path", "")
-    # As the router does it: the prefix counts only where a segment of the path ends.
-    return path[len(root) :] if root and path.startswith(f"{root}/") else path
+def _check_path(scope: Scope) -> None:
+    # A proxy that cuts paths apart in another way than we do would guard another path than the one that is answered.
+    raw: bytes = scope.get("raw_path") or b""
+    if b"%2f" in raw.partition(b"?")[0].lower():
+        raise NotFoundError("expected a path that /docs lists, got one with an encoded slash")
+    if any(unicodedata.category(character) == "Cc" for character in scope["path"]):
+        raise NotFoundError("expected a path that /docs lists, got one with a control character")

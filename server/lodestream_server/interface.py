@@ -6,9 +6,10 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from starlette.routing import Route
 
 from . import examples, problems
-from .access import needed_scope
+from .scopes import routes_of, scope_of
 
 __all__ = ["describe"]
 
@@ -24,9 +25,15 @@ def describe(app: FastAPI) -> dict[str, Any]:
         # What the framework assumes of validation errors is not what is answered.
         for name in ("HTTPValidationError", "ValidationError"):
             schemas.pop(name, None)
+        scopes = {
+            (method.lower(), route.path): scope_of(route)
+            for route in routes_of(app)
+            if isinstance(route, Route)
+            for method in route.methods or ()
+        }
         for path, operations in schema["paths"].items():
             for method, operation in operations.items():
-                _complete(operation, needed_scope(method.upper(), path))
+                _complete(operation, scopes[method, path])
         schemas["Problem"] = examples.PROBLEM_SCHEMA
         components["securitySchemes"] = {
             _SCHEME: {"type": "http", "scheme": "bearer", "description": "as `lodestream token create` prints it"}

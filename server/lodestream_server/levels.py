@@ -1,68 +1,185 @@
-"""One level of a surface as a file."""
+"""One level of a surface as a file: what runs in the process that makes it."""
 
 from __future__ import annotations
 
+import errno
+import os
+import resource
+import signal
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from lodestream.errors import FormatWarning
+from lodestream.errors import (
+    FormatError,
+    FormatWarning,
+    InputError,
+    LodestreamError,
+    OptionError,
+    StreamError,
+    TooLargeError,
+    UnavailableError,
+)
 from lodestream.formats import formats
 
-from .containers import OpenContainer
+from .containers import read_from
+from .results import reason_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lodestream import Surface
 
-__all__ = ["MEDIA_TYPES", "write_level"]
+__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "RefusedLevel", "make_level"]
 
 #: The formats of a level, and what they are called on the way.
 MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
 
+# What an error is told as: the first class that fits.
+_KINDS: tuple[type[LodestreamError], ...] = (
+    TooLargeError,
+    OptionError,
+    FormatError,
+    InputError,
+    UnavailableError,
+    StreamError,
+    LodestreamError,
+)
 
-def write_level(container: OpenContainer, level: int, format_name: str, folder: Path) -> BinaryIO:
-    """Decode a level and write it in a format.
 
-    Parameters
+@dataclass(frozen=True)
+class LevelJob:
+    """A level that is to be made.
+
+    Attributes
     ----------
-    container : OpenContainer
+    container : Path
     level : int
-        It exists.
     format_name : str
         A key of `MEDIA_TYPES`.
     folder : Path
-        Where the file is written.
-
-    Returns
-    -------
-    binary file
-        At its start; it has no name, so that it is gone when it is closed, or when the process dies.
+        Where files may be written; empty at the start.
+    most_bytes : int
+        Longest that any of them may become.
     """
-    from lodestream.formats import write_stream
 
-    surface = _decode(container, level)
-    # Whoever takes the file closes it.
-    file: BinaryIO = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+    container: Path
+    level: int
+    format_name: str
+    folder: Path
+    most_bytes: int
+
+    @property
+    def path(self) -> Path:
+        """Where the file is written."""
+        return self.folder / "level"
+
+
+@dataclass(frozen=True)
+class MadeLevel:
+    """The file was made, and has so many bytes."""
+
+    size: int
+
+
+@dataclass(frozen=True)
+class RefusedLevel:
+    """It was not made, for this reason.
+
+    Attributes
+    ----------
+    kind : str
+        Name of a class: `TooLargeError` where the file became too long; otherwise what was raised, or a base of it.
+    reason : str
+        In one line.
+    """
+
+    kind: str
+    reason: str
+
+    def error(self) -> LodestreamError:
+        """What was raised, as far as its process can be believed."""
+        kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
+        return kind(reason_of(self.reason))
+
+
+def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Decode a level and write it in a format.
+
+    Raises
+    ------
+    OSError
+        When the disk does not take it, or there is no such container any more.
+    """
+    # Errors come back as values: not every exception survives the way between processes.
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FormatWarning)  # whoever asked for a format knows what it holds
-            write_stream(surface, format_name, file)
-        file.seek(0)
-    except BaseException:
-        file.close()
-        raise
-    return file
+        surface = _decode(job)
+        with _short_files(job):
+            path = _write(surface, job)
+    except LodestreamError as error:
+        return RefusedLevel(next(kind.__name__ for kind in _KINDS if isinstance(error, kind)), str(error))
+    return MadeLevel(path.stat().st_size)
 
 
-def _decode(container: OpenContainer, level: int) -> Surface:
-    # The decoder brings the compiler of the kernels: a server that only streams does without.
+def _decode(job: LevelJob) -> Surface:
     from lodestream import Decoder, Target
+    from lodestream.container import read_index
     from lodestream.plan import plan
 
-    chosen = plan(container.index, Target(level=level))
-    decoder = Decoder()
-    for place in (*chosen.before, *chosen.ranges, *chosen.after):
-        decoder.feed_at(place.offset, container.read(place))
-    return decoder.surface(level)
+    with job.container.open("rb") as file:
+        handle = file.fileno()
+        index = read_index(partial(read_from, handle), os.fstat(handle).st_size)
+        chosen = plan(index, Target(level=job.level))
+        decoder = Decoder(level=job.level)
+        for place in (*chosen.before, *chosen.ranges, *chosen.after):
+            decoder.feed_at(place.offset, read_from(handle, place.offset, place.length))
+    return decoder.surface(job.level)
+
+
+def _write(surface: Surface, job: LevelJob) -> Path:
+    from lodestream.formats import write_stream
+
+    path = job.path
+    with path.open("xb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # whoever asked for a format knows what it holds
+        write_stream(surface, job.format_name, _Plain(file))  # type: ignore[arg-type]  # only its `write` is used
+    return path
+
+
+class _Plain:
+    """A file that can only be written, so that a write that fails says why."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.write = file.write
+
+
+@contextmanager
+def _short_files(job: LevelJob) -> Iterator[None]:
+    """Let files become so long and no longer, those included that a library writes on the way to the format.
+
+    Raises
+    ------
+    TooLargeError
+        When one was to become longer, whatever the library makes of that.
+    """
+    exceeded: list[int] = []
+    before, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    most = job.most_bytes if hard == resource.RLIM_INFINITY else min(job.most_bytes, hard)
+    handler = signal.signal(signal.SIGXFSZ, lambda number, frame: exceeded.append(number))
+    folder, tempfile.tempdir = tempfile.tempdir, str(job.folder)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    try:
+        yield
+    except Exception as error:
+        if not exceeded:
+            raise
+        raise TooLargeError(os.strerror(errno.EFBIG)) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (before, hard))
+        tempfile.tempdir = folder
+        signal.signal(signal.SIGXFSZ, handler)
+    if exceeded:
+        raise TooLargeError(os.strerror(errno.EFBIG))

@@ -11,9 +11,13 @@ import re
 import secrets
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
+
+from .repeats import Repeats
 
 __all__ = ["configure", "drain", "event", "new_request", "request_id"]
 
@@ -21,6 +25,17 @@ _FIELDS = "lodestream_fields"
 _STANDARD_ERROR = 2
 _MOST_LINES = 10_000
 _DRAIN_SECONDS = 1.0
+_LOOK_SECONDS = 1.0
+
+# What uvicorn says of what strangers send, which could fill a disk: refusals are in order, and are told and counted
+# elsewhere.
+_UNWORTHY = {
+    "ASGI callable returned without completing handshake.",
+    "Invalid HTTP request received.",
+    "Invalid UTF-8 sequence received from client.",
+    "Unsupported upgrade request.",
+}
+
 _request: ContextVar[str | None] = ContextVar("lodestream_request", default=None)
 _USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 _PLAIN = re.compile(r"[A-Za-z0-9._:/@+*,;<>()\[\]-]+", re.ASCII)
@@ -71,8 +86,7 @@ def _is_worth_a_line(record: logging.LogRecord) -> bool:
     # A request that the end of the server has cut short is no failure.
     if record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError):
         return False
-    # uvicorn says so of every handshake that is refused with an answer, which is in order.
-    return record.msg != "ASGI callable returned without completing handshake."
+    return record.msg not in _UNWORTHY
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
@@ -90,10 +104,15 @@ class _Patient(logging.Handler):
         self._descriptor = descriptor
         self._lines: queue.Queue[str] = queue.Queue(_MOST_LINES)
         self._lost = 0
+        self._repeats = Repeats()
         self._idle = threading.Event()
         threading.Thread(target=self._write, name="lodestream-log", daemon=True).start()
 
     def emit(self, record: logging.LogRecord) -> None:
+        if self._repeats.admit(record, time.monotonic()):
+            self._put(record)
+
+    def _put(self, record: logging.LogRecord) -> None:
         self._idle.clear()
         try:
             self._lines.put_nowait(self.format(record))
@@ -101,17 +120,40 @@ class _Patient(logging.Handler):
             self._lost += 1
 
     def flush(self) -> None:
+        with self._exclusive():
+            for record in self._repeats.all():
+                self._put(record)
         until = time.monotonic() + _DRAIN_SECONDS
         while not (self._lines.empty() and self._idle.is_set()) and time.monotonic() < until:
             self._idle.wait(0.01)
 
+    def _tell_repeats(self) -> None:
+        with self._exclusive():
+            for record in self._repeats.due(time.monotonic()):
+                self._put(record)
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        self.acquire()
+        try:
+            yield
+        finally:
+            self.release()
+
     def _write(self) -> None:
+        look = time.monotonic()
         while True:
+            if time.monotonic() >= look:
+                look = time.monotonic() + _LOOK_SECONDS
+                self._tell_repeats()
             try:
                 line = self._lines.get_nowait()
             except queue.Empty:
                 self._idle.set()
-                line = self._lines.get()
+                try:
+                    line = self._lines.get(timeout=_LOOK_SECONDS)
+                except queue.Empty:
+                    continue
                 self._idle.clear()
             if self._lost:
                 line, self._lost = f"{self._lost} lines of the log were lost, since nobody took them\n{line}", 0

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lodestream import Tolerance
-from lodestream.errors import FormatError, OptionError
+from lodestream.errors import FormatError, OptionError, SwitchedOffError
 
-from .worker import ATTRIBUTE, CLOSED, UNNAMED
+from . import finished
+from .worker import ALLOWED_BY, ATTRIBUTE, CLOSED, UNNAMED
 
 if TYPE_CHECKING:
     from lodestream.formats import Format
 
-__all__ = ["SurfaceOptions", "check", "identify", "plain_name"]
+__all__ = ["SurfaceOptions", "check", "identify", "plain_name", "printable"]
 
 _LONGEST_NAME = 255
 
@@ -75,23 +76,43 @@ class SurfaceOptions:
         return cls(name, filename, values)
 
 
-def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -> Format:
+def check(
+    files: list[Path],
+    names: list[str | None],
+    options: SurfaceOptions,
+    allowed: Collection[str] | None = None,
+) -> Format:
     """Refuse what a look at the first bytes shows to be wrong; the first file's format.
+
+    Parameters
+    ----------
+    files : list of Path
+    names : list of (str or None)
+        What their owner calls them.
+    options : SurfaceOptions
+    allowed : collection of str or None
+        Names of the formats that this server reads; None for all.
 
     Raises
     ------
     FormatError
         When a file is of no format that can be read.
+    SwitchedOffError
+        When the first file, whose format reads the others too, is of one that this server does not read.
     OptionError
         When the format has no such option.
     """
     from lodestream.formats import formats, sniff
 
+    if any(map(finished.is_container, files)):
+        _check_allowed(("lode",), names[0], allowed)
+        return finished.check_upload(files, options.chosen)
     found = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
     for format_ in found:
         if format_.read is None:
             readable = ", ".join(item.name for item in formats() if item.read)
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
+    _check_allowed(found[0].names, names[0], allowed)
     for key in options.chosen:
         if key not in ("precision", "rms", "closed", *found[0].options) and not key.startswith(ATTRIBUTE):
             known = ", ".join(("precision", "rms", "closed", "name", "filename", *found[0].options))
@@ -99,18 +120,37 @@ def check(files: list[Path], names: list[str | None], options: SurfaceOptions) -
     return found[0]
 
 
-def identify(digest: hashlib._Hash, format_: Format, filename: str | None, options: SurfaceOptions) -> str:
-    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, its format and its options.
+def _check_allowed(formats: Sequence[str], filename: str | None, allowed: Collection[str] | None) -> None:
+    from lodestream.formats import check_allowed
+
+    try:
+        check_allowed(formats, allowed)
+    except SwitchedOffError as error:
+        raise SwitchedOffError(f"{filename or UNNAMED}: {error} {ALLOWED_BY}") from None
+
+
+def identify(
+    digest: hashlib._Hash, format_: Format, filename: str | None, options: SurfaceOptions, owner: str | None
+) -> str:
+    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, format, options, name and owner.
 
     What the name of the first file tells, like the place of an .hgt, counts as an option; the name itself does not.
     """
     told = dict(format_.named(filename)) if format_.named and filename else {}
     whole = digest.copy()
-    whole.update(json.dumps([format_.name, sorted({**told, **options.chosen}.items())], ensure_ascii=True).encode())
+    words: list[object] = [format_.name, sorted({**told, **options.chosen}.items())]
+    # Nobody's surface without a name keeps the id that earlier versions gave it.
+    if options.name is not None or owner is not None:
+        words += [options.name, owner]
+    whole.update(json.dumps(words, ensure_ascii=True).encode())
     return whole.hexdigest()[:20]
 
 
 def plain_name(text: str) -> str | None:
     """A name as it is shown to people: the last part of a path, and nothing that could upset a terminal."""
-    name = "".join(character for character in text.replace("\\", "/").rpartition("/")[2] if character.isprintable())
-    return name[:_LONGEST_NAME].strip() or None
+    return printable(text.replace("\\", "/").rpartition("/")[2])
+
+
+def printable(text: str) -> str | None:
+    """A name without what could upset a terminal, as a stranger's container may have it."""
+    return "".join(character for character in text if character.isprintable())[:_LONGEST_NAME].strip() or None

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 
 import lodestream
 
 from . import examples
+from .documentation import render
 from .gate import caller_of
+from .html_page import html_page
 from .routing import Parts, readable
+from .scopes import needs
 
 __all__ = ["router"]
 
 router = APIRouter(tags=["server"])
 
-_PAGE = f"""<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<title>Lodestream</title>
-<style>body {{ font: 1rem/1.5 system-ui, sans-serif; max-width: 42rem; margin: 3rem auto; padding: 0 1rem }}</style>
-<h1>Lodestream {lodestream.__version__}</h1>
+_HOME = f"""<h1>Lodestream {lodestream.__version__}</h1>
 <p>This server sends structured surfaces over the network, coarsest level first. The error is known at every moment.</p>
 <pre>
 lodestream push surface.npy HOST      upload
@@ -31,17 +29,33 @@ lodestream pull URL out.npy --until-rms 1e-3d
 <li><a href="v1/surfaces">Surfaces on this server</a></li>
 <li><a href="docs">The HTTP interface</a></li>
 </ul>
-</html>
 """
 
 
 @readable(router, "/", include_in_schema=False)
+@needs(None)
 async def home() -> Response:
     """What this is, for whoever opens it in a browser."""
-    return HTMLResponse(_PAGE)
+    return html_page("Lodestream", _HOME)
+
+
+@readable(router, "/docs", include_in_schema=False)
+@needs(None)
+async def docs(request: Request) -> Response:
+    """The HTTP interface, for people."""
+    return html_page("Lodestream: the HTTP interface", render(request.app.openapi(), f"{_root(request)}/openapi.json"))
+
+
+@readable(router, "/openapi.json", include_in_schema=False)
+@needs(None)
+async def interface(request: Request) -> Response:
+    """The HTTP interface, for programs."""
+    root = _root(request)
+    return JSONResponse(request.app.openapi() | ({"servers": [{"url": root}]} if root else {}))
 
 
 @readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
+@needs(None)
 async def healthz() -> Response:
     """Answer at once."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
@@ -52,15 +66,20 @@ async def healthz() -> Response:
     "/readyz",
     summary="Ready",
     responses={
-        200: examples.answer("The kernels are compiled", {"status": "ready"}),
-        503: examples.answer("Not yet", {"status": "starting"}),
+        200: examples.answer("The kernels are compiled", {"status": "ready", "confinement": "landlock+seccomp"}),
+        503: examples.answer("Not yet", {"status": "starting", "confinement": None}),
     },
 )
+@needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Say whether the kernels are compiled; before that the server works, but the first build waits for them."""
+    """Say whether the kernels are compiled; before that the server works, but the first build waits for them.
+
+    ``confinement`` is what the kernel holds builds to: ``landlock+seccomp``, one of the two, or ``none``.
+    """
+    confinement = parts.builder.confinement
     if parts.builder.ready:
-        return JSONResponse({"status": "ready"})
-    return JSONResponse({"status": "starting"}, 503, {"retry-after": "1"})
+        return JSONResponse({"status": "ready", "confinement": confinement})
+    return JSONResponse({"status": "starting", "confinement": confinement}, 503, {"retry-after": "1"})
 
 
 @readable(
@@ -70,6 +89,7 @@ async def readyz(parts: Parts) -> Response:
     response_class=Response,
     responses={200: {"description": "The figures", "content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
+@needs("admin")
 async def metrics(parts: Parts) -> Response:
     """What the server has counted and measured since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
@@ -81,10 +101,15 @@ async def metrics(parts: Parts) -> Response:
     summary="Get a ticket for a stream",
     responses={201: examples.answer("A ticket, and the seconds for which it is valid", examples.TICKET)},
 )
+@needs("read")
 async def ticket(request: Request, parts: Parts) -> Response:
     """Give what a browser puts in a stream's ``open``, since it can send no header with a WebSocket."""
     caller = caller_of(request)
     assert caller is not None  # the gate asks for one here
-    tickets = parts.access.tickets
-    content = {"ticket": tickets.issue(caller.key), "seconds": tickets.seconds}
+    content = {"ticket": parts.access.ticket(caller), "seconds": parts.access.tickets.seconds}
     return JSONResponse(content, 201, {"cache-control": "no-store"})
+
+
+def _root(request: Request) -> str:
+    root: str = request.scope.get("root_path", "")
+    return root

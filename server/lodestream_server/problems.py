@@ -25,6 +25,7 @@ from lodestream.errors import (
     OptionError,
     StreamError,
     TooLargeError,
+    UnavailableError,
 )
 
 __all__ = [
@@ -34,8 +35,11 @@ __all__ = [
     "BusyError",
     "ForeignOriginError",
     "FullError",
+    "MissingError",
     "NoTokenError",
+    "NotOwnerError",
     "NotReadyError",
+    "PostponedError",
     "RestartingError",
     "SlowUploadError",
     "SmallScopeError",
@@ -58,6 +62,20 @@ class NotReadyError(LodestreamError):
 
 class BuildFailedError(LodestreamError):
     """The surface could not be built."""
+
+
+class PostponedError(LodestreamError):
+    """The surface could not be built for a reason that may pass, and waits."""
+
+
+class MissingError(LodestreamError):
+    """What the server has promised to keep is not on its disk now."""
+
+    headers: ClassVar = {"retry-after": "60"}
+
+
+class NotOwnerError(LodestreamError):
+    """The surface is somebody else's."""
 
 
 class SlowUploadError(LodestreamError):
@@ -107,6 +125,8 @@ class RestartingError(LodestreamError):
 class FullError(LodestreamError):
     """There is no room for more surfaces."""
 
+    headers: ClassVar = {"retry-after": "60"}
+
 
 @dataclass(frozen=True)
 class _Answer:
@@ -122,11 +142,13 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (OptionError, _Answer(422, "bad-option", "An option that does not exist, or a value that it does not take")),
     (FormatError, _Answer(422, "bad-file", "Not a file of a structured surface")),
     (InputError, _Answer(422, "bad-input", "Input that cannot be used")),
+    (UnavailableError, _Answer(501, "unavailable", "This server lacks what that needs")),
     (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
     (SlowUploadError, _Answer(408, "idle", "Nothing was heard for too long")),
     (NoTokenError, _Answer(401, "no-token", "A token is needed")),
     (BadTokenError, _Answer(403, "bad-token", "A token that is not known, or no longer")),
     (SmallScopeError, _Answer(403, "small-scope", "A token that does not allow this")),
+    (NotOwnerError, _Answer(403, "not-owner", "Only the owner of a surface and an admin may do this")),
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
     (TooManyError, _Answer(429, "too-many", "More at the same time than one client may have")),
     (BusyError, _Answer(503, "busy", "As much to do as the server can; come back")),
@@ -134,6 +156,8 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (FullError, _Answer(507, "full", "There is no room for more")),
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
+    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; ask for another attempt")),
+    (MissingError, _Answer(503, "missing", "The surface is not on the server's disk now")),
     (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
 )
 _FULL = _Answer(507, "disk-full", "The disk is full")
@@ -194,7 +218,8 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
     status, code, title, detail = problem(error)
     if status >= 500:
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
-    return _document(request, status, code, title, detail, getattr(error, "headers", {}))
+    headers = getattr(error, "headers", FullError.headers if status == 507 else {})
+    return _document(request, status, code, title, detail, headers)
 
 
 async def _gone(request: HTTPConnection, error: Exception) -> Response:

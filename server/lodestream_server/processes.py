@@ -1,35 +1,58 @@
-"""Processes that call functions, one call at a time each; any of them may die without harm to the others.
+"""Functions called in other processes, each of which has one call, what that call needs, and no more.
 
-Each process has a pipe of its own and shares no lock with anybody: whatever it was doing when it was killed, idling
-included, the next call finds another one. Pools in libraries share a queue and its locks between their processes, and
-one that is killed at the wrong moment, or merely while it idles, takes the pool with it.
+The processes are forked from one that has loaded everything (`forkserver`) and knows nothing of strangers. Whatever
+becomes of one of them, the others go on, and the next call finds a new one.
+
+Nothing that such a process says is believed: its answer is JSON, of bounded length, and made into what its function
+says that it returns, or refused.
 """
 
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
+import json
 import os
+import select
 import signal
+import socket
+import subprocess
+import sys
 import threading
-import traceback
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection
-from typing import Any, Final
+from contextlib import suppress
+from dataclasses import asdict
+from textwrap import indent
+from typing import Any, Final, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from lodestream.errors import LodestreamError
 
-__all__ = ["Call", "Pool", "ProcessDiedError", "UnforeseenError"]
+from .forkserver import Allowed
 
-# A process gives memory back when it ends: a large call is not paid for by the small ones after it.
-_CALLS_PER_PROCESS = 32
+__all__ = ["Allowed", "Call", "ForkServer", "Pool", "ProcessDiedError", "UnforeseenError", "WrongAnswerError"]
 
 # A process may die between the last look at it and the call; one that dies again and again has another reason.
 _STARTS: Final = 3
 
-# Spawned, not forked: this process has threads.
-_context = multiprocessing.get_context("spawn")
+_LOOK_SECONDS = 0.1
+_LAST_SECONDS = 5.0
+
+_LONGEST_ANSWER = 256 << 10
+_LONGEST_MESSAGE = 64 << 10
+_LONGEST_KIND = 100
+
+# What processes that read strangers' files find in their environment: no secret of whoever started the server.
+_ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
+_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "NUMBA_", "PROJ_", "PYTHON")
+
+# Threads of libraries would not be there in a process that is forked, and a build has one processor.
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "NUMBA", "OMP", "OPENBLAS")}
+
+_PROGRAM = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
 
 
 class ProcessDiedError(LodestreamError):
@@ -45,8 +68,17 @@ class ProcessDiedError(LodestreamError):
         name = ""
         if exitcode is not None and exitcode < 0:
             name = f", {signal.Signals(-exitcode).name}" if -exitcode in set(signal.Signals) else ""
-        super().__init__(f"the process ended before it was done (exit code {exitcode}{name})")
+        code = "" if exitcode is None else f" (exit code {exitcode}{name})"
+        super().__init__(f"the process ended before it was done{code}")
         self.exitcode = exitcode
+
+
+class WrongAnswerError(ProcessDiedError):
+    """The process ended with an answer that its function does not give, or made something else than it says."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__(0)
+        self.args = (f"its process gave an answer that cannot be used: {words}",)
 
 
 class UnforeseenError(LodestreamError):
@@ -59,6 +91,7 @@ class UnforeseenError(LodestreamError):
     errno : int or None
         Of an operating system's error, its number.
     traceback : str
+        As the process tells it, with a bar before each line.
     """
 
     def __init__(self, kind: str, errno: int | None, traceback: str) -> None:
@@ -74,12 +107,15 @@ class Call:
     Parameters
     ----------
     function : callable
-        It can be pickled, as can its arguments and what it returns.
+        Of a module, under its own name. Its arguments, and what it returns, are what JSON holds, or what pydantic makes
+        of that by the function's annotations: paths, tuples, dataclasses.
     args : tuple
     seconds : float or None
-        Longest time that it may take.
+        Longest time that it may take, and most processor time.
     before : callable or None
         Called in this process when a process is free, before the call begins.
+    allowed : Allowed
+        What its process may touch and take: nothing, unless it is said.
 
     Attributes
     ----------
@@ -93,11 +129,13 @@ class Call:
         args: tuple[Any, ...] = (),
         seconds: float | None = None,
         before: Callable[[], object] | None = None,
+        allowed: Allowed | None = None,
     ) -> None:
         self.function = function
         self.args = args
         self.seconds = seconds
         self.before = before
+        self.allowed = Allowed() if allowed is None else allowed
         self.begun = threading.Event()
         self._lock = threading.Lock()
         self._process: _Process | None = None
@@ -123,37 +161,194 @@ class Call:
                 self._process.kill()
 
 
+class _Started:
+    """A fork server that was started, and what it has said since."""
+
+    def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
+        self.process = process
+        self.control = control
+        self.settled = threading.Event()
+        self.confinement: tuple[str, ...] | None = None
+        self.problem: str | None = None
+        self.note: str | None = None
+        self.ready = False
+        threading.Thread(target=self._listen, name="lodestream-forkserver", daemon=True).start()
+
+    def _listen(self) -> None:
+        try:
+            self.confinement = tuple(self._message()["confinement"])
+            warmed = self._message()
+            self.problem, self.note = warmed["problem"], warmed["note"]
+            self.ready = True
+        except (EOFError, OSError):
+            pass
+        finally:
+            self.settled.set()
+
+    def _message(self) -> dict[str, Any]:
+        text = self.control.recv(_LONGEST_MESSAGE)
+        if not text:
+            raise EOFError
+        message: dict[str, Any] = json.loads(text)
+        return message
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.settled.wait()
+        self.control.close()
+
+
+class ForkServer:
+    """The process from which others are forked, started when it is first needed, and again when it has died.
+
+    Parameters
+    ----------
+    warm : callable or None
+        Called in it without arguments before it forks for the first time; it loads what calls need.
+    """
+
+    def __init__(self, warm: Callable[[], object] | None = None) -> None:
+        self._warm = "" if warm is None else _name(warm)
+        self._lock = threading.Lock()
+        self._started: _Started | None = None
+        self._closed = False
+
+    @property
+    def pid(self) -> int | None:
+        """Number of its process, once it was started."""
+        return None if self._started is None else self._started.process.pid
+
+    @property
+    def confinement(self) -> tuple[str, ...] | None:
+        """What the kernel holds the processes of calls to, see `lodestream.confinement`; None before it is known."""
+        return None if self._started is None else self._started.confinement
+
+    def wait(self, given_up: Callable[[], bool] = lambda: False) -> tuple[str | None, str | None]:
+        """Start it, and wait until it is ready, or nobody waits any more.
+
+        Returns
+        -------
+        (str or None, str or None)
+            What went wrong in `warm`, if anything did; and what it returned, if that is a text.
+
+        Raises
+        ------
+        ProcessDiedError
+            When it ended, or was closed.
+        OSError
+            When it could not be started.
+        """
+        started = self._running()
+        while not started.settled.wait(_LOOK_SECONDS):
+            if given_up():
+                return None, None
+        if not started.ready:
+            raise ProcessDiedError(self._exitcode(started))
+        return started.problem, started.note
+
+    def fork(self, request: bytes) -> _Process:
+        """A process for a call.
+
+        Raises
+        ------
+        ProcessDiedError
+            When there is no fork server; the next time another one is started.
+        OSError
+        """
+        started = self._running()
+        ours, theirs = socket.socketpair()
+        answer, end = os.pipe()
+        try:
+            with self._lock:
+                socket.send_fds(started.control, [b"c"], [theirs.fileno(), end])
+        except OSError:
+            ours.close()
+            os.close(answer)
+            raise ProcessDiedError(self._exitcode(started)) from None
+        finally:
+            # The process has them alone, so that its death is an end of file here.
+            theirs.close()
+            os.close(end)
+        return _Process(ours, answer, request)
+
+    def close(self) -> None:
+        """End it, with every process that was forked from it and is left."""
+        with self._lock:
+            self._closed = True
+            started = self._started
+        if started is not None:
+            started.end()
+
+    def _running(self) -> _Started:
+        with self._lock:
+            if self._closed:
+                raise ProcessDiedError(None)
+            if self._started is not None and self._started.process.poll() is not None:
+                self._started.end()
+                self._started = None
+            if self._started is None:
+                self._started = self._start()
+            return self._started
+
+    def _start(self) -> _Started:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        program = _PROGRAM.format(module=Allowed.__module__)
+        path = json.dumps([place or os.getcwd() for place in sys.path])
+        environment = {
+            name: value
+            for name, value in os.environ.items()
+            if name in _ENVIRONMENT or name.startswith(_ENVIRONMENT_PREFIXES)
+        }
+        command = [sys.executable, "-c", program, str(theirs.fileno()), self._warm, path]
+        try:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, env=environment | _ONE_THREAD, pass_fds=(theirs.fileno(),)
+            )
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        return _Started(process, ours)
+
+    def _exitcode(self, started: _Started) -> int | None:
+        with suppress(subprocess.TimeoutExpired):
+            return started.process.wait(_LAST_SECONDS)
+        return None
+
+
 class Pool:
-    """Up to ``size`` processes.
+    """Up to ``size`` calls at a time.
 
     Parameters
     ----------
     size : int
-    prepare : callable or None
-        Called without arguments in each process before anything else; it can be pickled.
+    server : ForkServer
+        Others may use it too; whoever made it closes it.
     """
 
-    def __init__(self, size: int, prepare: Callable[[], object] | None = None) -> None:
-        self._prepare = prepare
+    def __init__(self, size: int, server: ForkServer) -> None:
+        self._server = server
         self._threads = ThreadPoolExecutor(size, "lodestream-process")
         self._lock = threading.Lock()
-        self._idle: list[_Process] = []
         self._busy: set[_Process] = set()
         self._closed = False
 
     async def run(self, call: Call) -> Any:
-        """Make a call when a process is free; what the function returns.
+        """Make a call when its turn comes; what the function returns.
 
         Cancelling it kills the process, which has ended when this raises.
 
         Raises
         ------
         ProcessDiedError
-            When the process ended.
+            When the process ended, or gave no answer that its function gives (`WrongAnswerError`).
         TimeoutError
-            When the call took longer than its seconds; its process was killed.
+            When the call took longer than its seconds, or more processor time (then it says so); its process was
+            killed.
         MemoryError
-            When the function ran out of memory; its process is not used again.
+            When the function ran out of memory.
         UnforeseenError
             When the function raised anything else.
         OSError
@@ -174,148 +369,169 @@ class Pool:
         """Kill every process; calls that are under way raise `ProcessDiedError`."""
         with self._lock:
             self._closed = True
-            processes = [*self._idle, *self._busy]
-        for process in processes:
-            process.kill()
+            for process in self._busy:
+                process.kill()
         self._threads.shutdown(wait=True, cancel_futures=True)
-        for process in processes:
-            process.join()
 
     def _run(self, call: Call) -> Any:
-        if call.before is not None:
-            call.before()
+        allowed = {**asdict(call.allowed), "seconds": call.seconds}
+        request = to_json({"function": _name(call.function), "args": call.args, "allowed": allowed})
+        died, ready = ProcessDiedError(None), False
         for _ in range(_STARTS):
-            process = self._take()
+            if call.ended or self._closed:
+                break
+            try:
+                self._server.wait(lambda: call.ended or self._closed)
+                if call.ended or self._closed:
+                    break
+                if call.before is not None and not ready:
+                    call.before()
+                ready = True
+                process = self._server.fork(request)
+            except ProcessDiedError as error:
+                died = error
+                continue
+            self._add(process)
             call.attach(process)
             try:
-                if process.begin(call):
+                if process.begin():
                     call.begun.set()
-                    return process.finish(call)
+                    return _result(call.function, process.finish(call.seconds))
             finally:
                 call.attach(None)
-                self._give_back(process)
-            if call.ended:
-                break
-        raise ProcessDiedError(process.exitcode)
+                self._remove(process)
+        raise died
 
-    def _take(self) -> _Process:
+    def _add(self, process: _Process) -> None:
         with self._lock:
-            while self._idle:
-                process = self._idle.pop()
-                if process.alive:
-                    break
-                process.join()
-            else:
-                process = _Process(self._prepare)
             self._busy.add(process)
             if self._closed:
                 process.kill()
-            return process
 
-    def _give_back(self, process: _Process) -> None:
+    def _remove(self, process: _Process) -> None:
         with self._lock:
             self._busy.discard(process)
-            if process.usable and not self._closed:
-                self._idle.append(process)
-                return
-        process.kill()
-        process.join()
+        process.end()
 
 
 class _Process:
-    """A process and this side's end of its pipe."""
+    """A process that was forked for a call: the connection to whoever forked it, and the pipe of its answer."""
 
-    def __init__(self, prepare: Callable[[], object] | None) -> None:
-        self._pipe, theirs = _context.Pipe()
-        self._process = _context.Process(target=_serve, args=(theirs, prepare), name="lodestream-build", daemon=True)
-        self._calls = 0
-        self._healthy = True
+    def __init__(self, connection: socket.socket, answer: int, request: bytes) -> None:
+        self._connection = connection
+        self._lines = connection.makefile("rb")
+        self._answer = answer
+        self._request = request
+        self._exitcode: int | None = None
+        self._over = False
+
+    def begin(self) -> bool:
+        """Hand over the call; False when there is nobody to take it.
+
+        Raises
+        ------
+        OSError
+            When the system has no room for another process.
+        """
         try:
-            self._process.start()
-        finally:
-            # The other end is the process's alone, so that its death is an end of file here.
-            theirs.close()
-
-    @property
-    def alive(self) -> bool:
-        return self._process.is_alive()
-
-    @property
-    def usable(self) -> bool:
-        return self._healthy and self._calls < _CALLS_PER_PROCESS
-
-    @property
-    def exitcode(self) -> int | None:
-        self._process.join()
-        return self._process.exitcode
-
-    def begin(self, call: Call) -> bool:
-        """Hand over a call; False when there is nobody to take it any more."""
-        self._calls += 1
-        self._healthy = False
-        try:
-            self._pipe.send((call.function, call.args))
-            self._pipe.recv()
-        except (EOFError, OSError):
+            self._connection.sendall(len(self._request).to_bytes(8, "big") + self._request)
+        except OSError:
             return False
-        return True
+        message = self._message()
+        if "failed" in message:
+            raise OSError(message["failed"], os.strerror(message["failed"]))
+        return "begun" in message
 
-    def finish(self, call: Call) -> Any:
-        """Wait for the end of the call that was begun."""
-        try:
-            if not self._pipe.poll(call.seconds):
-                self.kill()
+    def finish(self, seconds: float | None) -> bytes:
+        """The answer, once the process has ended."""
+        until = None if seconds is None else time.monotonic() + seconds
+        answer = self._read(until)
+        if answer is None or not self._wait(self._connection.fileno(), until):
+            self.end()
+            if answer is None or self._exitcode == -signal.SIGKILL:
                 raise TimeoutError
-            kind, value = self._pipe.recv()
-        except (EOFError, ConnectionError):
-            raise ProcessDiedError(self.exitcode) from None
-        if kind == "memory":
-            raise MemoryError(value)
-        self._healthy = True
-        if kind == "raised":
-            raise UnforeseenError(*value)
-        return value
+        self.end()
+        if self._exitcode == -signal.SIGXCPU:
+            raise TimeoutError("processor time")
+        if self._exitcode != 0:
+            raise ProcessDiedError(self._exitcode)
+        return answer
 
     def kill(self) -> None:
-        self._healthy = False
-        self._process.kill()
+        """Have it killed; from any thread."""
+        with suppress(OSError):
+            self._connection.shutdown(socket.SHUT_WR)
 
-    def join(self) -> None:
-        self._process.join()
-        self._pipe.close()
+    def end(self) -> None:
+        """Kill it, and wait for its end; nothing of it is left then."""
+        if self._over:
+            return
+        self._over = True
+        self.kill()
+        while message := self._message():
+            self._exitcode = message.get("ended", self._exitcode)
+        if self._exitcode is None:  # the fork server has died, and it with it, though perhaps not yet
+            self._drain(time.monotonic() + _LAST_SECONDS)
+        self._lines.close()
+        self._connection.close()
+        os.close(self._answer)
 
+    def _read(self, until: float | None) -> bytes | None:
+        """All that it says; None when it takes too long."""
+        data = bytearray()
+        while len(data) <= _LONGEST_ANSWER:
+            if not self._wait(self._answer, until):
+                return None
+            piece = os.read(self._answer, 1 << 16)
+            if not piece:
+                return bytes(data)
+            data += piece
+        raise WrongAnswerError(f"expected at most {_LONGEST_ANSWER} bytes")
 
-def _serve(pipe: Connection, prepare: Callable[[], object] | None) -> None:
-    # Ctrl-C reaches every process of a terminal: this one is its parent's to end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-    if prepare is not None:
-        prepare()
-    while True:
+    def _drain(self, until: float) -> None:
+        while self._wait(self._answer, until) and os.read(self._answer, 1 << 16):
+            pass
+
+    def _wait(self, handle: int, until: float | None) -> bool:
+        poll = select.poll()
+        poll.register(handle, select.POLLIN)
+        return bool(poll.poll(None if until is None else max(0.0, 1000 * (until - time.monotonic()))))
+
+    def _message(self) -> dict[str, int]:
+        """The next word of whoever forked it; nothing when they have gone."""
         try:
-            function, args = pipe.recv()
-            pipe.send("begun")
-            answer = _call(function, args)
-            pipe.send(answer)
-        except (EOFError, OSError):
-            return
-        if answer[0] == "memory":
-            return
+            line = self._lines.readline()
+        except OSError:
+            line = b""
+        message: dict[str, int] = json.loads(line) if line.endswith(b"\n") else {}
+        return message
 
 
-def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[str, Any]:
-    # Not every exception survives the way between processes: its name and its text do.
+def _name(function: Callable[..., Any]) -> str:
+    return f"{function.__module__}:{function.__qualname__}"
+
+
+def _result(function: Callable[..., Any], answer: bytes) -> Any:
+    """What a function returned, or raised, by the word of its process."""
     try:
-        return "returned", function(*args)
-    except MemoryError as error:
-        return "memory", str(error)
-    except Exception as error:
-        return "raised", (type(error).__name__, getattr(error, "errno", None), traceback.format_exc())
+        told = json.loads(answer)
+    except (ValueError, RecursionError):
+        raise WrongAnswerError("expected JSON") from None
+    match told:
+        case {"returned": value}:
+            kind = get_type_hints(function).get("return", Any)
+            try:
+                return TypeAdapter(kind).validate_python(value)
+            except (ValidationError, RecursionError):
+                raise WrongAnswerError(f"expected what {function.__name__} returns") from None
+        case {"memory": str(words)}:
+            raise MemoryError(words)
+        case {"raised": {"kind": str(kind), "errno": int() | None as number, "traceback": str(text)}} if (
+            kind.isidentifier() and len(kind) <= _LONGEST_KIND
+        ):
+            raise UnforeseenError(kind, number, indent(_printable(text), "| ", lambda line: True))
+    raise WrongAnswerError("expected what was returned or raised")
 
 
-def _follow_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        # Nobody waits for the result, and another server may already work in the folder.
-        os._exit(1)
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() or character == "\n" else "?" for character in text)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-__all__ = ["Record", "State", "plain"]
+__all__ = ["Record", "State", "plain", "read_record", "serialize"]
 
-State = Literal["queued", "building", "ready", "failed"]
+State = Literal["queued", "building", "ready", "failed", "waiting", "missing"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Record:
     Attributes
     ----------
     id : str
-        20 hexadecimal digits, from the upload's bytes and options.
+        20 hexadecimal digits, from the upload's bytes and options, the name and the owner.
     name : str or None
         What the surface is called.
     created : float
@@ -32,14 +34,17 @@ class Record:
     upload_bytes : int
     options : mapping
         ``precision`` or ``rms``, ``precision=NAME`` of attributes, ``closed`` and options of the format, as text.
-    state : "queued", "building", "ready" or "failed"
-        On disk a build that has begun is still queued: after a restart it begins again.
+    state : "queued", "building", "ready", "failed", "waiting" or "missing"
+        ``failed``: a reader refused the bytes. ``waiting``: they could not be built here, for a reason that may pass;
+        somebody has to ask for another attempt. ``missing``: neither the upload nor the container is on the disk.
+        On disk a build that has begun is still queued, since after a restart it begins again, and nothing is missing,
+        since what is there is looked for at every start.
     reason : str or None
-        Why it failed, in one line.
+        Why it failed, waits or is missing, in one line.
     container : str or None
-        SHA-256 of the container, once ready.
+        SHA-256 of the container that it has, or had before the container was lost.
     info : mapping or None
-        What ``lodestream info --json`` prints, once ready.
+        What ``lodestream info --json`` prints of that container.
     upload_sha256 : str or None
         SHA-256 over the files and their lengths, as `uploads.Upload` computes it; None where an earlier version of the
         server took the upload, or where the upload is lost.
@@ -47,6 +52,11 @@ class Record:
         Builds that were begun and of whose end nothing is known: the server itself died under them.
     upload_lost : bool
         The upload was damaged and set aside; the container is all there is.
+    upload : str or None
+        Name of the folder of the uploaded files; None where an earlier version of the server took them, which named it
+        by the surface.
+    owner : str or None
+        Name of the token that the surface was pushed with; None where none was shown.
     """
 
     id: str
@@ -62,6 +72,13 @@ class Record:
     upload_sha256: str | None = None
     attempts: int = 0
     upload_lost: bool = False
+    upload: str | None = None
+    owner: str | None = None
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of the uploaded files."""
+        return self.upload or self.id
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` takes."""
@@ -87,6 +104,33 @@ class Record:
 @cache
 def _adapter() -> TypeAdapter[Record]:
     return TypeAdapter(Record)
+
+
+def read_record(path: Path) -> Record:
+    """The record in a file: that of the surface by which it is named, unless it is called ``record.json``.
+
+    Raises
+    ------
+    ValueError
+        When it is none, or that of another surface; in one line.
+    OSError
+        When it cannot be read.
+    """
+    record = Record.from_json(json.loads(path.read_bytes()))
+    if path.name != "record.json" and record.id != path.stem:
+        raise ValueError(f"expected the record of {path.stem}, got that of {record.id[:80]!a}")
+    return record
+
+
+def serialize(record: Record) -> bytes:
+    """A record as it stands in its file.
+
+    Raises
+    ------
+    ValueError, TypeError
+        When a value is none that JSON has.
+    """
+    return json.dumps(record.to_json(), ensure_ascii=False, allow_nan=False).encode()
 
 
 def plain(value: Any) -> Any:

@@ -1,66 +1,117 @@
 """Putting a folder in order after `fsck` has found damage.
 
 What is damaged is set aside, never deleted. A container is built again from its upload, a record is taken from the copy
-beside the upload. Where the upload itself is damaged, its surface is served as long as its container is whole.
+beside the upload. Where the upload itself is damaged, its surface is served as long as its container is whole. Then the
+folder is looked through again, and only what is found no more counts as repaired.
 """
 
 from __future__ import annotations
 
 import asyncio
-import secrets
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from lodestream.container import describe
-
-from . import fsck
-from .durable import remove, rename, sync_folder, write_file
+from . import aside, fsck
+from .durable import write_file
+from .finished import figures_of
+from .folders import Folders, is_file
 from .fsck import Finding, Report
 from .jobs import Builder
-from .records import Record, plain
+from .records import Record, read_record, serialize
 from .settings import Settings
-from .storage import Folders, Storage, serialize
+from .storage import Storage
 
-__all__ = ["rebuild", "set_aside"]
+__all__ = ["compare", "rebuild", "set_aside"]
 
 
 def set_aside(report: Report) -> None:
     """Move what is damaged out of the way, and write records that are true of what remains.
 
-    Surfaces whose container is damaged, and whose upload is not, are queued: `rebuild` builds them, or the next server.
+    `rebuild` has to follow, or a server's start: what lacks its container is built again then, and what no record
+    speaks of is adopted or set aside.
+
+    Raises
+    ------
+    OSError
+        When something cannot be moved or written; what was not done stays as it was.
     """
     at = Folders(report.folder)
-    for number, finding in enumerate(report.findings):
-        report.findings[number] = _ACTIONS[finding.what](at, report, finding)
-    if any(finding.what == "record" and finding.lost for finding in report.findings):
-        # One of the containers that nothing refers to may be that of the lost record: better kept than swept away.
-        for number, finding in enumerate(report.findings):
-            if finding.what == "leftover" and finding.path.parent == at.containers and finding.path.exists():
-                report.findings[number] = replace(finding, repair=_move(at, finding.path))
+    # Records first: those of an upload that is moved away are told so, whichever of them were lost.
+    order = sorted(enumerate(report.findings), key=lambda item: item[1].what != "record")
+    for number, finding in order:
+        action = _ACTIONS.get(finding.what)
+        if action is not None:
+            report.findings[number] = action(at, report, finding)
 
 
-async def rebuild(report: Report, settings: Settings) -> None:
-    """Build every surface that is queued, as a server would, and say what came of those that were damaged.
+async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> dict[str, Record]:
+    """Build every surface that is queued, as a server would; the records of all surfaces after that.
+
+    Parameters
+    ----------
+    folder : Path
+    settings : Settings
+    retry : bool
+        Those that wait for another attempt as well.
 
     Raises
     ------
     LodestreamError
-        When another process works in the folder by now.
+        When another process works in the folder, or not all of it is there.
+    OSError
+        When it cannot be read or written.
     """
-    storage = await asyncio.to_thread(Storage, report.folder)
+    storage = await asyncio.to_thread(Storage, folder)
     try:
+        if retry:
+            for record in storage.records():
+                if record.state == "waiting":
+                    await asyncio.to_thread(storage.retry, record.id)
         await _build(storage, settings)
-        for number, finding in enumerate(report.findings):
-            record = storage.find(finding.surface)
-            if finding.what in ("record", "container") and not finding.lost and record is not None:
-                if record.state == "failed":
-                    words, lost = f"{finding.repair}; it could not be built again: {record.reason}", True
-                else:
-                    words, lost = f"{finding.repair}; built again", False
-                report.findings[number] = replace(finding, repair=words, lost=lost)
+        return {record.id: record for record in storage.records()}
     finally:
         storage.close()
+
+
+def compare(report: Report, again: Report, records: dict[str, Record]) -> None:
+    """Say of each finding what became of it, and add those that only the second look found.
+
+    Parameters
+    ----------
+    report : Report
+        Of the first look; changed.
+    again : Report
+        Of the look after everything was done.
+    records : dict of Record
+        What `rebuild` gave.
+    """
+    left = {finding.key: finding for finding in again.findings}
+    for number, finding in enumerate(report.findings):
+        report.findings[number] = _after(finding, finding.key in left, records.get(finding.surface or ""))
+    first = {finding.key for finding in report.findings}
+    report.findings += [finding for key, finding in left.items() if key not in first and finding.what != "leftover"]
+    report.records = again.records
+
+
+def _after(finding: Finding, found_again: bool, record: Record | None) -> Finding:
+    done = [finding.repair] if finding.repair else []
+    if finding.lost and (record is None or record.state == "missing"):
+        return finding
+    if found_again:
+        missing = record is not None and record.state == "missing"
+        done.append("there is nothing to make it again from" if missing else "still so")
+        return replace(finding, repair="; ".join(done), lost=finding.lost or missing)
+    if finding.what == "leftover":
+        return replace(finding, repair="removed, or set aside", repaired=True)
+    if record is None or record.state == "ready":
+        if finding.what in ("container", "record"):
+            done.append("whole again")
+        return replace(finding, repair="; ".join(done) or "gone", repaired=True)
+    if record.state == "failed" and finding.what == "record":
+        return replace(finding, repair="; ".join(done), repaired=True)
+    done.append(f"{record.state}: {record.reason}")
+    return replace(finding, repair="; ".join(done), lost=record.state == "missing")
 
 
 async def _build(storage: Storage, settings: Settings) -> None:
@@ -77,47 +128,53 @@ async def _build(storage: Storage, settings: Settings) -> None:
 
 
 def _record(at: Folders, report: Report, finding: Finding) -> Finding:
-    words = _move(at, finding.path)
     surface = finding.surface or ""
-    try:
-        first = fsck.read_record(at.first_record(surface))
-        if first.id != surface:
-            raise ValueError(f"expected the record of {surface}, got that of {first.id[:80]!a}")
-        problem = fsck.check_upload(at, first)
-    except (OSError, ValueError) as error:
-        problem = f"expected its copy beside the upload: {error}"
-    if problem is not None:
-        upload = at.uploads / surface
-        if upload.exists():
-            words = f"{words}; {_move(at, upload)}"
-        return replace(finding, repair=f"{words}; nothing to take it from, {problem}", lost=True)
-    _write(at, report, replace(first, state="queued"))
-    return replace(finding, repair=f"{words}; taken from the copy beside the upload")
+    copy = _copy_of(at, surface)
+    if copy is None:
+        return replace(finding, repair="left as it is, since there is no other record of this surface", lost=True)
+    words = _move(at, finding.path) if is_file(finding.path) else "written again"
+    # A container of the surface may be whole, and is found by the hash that its record would name: it is built again.
+    _write(at, report, copy)
+    return replace(finding, repair=f"{words}; that beside the upload was taken")
+
+
+def _copy_of(at: Folders, surface: str) -> Record | None:
+    for upload in at.all_uploads():
+        for path in at.copies(upload):
+            if path.stem not in (surface, "record"):
+                continue
+            try:
+                record = read_record(path)
+            except ValueError:
+                continue
+            if record.id == surface and record.folder == upload.name:
+                return record
+    return None
 
 
 def _upload(at: Folders, report: Report, finding: Finding) -> Finding:
-    words = _move(at, finding.path) if finding.path.exists() else "it is gone"
     record = report.records[finding.surface or ""]
-    record = replace(record, upload_lost=True, upload_sha256=None)
-    if any(other.what == "container" and other.surface == record.id for other in report.findings):
-        _write(at, report, record)
-        return replace(finding, repair=words, lost=True)
-    if record.state == "ready":
-        _write(at, report, record)
+    damaged = [path for path in at.files(record) if is_file(path)]
+    if damaged:
+        # Not what lies beside them: the records of all surfaces that were made of them.
+        words = "; ".join(_move(at, path) for path in damaged)
+        others = [other for other in report.records.values() if other.folder == record.folder]
+        for other in others:
+            _write(at, report, replace(other, upload_lost=True))
+    elif report.records[record.id].upload_lost:
+        words = "set aside, as said above"
+    else:
+        return replace(finding, repair="left as it is, since nothing of it is here: is it elsewhere?")
+    if record.state == "ready" and not any(
+        other.what == "container" and other.surface == record.id for other in report.findings
+    ):
         return replace(finding, repair=f"{words}; the container is whole and is served")
-    _write(at, report, replace(record, state="failed", reason="the upload was damaged"))
-    return replace(finding, repair=words, lost=True)
+    return replace(finding, repair=words)
 
 
 def _container(at: Folders, report: Report, finding: Finding) -> Finding:
     # Another surface with the same container may have set it aside already.
-    words = _move(at, finding.path) if finding.path.exists() else "set aside, or gone"
-    record = replace(report.records[finding.surface or ""], container=None, info=None)
-    if record.upload_lost or record.state == "failed":
-        _write(at, report, replace(record, state="failed", reason="the container and the upload were damaged"))
-        return replace(finding, repair=f"{words}; the upload is lost too", lost=True)
-    _write(at, report, replace(record, state="queued", attempts=0))
-    return replace(finding, repair=words)
+    return replace(finding, repair=_move(at, finding.path) if finding.path.exists() else "set aside, or gone")
 
 
 def _figures(at: Folders, report: Report, finding: Finding) -> Finding:
@@ -125,15 +182,8 @@ def _figures(at: Folders, report: Report, finding: Finding) -> Finding:
     index = fsck.check_container(at.container(record.container), record.container or "")
     if isinstance(index, str):
         return replace(finding, repair=index, lost=True)
-    _write(at, report, replace(record, info=plain(describe(index))))
+    _write(at, report, replace(record, info=figures_of(index, record.info, at.files(record))))
     return replace(finding, repair="taken from the container")
-
-
-def _leftover(at: Folders, report: Report, finding: Finding) -> Finding:
-    if finding.path.parent == at.containers:
-        return finding
-    remove(finding.path)
-    return replace(finding, repair="removed")
 
 
 _ACTIONS: dict[str, Callable[[Folders, Report, Finding], Finding]] = {
@@ -141,20 +191,11 @@ _ACTIONS: dict[str, Callable[[Folders, Report, Finding], Finding]] = {
     "upload": _upload,
     "container": _container,
     "figures": _figures,
-    "leftover": _leftover,
 }
 
 
 def _move(at: Folders, path: Path) -> str:
-    folder = at.damaged / path.parent.name
-    folder.mkdir(parents=True, exist_ok=True)
-    sync_folder(at.root)
-    sync_folder(at.damaged)
-    target = folder / path.name
-    if target.exists():
-        target = folder / f"{path.name}.{secrets.token_hex(4)}"
-    rename(path, target)
-    return f"set aside as {target.relative_to(at.root)}"
+    return f"set aside as {aside.set_aside(at, path).relative_to(at.root)}"
 
 
 def _write(at: Folders, report: Report, record: Record) -> None:

@@ -13,12 +13,17 @@ from fastapi.responses import Response
 from .access import Access
 from .containers import Containers
 from .jobs import Builder
-from .limits import Limits, Turnstile
+from .level_queue import LevelQueue
+from .limits import Limits
 from .metrics import Metrics
 from .settings import Settings
+from .shares import Turns
 from .storage import Storage
 
 __all__ = ["Parts", "State", "matches", "readable"]
+
+# For so many seconds it counts who has had plans made.
+_PLANS_REMEMBERED = 60.0
 
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
@@ -27,7 +32,7 @@ _Route = TypeVar("_Route", bound=Callable[..., Any])
 class State:
     """The parts of a running server.
 
-    ``decoding`` is held while a level is decoded: it takes as much memory as the surface, so there is one at a time.
+    ``planning`` is had while a large plan is made, which holds up what else Python does: one at a time.
     """
 
     settings: Settings
@@ -37,11 +42,8 @@ class State:
     access: Access
     limits: Limits
     metrics: Metrics
-    decoding: Turnstile = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Let as many wait for a level as the settings say."""
-        object.__setattr__(self, "decoding", Turnstile(self.settings.max_level_requests))
+    levels: LevelQueue
+    planning: Turns = field(default_factory=lambda: Turns(1, _PLANS_REMEMBERED), init=False)
 
 
 def _parts(connection: HTTPConnection) -> State:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import resource
+import os
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,19 +18,16 @@ from lodestream.messages import MAX_MESSAGE
 
 from .app import create_app
 from .connections import connections
+from .cuts import Cuts
+from .frames import stream_connections
 from .logs import drain
 from .settings import Settings
+from .storage import Storage
 
-__all__ = ["Server", "make_server", "raise_file_limit", "running_server"]
-
-_log = logging.getLogger(__name__)
+__all__ = ["Server", "make_server", "running_server"]
 
 _START_SECONDS = 60.0
 _GRACEFUL_SECONDS = 4
-
-# A connection and the container that is sent over it, and what everything else needs.
-_FILES_EACH = 2
-_OTHER_FILES = 200
 
 # A ping waits behind what is in flight: a full window of 256 KiB takes 33 s on a link of 64 kbit/s.
 _PING_INTERVAL = 20.0
@@ -38,19 +35,45 @@ _PING_TIMEOUT = 60.0
 
 
 class Server(uvicorn.Server):
-    """A uvicorn server that says where it listens, once it does."""
+    """A uvicorn server that says where it listens, once it does.
 
-    def __init__(self, config: uvicorn.Config, listening: Callable[[str], None]) -> None:
+    Attributes
+    ----------
+    refusal : LodestreamError, OSError or None
+        Why its data folder could not be opened, or nothing can listen at its address, so that it did not start.
+    """
+
+    def __init__(self, config: uvicorn.Config, data: Path, listening: Callable[[str], None]) -> None:
         super().__init__(config)
+        self.refusal: LodestreamError | OSError | None = None
+        self._data = data
         self._listening = listening
         self._state = getattr(config.app, "state", None)
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
-        """Start, then tell the address."""
-        await super().startup(sockets)
+        """Open the data folder, listen, start, then tell the address."""
+        assert self._state is not None, "the application is that of `create_app`"
+        try:
+            storage = await asyncio.to_thread(Storage, self._data)
+        except (LodestreamError, OSError) as error:
+            self._refuse(error)
+            return
+        try:
+            # uvicorn would write what is wrong into its log, and end the process with a code of its own.
+            listening = await _listen(self.config.host, self.config.port, self.config.backlog)
+        except LodestreamError as error:
+            storage.close()
+            self._refuse(error)
+            return
+        self._state.storage = storage
+        await super().startup(listening)
         if self.started:
             host, port = self.servers[0].sockets[0].getsockname()[:2]
             self._listening(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
+
+    def _refuse(self, error: LodestreamError | OSError) -> None:
+        self.refusal = error
+        self.should_exit = True
 
     async def shutdown(self, sockets: list[Any] | None = None) -> None:
         """Tell whoever is connected, wait a little for them, and end."""
@@ -60,6 +83,24 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
         # The signal that was caught is raised again after this, and ends the process at once.
         await asyncio.to_thread(drain)
+
+
+async def _listen(host: str, port: int, backlog: int) -> list[socket.socket]:
+    """Sockets that listen: a name may have several addresses."""
+    found = list[socket.socket]()
+    try:
+        # Nothing is accepted yet: the protocol is never used.
+        bound = await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port, start_serving=False)
+        found += [ours.dup() for ours in bound.sockets]
+        bound.close()
+        for ours in found:
+            ours.listen(backlog)
+    except OSError as error:
+        for ours in found:
+            ours.close()
+        reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
+        raise LodestreamError(f"expected an address to listen at, got {host} port {port}: {reason}") from None
+    return found
 
 
 def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
@@ -76,12 +117,14 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
     LodestreamError, OSError
         As `create_app` does.
     """
+    app = create_app(settings)
+    cuts = Cuts(app.state.metrics)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         host=settings.host,
         port=settings.port,
-        http=connections(settings),
-        ws="websockets-sansio",
+        http=connections(settings, cuts),
+        ws=stream_connections(cuts),
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.
         ws_per_message_deflate=False,
@@ -96,31 +139,12 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies),
     )
-    return Server(config, listening)
-
-
-def raise_file_limit(settings: Settings) -> None:
-    """Let this process open as many files as it may need, or as many as the system lets it."""
-    needed = _FILES_EACH * settings.max_connections + _OTHER_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    if soft < allowed:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-    if allowed < needed:
-        _log.warning(
-            "%d connections may need %d open files and this process may open %d: raise the limit (ulimit -n) or set "
-            "LODESTREAM_MAX_CONNECTIONS",
-            settings.max_connections,
-            needed,
-            allowed,
-        )
+    return Server(config, settings.data, listening)
 
 
 @contextmanager
 def running_server(data: Path, **settings: Any) -> Iterator[str]:
     """A server on a free port of this machine, in a thread, for as long as the ``with`` block lasts.
-
-    Builds run in spawned processes: a script that uses this guards its own start with ``if __name__ == "__main__"``.
 
     Parameters
     ----------
@@ -136,7 +160,7 @@ def running_server(data: Path, **settings: Any) -> Iterator[str]:
 
     Raises
     ------
-    LodestreamError
+    LodestreamError, OSError
         When the server does not start.
     """
     address: list[str] = []
@@ -161,6 +185,8 @@ def running_server(data: Path, **settings: Any) -> Iterator[str]:
     thread.start()
     settled.wait(_START_SECONDS)
     try:
+        if server.refusal is not None:
+            raise server.refusal
         if not address:
             raise LodestreamError(
                 f"expected a server that starts within {_START_SECONDS:g} s; its log says why it did not"

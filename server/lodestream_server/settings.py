@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from .table import PREFIX, TABLE
+from .table import FORMATS, PREFIX, TABLE
 
 __all__ = ["Settings"]
 
@@ -39,20 +39,26 @@ class Settings(BaseSettings):
     public_reads: bool = _field("public_reads")
     origins: Annotated[tuple[str, ...], NoDecode] = _field("origins")
     ticket_seconds: float = _field("ticket_seconds")
+    formats: Annotated[tuple[str, ...], NoDecode] = _field("formats")
     upload_bytes: int = _field("upload_bytes")
     upload_files: int = _field("upload_files")
     max_uploads: int = _field("max_uploads")
     max_vertices: int = _field("max_vertices")
     max_surfaces: int = _field("max_surfaces")
     keep_free: int | None = _field("keep_free")
-    max_connections: int = _field("max_connections")
+    owner_bytes: int | None = _field("owner_bytes")
+    max_connections: int | None = _field("max_connections")
     max_streams: int = _field("max_streams")
     max_client_streams: int = _field("max_client_streams")
     max_level_requests: int = _field("max_level_requests")
+    max_client_level_requests: int = _field("max_client_level_requests")
+    level_memory: int = _field("level_memory")
+    level_disk: int | None = _field("level_disk")
     max_builds: int = _field("max_builds")
     workers: int = _field("workers")
-    build_memory: int = _field("build_memory")
+    build_memory: int | None = _field("build_memory")
     build_seconds: float = _field("build_seconds")
+    level_seconds: float = _field("level_seconds")
     idle_seconds: float = _field("idle_seconds")
     upload_rate: int = _field("upload_rate")
     head_seconds: float = _field("head_seconds")
@@ -70,6 +76,13 @@ class Settings(BaseSettings):
     def _rooted(cls, value: str) -> str:
         if value and (not value.startswith("/") or value.endswith("/")):
             raise ValueError(f"expected a path that begins with a slash and does not end with one, got {value!r}")
+        return value
+
+    @field_validator("formats")
+    @classmethod
+    def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value or not set(value) <= set(FORMATS):
+            raise ValueError(f"expected {TABLE['formats'].kind.expected}, got {', '.join(value) or 'none'}")
         return value
 
     @property

@@ -1,95 +1,38 @@
-"""A folder of surfaces: records, uploads and containers.
+"""The surfaces of a server: what is kept of them in its folder (`folders`), and what is known of them in memory.
 
-::
-
-    DATA/records/{id}.json          one `Record`
-    DATA/uploads/{id}/0, 1, ...     the uploaded files
-    DATA/uploads/{id}/record.json   the record as it was when they came
-    DATA/containers/{sha256}.lode   never changed, named by their content
-    DATA/incoming/                  uploads under way
-    DATA/work/                      builds under way
-    DATA/damaged/                   what ``lodestream fsck --repair`` has set aside
-    DATA/lock                       held by the one process that works in the folder
-
-Whatever stands in the first three folders is whole: it was written elsewhere, put on disk, and renamed. The next two
-are emptied at the start. What no record speaks of is left over from a moment at which the process died, and is removed
-then too.
+Whatever was acknowledged stays until somebody who may asks for its removal. What a start makes of the folder that it
+finds is told in `recovery`.
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
 import logging
 import os
 import secrets
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from lodestream.errors import LodestreamError, NotFoundError
+from lodestream.errors import InputError, LodestreamError, NotFoundError
 
+from . import markers
+from .catalog import Catalog, Position
 from .durable import NewFile, make_folder, remove, rename, sync_folder, write_file
-from .records import Record
+from .folders import Folders, is_file, is_folder
+from .private import check_writable, make_private, tighten
+from .problems import MissingError
+from .records import Record, State, serialize
+from .recovery import finish_delete, has_upload, present, recover
 
-__all__ = ["Folders", "Storage", "claim", "serialize"]
+__all__ = ["Storage", "claim"]
 
 _log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class Folders:
-    """Where everything lies."""
-
-    root: Path
-
-    @property
-    def records(self) -> Path:
-        """One file for each surface."""
-        return self.root / "records"
-
-    @property
-    def uploads(self) -> Path:
-        """One folder for each surface."""
-        return self.root / "uploads"
-
-    @property
-    def containers(self) -> Path:
-        """One file for each container."""
-        return self.root / "containers"
-
-    @property
-    def incoming(self) -> Path:
-        """Uploads under way."""
-        return self.root / "incoming"
-
-    @property
-    def work(self) -> Path:
-        """Builds under way."""
-        return self.root / "work"
-
-    @property
-    def damaged(self) -> Path:
-        """What was set aside; made when it is needed."""
-        return self.root / "damaged"
-
-    def record(self, surface: str) -> Path:
-        """The record of a surface."""
-        return self.records / f"{surface}.json"
-
-    def upload(self, record: Record) -> list[Path]:
-        """The uploaded files of a surface, in order."""
-        return [self.uploads / record.id / str(number) for number in range(len(record.filenames))]
-
-    def first_record(self, surface: str) -> Path:
-        """The record of a surface as it was when it was uploaded."""
-        return self.uploads / surface / "record.json"
-
-    def container(self, sha256: str | None) -> Path:
-        """A container."""
-        return self.containers / f"{sha256}.lode"
+# Of a surface in these states another upload, or somebody who asks for it, begins another attempt.
+_STOPPED = ("failed", "waiting", "missing")
 
 
 class Storage:
@@ -103,22 +46,25 @@ class Storage:
     Raises
     ------
     LodestreamError
-        When another server works in the folder.
+        When another server works in the folder, not all of it is there, or it cannot be written.
+    OSError
+        When it cannot be read or written.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._at = Folders(root)
         self._lock = threading.RLock()
-        at = self._at
-        for folder in (at.records, at.uploads, at.containers, at.incoming, at.work):
-            folder.mkdir(parents=True, exist_ok=True)
-        sync_folder(root)
-        sync_folder(root.absolute().parent)
+        new = make_private(root)
         self._guard = claim(root)
         try:
-            self._records = {record.id: record for record in self._load()}
-            self._sweep()
+            if not new:
+                tighten(root, self._at.known)
+            check_writable(root, *self._at.written)
+            self._identity = markers.establish(self._at)
+            self._catalog = Catalog(recover(self._at))
+            self._unusable = any(not record.filenames for record in self._catalog.all())
+            sync_folder(root)
         except BaseException:
             self.close()
             raise
@@ -128,7 +74,7 @@ class Storage:
         os.close(self._guard)
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len(self._catalog)
 
     def get(self, surface: str) -> Record:
         """The record of a surface.
@@ -138,18 +84,30 @@ class Storage:
         NotFoundError
             When there is none.
         """
-        record = self._records.get(surface)
+        record = self._catalog.find(surface)
         if record is None:
             raise NotFoundError(f"expected the id of a surface on this server, got {surface[:80]!a}")
         return record
 
     def find(self, surface: str | None) -> Record | None:
         """The record of a surface, if there is one."""
-        return self._records.get(surface or "")
+        return self._catalog.find(surface or "")
 
     def records(self) -> list[Record]:
         """All records, oldest first."""
-        return sorted(self._records.values(), key=lambda record: (record.created, record.id))
+        return self._catalog.all()
+
+    def records_after(self, position: Position, most: int) -> list[Record]:
+        """At most so many records that come after a place in the order of `records`."""
+        return self._catalog.after(position, most)
+
+    def records_of(self, upload_sha256: str) -> Iterator[Record]:
+        """The surfaces that were made of files with this hash."""
+        return self._catalog.of_digest(upload_sha256)
+
+    def kept(self, owner: str | None) -> int:
+        """How many bytes are kept for the surfaces of an owner."""
+        return self._catalog.kept(owner)
 
     def new_upload(self) -> Path:
         """An empty folder for the files of an upload, called 0, 1, ..."""
@@ -163,13 +121,13 @@ class Storage:
         return self._at.work / f"{surface}.{secrets.token_hex(8)}"
 
     @property
-    def temporary(self) -> Path:
-        """A folder for files without a name."""
-        return self._at.work
+    def levels(self) -> Path:
+        """A folder for files that can be made again; made and emptied by whoever uses it."""
+        return self._at.levels
 
     def upload_files(self, record: Record) -> list[Path]:
         """The uploaded files of a surface, in order."""
-        return self._at.upload(record)
+        return self._at.files(record)
 
     def container(self, sha256: str) -> Path:
         """The path of a container.
@@ -178,158 +136,281 @@ class Storage:
         ------
         NotFoundError
             When no surface has it.
+        MissingError
+            When a surface has it, and it is not on the disk.
         """
         path = self._at.container(sha256)
-        if len(sha256) != 64 or not (sha256.isascii() and sha256.isalnum()) or not path.is_file():
-            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+        if not self._catalog.serves(sha256) or not is_file(path):
+            raise self.gone(sha256)
         return path
 
-    def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
-        """Keep an upload; the surface's record, and whether it is new.
+    def container_bytes(self, sha256: str) -> int | None:
+        """How long a container was when it was kept; None where it is not known."""
+        record = self._catalog.one_of_container(sha256)
+        size = None if record is None or record.info is None else record.info.get("bytes")
+        return size if isinstance(size, int) else None
 
-        A surface that failed is taken up again.
+    def has_container(self, sha256: str | None) -> bool:
+        """Whether a surface has a container, or had it before it was lost."""
+        return sha256 is not None and self._catalog.has_container(sha256)
+
+    def may_have_upload(self, size: int | None, *, form: bool) -> bool:
+        """Whether an upload of so many bytes, or a form around one, may be there already; None: of any size."""
+        return self._catalog.has_size(size, form=form)
+
+    def gone(self, sha256: str) -> LodestreamError:
+        """Why a container that was known a moment ago cannot be read: it was deleted since, or its disk is gone."""
+        if self._catalog.has_container(sha256):
+            _log.error("the container %s is not on the disk", sha256)
+            return MissingError(f"expected the container {sha256} on the server's disk, where it is not now")
+        return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+
+    def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
+        """Keep an upload; the surface's record, and whether it is to be built.
+
+        A surface that failed, waits or is missing is taken up again. One of the same bytes, options and name as
+        another owner's has its container at once.
+
+        Parameters
+        ----------
+        record : Record
+            With the hash of its upload.
+        upload : Path
+            Folder of the files, as `new_upload` gave it.
+
+        Raises
+        ------
+        InputError
+            When a surface of other bytes has the same id.
+        MissingError
+            When a folder is not there now.
+        OSError
+            When it cannot be kept; then nothing has changed.
         """
         with self._lock:
-            known = self._records.get(record.id)
-            if known is not None and known.state != "failed":
+            self._check_mounted()
+            known = self._catalog.find(record.id)
+            if known is not None and not _may_be(known, record):
+                raise InputError(
+                    f"expected an upload whose id no other has, got one with that of {record.id}; give it another name"
+                )
+            if known is not None and known.state not in _STOPPED and has_upload(self._at, known):
                 remove(upload)
                 return known, False
-            with NewFile(upload / self._at.first_record(record.id).name) as file:
-                file.write(serialize(record))
-            sync_folder(upload)
-            remove(self._at.uploads / record.id)
-            try:
-                rename(upload, self._at.uploads / record.id)
-                self._write(record)
-            except OSError:
-                self._take_back(record, known)
-                raise
-            return record, True
+            record = replace(record, upload=self._upload_folder(record))
+            if known is not None:
+                record = replace(record, created=known.created, container=known.container, info=known.info)
+                if known.upload is None and known.filenames:  # its id does not tell its name from another
+                    record = replace(record, name=known.name, filenames=known.filenames)
+            made = self._like_its_twin(record) or self._with_its_container(record) or record
+            self._place(made, upload, known)
+            return made, made.state == "queued"
 
-    def _take_back(self, record: Record, known: Record | None) -> None:
-        # What is not acknowledged does not come back after a restart. That the surface had failed before may be
-        # forgotten, if there is not even room to say so.
-        remove(self._at.uploads / record.id)
-        remove(self._at.record(record.id))
-        self._records.pop(record.id, None)
-        if known is not None:
-            with suppress(OSError):
+    def _upload_folder(self, record: Record) -> str | None:
+        # Files that are here already, perhaps under a name of an earlier version, are not kept twice.
+        for other in self._catalog.of_digest(record.upload_sha256 or ""):
+            if has_upload(self._at, other):
+                return None if other.folder == record.id else other.folder
+        return record.upload_sha256
+
+    def _with_its_container(self, record: Record) -> Record | None:
+        if record.container is None or not is_file(self._at.container(record.container)):
+            return None
+        return replace(record, state="ready")
+
+    def _like_its_twin(self, record: Record) -> Record | None:
+        for other in self._catalog.of_digest(record.upload_sha256 or ""):
+            same = (other.options, other.name, other.filenames) == (record.options, record.name, record.filenames)
+            if same and other.state == "ready" and is_file(self._at.container(other.container)):
+                return replace(record, state="ready", container=other.container, info=other.info)
+        return None
+
+    def _place(self, record: Record, upload: Path, known: Record | None) -> None:
+        folder, copy = self._at.upload(record), self._at.copy(record)
+        new = not is_folder(folder)
+        # Of a delete that could not remove everything: the surface is there again.
+        remove(self._at.tombstone(record.id))
+        try:
+            if new:
+                with NewFile(upload / copy.name) as file:
+                    file.write(serialize(record))
+                sync_folder(upload)
+                rename(upload, folder)
+            else:
+                # The same bytes, file by file: whoever reads them does not notice, and what was damaged is whole again.
+                for source, target in zip(sorted(upload.iterdir()), sorted(self._at.files(record)), strict=True):
+                    rename(source, target)
+                write_file(copy, serialize(record))
+            self._write(record)
+        except OSError:
+            self._take_back(record, known, folder if new else copy)
+            raise
+
+    def _take_back(self, record: Record, known: Record | None, placed: Path) -> None:
+        # What is not acknowledged does not come back after a restart; what was there before stays.
+        with suppress(OSError):
+            if known is None:
+                remove(self._at.record(record.id))
+            else:
                 self._write(known)
+        if known is None or placed != self._at.copy(record):
+            with suppress(OSError):
+                remove(placed)
 
-    def waiting(self, surface: str, reason: str | None) -> None:
+    def note(self, surface: str, reason: str | None) -> None:
         """Say why a surface stays in the queue; not worth writing down."""
         with self._lock:
-            record = self._records.get(surface)
+            record = self._catalog.find(surface)
             if record is not None and record.state == "queued":
-                self._records[surface] = replace(record, reason=reason)
+                self._catalog.put(replace(record, reason=reason))
 
     def ready(self, surface: str, built: Path, sha256: str, info: dict[str, object]) -> None:
-        """Keep the container that was built for a surface; nothing happens if the surface is gone."""
+        """Keep the container that was built for a surface; nothing happens if the surface is gone.
+
+        Raises
+        ------
+        OSError, MissingError
+            When it cannot be kept; the surface is still to be built then.
+        """
         with self._lock:
-            record = self._records.get(surface)
+            record = self._catalog.find(surface)
             if record is None:
                 remove(built)
                 return
+            self._check_mounted()
+            if record.container not in (None, sha256):
+                _log.warning("%s was built again as another container, %s, than before", surface, sha256)
             made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
             serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
+            container = self._at.container(sha256)
+            there = is_file(container)
             try:
-                rename(built, self._at.container(sha256))
+                rename(built, container)
                 self._write(made)
             except OSError:
-                self._remove_container(sha256)
+                if not there:
+                    remove(container)
                 raise
 
     def failed(self, surface: str, reason: str) -> None:
-        """Note why a surface could not be built, and drop its upload."""
+        """Note that a reader refused the bytes of a surface; they stay until somebody deletes it."""
+        self._stop(surface, "failed", reason)
+
+    def postpone(self, surface: str, reason: str) -> None:
+        """Note that a surface could not be built here and now; it waits until somebody asks for another attempt."""
+        self._stop(surface, "waiting", reason)
+
+    def _stop(self, surface: str, state: State, reason: str) -> None:
         with self._lock:
-            record = self._records.get(surface)
+            record = self._catalog.find(surface)
             if record is None:
                 return
-            made = replace(record, state="failed", reason=reason, attempts=0)
-            # First the bytes: whoever sees the failure finds nothing stored.
-            remove(self._at.uploads / surface)
-            self._write_if_possible(made)
+            made = replace(record, state=state, reason=reason, attempts=0)
+            try:
+                self._write(made)
+            except OSError as error:
+                # What this says is found out again after a restart.
+                _log.error("%s: the record could not be written: %s", surface, error)
+                self._catalog.put(made)
 
-    def delete(self, surface: str) -> None:
-        """Remove a surface, and its container unless another surface has the same.
+    def retry(self, surface: str) -> Record:
+        """Take up a surface again that failed, waits or is missing; its record, queued if there is something to build.
 
         Raises
         ------
         NotFoundError
             When there is none.
+        OSError
+            When it cannot be seen what is there, or cannot be written down.
         """
         with self._lock:
             record = self.get(surface)
-            remove(self._at.record(surface))
-            del self._records[surface]
-            sync_folder(self._at.records)
-            remove(self._at.uploads / surface)
-            self._remove_container(record.container)
+            if record.state not in _STOPPED:
+                return record
+            made = present(self._at, replace(record, state="queued", reason=None, attempts=0))
+            if made.state != "missing":
+                self._write(made)
+            elif record.state == "failed":  # an earlier version dropped its upload
+                return record
+            else:
+                self._catalog.put(made)
+            return made
 
-    def _remove_container(self, sha256: str | None) -> None:
-        if all(other.container != sha256 for other in self._records.values()):
-            remove(self._at.container(sha256))
+    def lose(self, surface: str) -> None:
+        """Look again what is there of a surface whose upload was not found."""
+        with self._lock:
+            record = self._catalog.find(surface)
+            if record is not None:
+                self._catalog.put(present(self._at, record))
+
+    def has_upload(self, record: Record) -> bool:
+        """Whether every uploaded file of a surface is on the disk.
+
+        Raises
+        ------
+        OSError
+            When the system cannot tell.
+        """
+        return has_upload(self._at, record)
+
+    def delete(self, surface: str) -> None:
+        """Remove a surface, and its upload and container unless another surface has the same.
+
+        Raises
+        ------
+        NotFoundError
+            When there is none.
+        MissingError
+            When a folder is not there now.
+        OSError
+            When that could not be written down; the surface is still there.
+        """
+        with self._lock:
+            record = self.get(surface)
+            self._check_mounted()
+            tombstone = self._at.tombstone(surface)
+            # A record that was never written, or cannot be read, leaves nothing to rename.
+            if is_file(self._at.record(surface)):
+                try:
+                    rename(self._at.record(surface), tombstone)
+                except OSError:
+                    with suppress(OSError):
+                        rename(tombstone, self._at.record(surface))
+                    raise
+            self._catalog.drop(surface)
+            try:
+                finish_delete(
+                    self._at,
+                    record,
+                    last_upload=not self._catalog.has_upload(record.folder),
+                    # A record that cannot be used may speak of it as well.
+                    last_container=not self.has_container(record.container) and not self._unusable,
+                )
+            except OSError as error:
+                _log.warning("what is left of %s, which was deleted, goes at the next start: %s", surface, error)
+
+    def _check_mounted(self) -> None:
+        """Refuse to change anything while a folder is not there: what is written then would be under its mount."""
+        for folder in self._at.kept:
+            if markers.identity(folder) != self._identity:
+                raise MissingError(
+                    f"expected {folder.name}/ with the marker of the data folder; is its disk not mounted? Nothing was "
+                    "changed"
+                )
 
     def _write(self, record: Record) -> None:
-        write_file(self._at.record(record.id), serialize(record))
-        self._records[record.id] = record
-
-    def _write_if_possible(self, record: Record) -> None:
-        # What this says is found out again after a restart.
-        try:
-            self._write(record)
-        except OSError as error:
-            _log.error("%s: the record could not be written: %s", record.id, error)
-            self._records[record.id] = record
-
-    def _load(self) -> Iterator[Record]:
-        for path in self._at.records.glob("*.json"):
-            try:
-                record = Record.from_json(json.loads(path.read_bytes()))
-                if record.id != path.stem:
-                    raise ValueError(f"expected the record of {path.stem}, got that of {record.id[:80]!a}")
-                yield record
-            except ValueError as error:
-                _log.error("%s is not a record and is left alone; see lodestream fsck: %s", path, error)
-
-    def _sweep(self) -> None:
-        for record in list(self._records.values()):
-            if record.state == "ready" and not self._at.container(record.container).is_file():
-                record = replace(record, state="queued", container=None, info=None)
-                self._write_if_possible(record)
-            if record.state == "queued" and not all(path.is_file() for path in self.upload_files(record)):
-                self._write_if_possible(replace(record, state="failed", reason="the upload is gone"))
-        for surface in {path.name.partition(".")[0] for path in self._at.work.iterdir()}:
-            begun = self._records.get(surface)
-            if begun is not None and begun.state == "queued":
-                self._write_if_possible(replace(begun, attempts=begun.attempts + 1))
-        unreadable = {path.stem for path in self._at.records.glob("*.json")} - self._records.keys()
-        if not unreadable:
-            kept = {record.id for record in self._records.values() if record.state != "failed"}
-            self._remove_unknown(self._at.uploads, kept)
-            known = {self._at.container(record.container).name for record in self._records.values()}
-            self._remove_unknown(self._at.containers, known)
-        self._remove_unknown(self._at.incoming, set())
-        self._remove_unknown(self._at.work, set())
-        for path in self._at.records.glob("*.new"):
-            remove(path)
-
-    def _remove_unknown(self, folder: Path, known: set[str]) -> None:
-        for path in folder.iterdir():
-            if path.name not in known:
-                _log.debug("removing %s, left over", path)
-                remove(path)
+        # What is missing now may be there at the next start.
+        kept = replace(record, state="queued", reason=None) if record.state == "missing" else record
+        write_file(self._at.record(record.id), serialize(kept))
+        self._catalog.put(record)
 
 
-def serialize(record: Record) -> bytes:
-    """A record as it stands in its file.
-
-    Raises
-    ------
-    ValueError, TypeError
-        When a value is none that JSON has.
-    """
-    return json.dumps(record.to_json(), ensure_ascii=False, allow_nan=False).encode()
+def _may_be(known: Record, record: Record) -> bool:
+    """Whether an upload may be another one of a surface: ids are hashes, and not very long ones."""
+    if not known.filenames:  # all that is known of it is its id
+        return True
+    same = known.upload_sha256 in (None, record.upload_sha256)
+    return same and known.owner == record.owner and (known.upload is None or known.name == record.name)
 
 
 def claim(root: Path) -> int:
@@ -339,8 +420,10 @@ def claim(root: Path) -> int:
     ------
     LodestreamError
         When another process works in the folder.
+    OSError
+        When nothing can be written there.
     """
-    handle = os.open(root / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -348,4 +431,7 @@ def claim(root: Path) -> int:
         raise LodestreamError(
             f"expected a folder in which no server works, got {root}, in which another works"
         ) from None
+    except OSError:
+        os.close(handle)
+        raise
     return handle

@@ -9,13 +9,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Coroutine
-from typing import Any
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
 from fastapi import APIRouter, WebSocket
 from fastapi.responses import JSONResponse
 from starlette.websockets import WebSocketDisconnect
 
+from lodestream.container import ByteRange
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
 from lodestream.opening import OPENED, PARAMETER, from_address
@@ -29,8 +30,18 @@ from .containers import OpenContainer
 from .files import ready
 from .gate import caller_of
 from .logs import event
-from .problems import BadTokenError, BuildFailedError, BusyError, NoTokenError, NotReadyError, TooManyError
+from .problems import (
+    BadTokenError,
+    BuildFailedError,
+    BusyError,
+    MissingError,
+    NoTokenError,
+    NotReadyError,
+    PostponedError,
+    TooManyError,
+)
 from .routing import Parts
+from .scopes import needs
 
 __all__ = ["router"]
 
@@ -41,11 +52,23 @@ router = APIRouter()
 # A close frame carries 125 bytes, two of them the code.
 _LONGEST_REASON = 123
 
+# Planning with more pieces than this takes longer than the others should wait; each range that is held takes at least
+# so many bytes of a message.
+_PIECES_AT_ONCE = 2048
+_BYTES_OF_A_PIECE = 3
+
+_Result = TypeVar("_Result")
+
+# How often it is looked whether a stream's token is still valid. With the wait for a close frame it makes less than the
+# ten seconds that are promised.
+_TOKEN_SECONDS = 3.0
+
 # Long enough for a close frame to leave through a full buffer, short enough not to keep a dead peer.
 _CLOSE_SECONDS = 5.0
 
 
 @router.websocket("/v1/surfaces/{surface}/stream")
+@needs("read")
 async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
     """Send a surface under the client's credit."""
     try:
@@ -68,7 +91,7 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
                 caller = parts.access.redeem(_ticket(first))
             record = ready(parts, surface)
             container = await asyncio.to_thread(parts.containers.open, record.container or "")
-            await _stream(_Session(socket, container, parts, first), surface, caller)
+            await _stream(_Session(socket, container, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
         return
     except LodestreamError as error:
@@ -138,17 +161,25 @@ class _Session:
         Seconds from the client's open to the first layer's being sent.
     """
 
-    def __init__(self, socket: WebSocket, container: OpenContainer, parts: Parts, first: bytes | None) -> None:
+    def __init__(
+        self, socket: WebSocket, container: OpenContainer, parts: Parts, first: bytes | None, caller: Caller
+    ) -> None:
         self.result = "lost"
         self.first_surface: float | None = None
         self.metrics = parts.metrics
+        self._access = parts.access
+        self._caller = caller
         self._first = first
         self._opened = 0.0
+        self._progress = time.monotonic()
         self._socket = socket
         self._container = container
         self._settings = parts.settings
         self._sender = Sender(container.index, container.sha256)
         self._heard = asyncio.Event()
+        self._planning = parts.planning
+        # Who has the sender: a thread that plans with it, or one of the two tasks.
+        self._mine = asyncio.Lock()
 
     @property
     def sent(self) -> int:
@@ -160,8 +191,9 @@ class _Session:
         """Bytes that the client did not hold of the surface and did not need: it met its target, or had seen enough."""
         if self._sender.why in (None, "complete"):
             return 0
-        missing = plan(self._container.index, held=self._sender.held).ranges
-        return max(sum(place.length for place in missing) - self._sender.sent, 0)
+        held = self._sender.held
+        missing = (gap for p in plan(self._container.index).ranges for gap in held.missing(p.offset, p.length))
+        return max(sum(length for _, length in missing) - self._sender.sent, 0)
 
     def close(self) -> None:
         """Close the container."""
@@ -177,56 +209,88 @@ class _Session:
             return
         except (LodestreamError, OSError) as error:
             await self._fail(_code(error), str(error) if isinstance(error, LodestreamError) else "see the server's log")
-            if not isinstance(error, MessageError | UnsupportedVersionError | _SilentError):
+            if not isinstance(error, MessageError | UnsupportedVersionError | BadTokenError | _SilentError):
                 _log.error("a stream failed", exc_info=error)
         else:
             self.result = self._sender.why or "closed"
             await _close(self._socket, 1000, self.result)
 
     async def _both(self) -> None:
-        # Whichever ends first ends the other: the sender because the client has said bye, the receiver with an error.
-        sending, receiving = asyncio.ensure_future(self._send()), asyncio.ensure_future(self._receive())
+        # Whichever ends first ends the others: the sender because the client has said bye, the others with an error.
+        work = [self._receive(), self._send()]
+        if self._caller.token is not None:
+            work.append(self._follow_token())
+        tasks = [asyncio.ensure_future(task) for task in work]
         try:
-            done, _ = await asyncio.wait((sending, receiving), return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            sending.cancel()
-            receiving.cancel()
-            await asyncio.gather(sending, receiving, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
         # The receiver's error says why the sender failed, where both have.
-        for task in (receiving, sending):
+        for task in tasks:
             if task in done:
                 task.result()
+
+    async def _follow_token(self) -> None:
+        while True:
+            await asyncio.sleep(_TOKEN_SECONDS)
+            self._access.check(self._caller)
 
     async def _receive(self) -> None:
         while self._sender.state is not State.CLOSED:
             data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
-            self._sender.receive(data)
+            async with self._mine:
+                if self._sender.state is State.IDLE and self._long(len(data) // _BYTES_OF_A_PIECE):
+                    await self._plan(self._sender.receive, data)
+                else:
+                    self._sender.receive(data)
             self._heard.set()
+
+    def _long(self, more: int = 0) -> bool:
+        return self._sender.pieces + more > _PIECES_AT_ONCE
+
+    async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
+        """Do what takes long beside the event loop, which serves the others meanwhile."""
+        async with self._planning.turn(self._caller.key):
+            return await _whole(asyncio.to_thread(work, *args))
+
+    async def _next(self) -> tuple[bytes | None, ByteRange | None]:
+        """The message to send, or else the slice to read."""
+        async with self._mine:
+            message = self._sender.next_message()
+            if message is not None:
+                return message, None
+            if self._sender.turning and self._long():
+                return None, await self._plan(self._sender.wanted)
+            return None, self._sender.wanted()
 
     async def _send(self) -> None:
         while self._sender.state is not State.CLOSED:
-            message = self._sender.next_message()
+            # Before the look at the sender: what is heard from now on is not missed.
+            self._heard.clear()
+            message, wanted = await self._next()
             if message is not None:
                 sending = self._socket.send_bytes(message)
                 await _within(self._settings.idle_seconds, sending, "the client to take what was sent")
+                self._progress = time.monotonic()
                 if self._sender.layers and self.first_surface is None:
                     self.first_surface = time.monotonic() - self._opened
                     self.metrics.first_surface(self.first_surface)
-            elif (wanted := self._sender.wanted()) is not None:
+            elif wanted is not None:
                 data = self._container.read_at_once(wanted)
                 if data is None:
                     data = await asyncio.to_thread(self._container.read, wanted)
                 else:
                     # The others' turn: of many streams each has its first picture before any has its second.
                     await asyncio.sleep(0)
-                self._sender.provide(wanted, data)
+                async with self._mine:
+                    self._sender.provide(wanted, data)
             else:
                 await self._hear()
 
     async def _hear(self) -> None:
-        # Nothing is awaited between the last look at the sender and this: no message is missed.
-        self._heard.clear()
         if self._sender.state is State.ENDED:
             patience, what = self._settings.bye_seconds, "bye"
         else:
@@ -234,7 +298,9 @@ class _Session:
                 self._settings.idle_seconds,
                 "open" if self._sender.state is State.IDLE else "credit or stop",
             )
-        await _within(patience, self._heard.wait(), what)
+        # Messages that change nothing, such as a focus without credit, do not set the clock back.
+        waited = time.monotonic() - self._progress
+        await _within(patience, self._heard.wait(), what, waited)
 
     async def _fail(self, code: str, detail: str) -> None:
         self.result = code
@@ -250,9 +316,19 @@ class _Session:
         await _close(self._socket, CODES[code].close, f"{code}: {detail}")
 
 
-async def _within(seconds: float, work: Coroutine[Any, Any, object], what: str) -> None:
+async def _whole(work: Coroutine[Any, Any, _Result]) -> _Result:
+    """Do all of it before a cancellation goes on: a thread does not stop for that, and it has the sender."""
+    task = asyncio.ensure_future(work)
     try:
-        async with asyncio.timeout(seconds):
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.gather(task, return_exceptions=True)
+        raise
+
+
+async def _within(seconds: float, work: Coroutine[Any, Any, object], what: str, waited: float = 0.0) -> None:
+    try:
+        async with asyncio.timeout(max(seconds - waited, 0.0)):
             await work
     except TimeoutError:
         raise _SilentError(f"expected {what} within {seconds:g} s") from None
@@ -267,6 +343,8 @@ def _code(error: Exception) -> str:
         (NotFoundError, "not-found"),
         (NotReadyError, "not-ready"),
         (BuildFailedError, "failed"),
+        (PostponedError, "waiting"),
+        (MissingError, "missing"),
         (NoTokenError, "no-token"),
         (BadTokenError, "bad-token"),
         (TooManyError, "too-many"),

@@ -13,10 +13,14 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from . import examples, options, uploads
+from .access import Caller, anybody
 from .durable import remove
-from .problems import BusyError, FullError, responses
+from .files import ready
+from .gate import caller_of
+from .problems import BusyError, FullError, NotOwnerError, TooManyError, responses
 from .records import Record
 from .routing import Parts, State, readable
+from .scopes import needs
 
 __all__ = ["router"]
 
@@ -35,30 +39,36 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
         200: examples.answer("The same surface is there already", examples.READY, location=True),
-        **responses(408, 413, 422, 503, 507),
+        **responses(408, 413, 422, 429, 503, 507),
     },
 )
+@needs("write")
 async def upload(request: Request, parts: Parts) -> Response:
     """Take a file, raw or as parts called ``file`` of a form, and build the surface in the background.
 
     What is neither precision, rms, closed, name nor filename in the query is an option of the file's format. Bytes and
-    options that are known already give the surface that is there, even where there is no room for others.
+    options that the caller has uploaded already, under the same name, give the surface that is there, even where there
+    is no room for others.
+
+    A container (.lode) is taken as it is: it is checked and decoded once, and kept. No option but name and filename
+    goes with it.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
+    caller = _caller(request)
     async with AsyncExitStack() as held:
         try:
-            watched = await held.enter_async_context(parts.limits.upload(request))
-        except (BusyError, FullError) as refusal:
+            watched = await held.enter_async_context(parts.limits.upload(request, caller))
+        except (BusyError, FullError, TooManyError) as refusal:
             if not _perhaps_known(request, parts):
                 raise
-            watched = await held.enter_async_context(parts.limits.upload(request, stored=False))
+            watched = await held.enter_async_context(parts.limits.upload(request, caller, stored=False))
             received = await uploads.receive(watched, None, parts.settings, chosen.filename)
-            known = await asyncio.to_thread(_known, received, chosen, parts)
+            known = await asyncio.to_thread(_known, received, chosen, caller.owner, parts)
             if known is None:
                 raise refusal from None
             record = known
         else:
-            received, record = await _keep(watched, chosen, parts)
+            received, record = await _keep(watched, chosen, caller, parts)
     parts.metrics.uploaded(received.size)
     content = _present(record, parts, request, full=True)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
@@ -72,6 +82,7 @@ async def upload(request: Request, parts: Parts) -> Response:
     summary="List surfaces",
     responses={200: examples.answer("A page of surfaces, oldest first", examples.PAGE), **responses(422)},
 )
+@needs("read")
 async def page(
     request: Request,
     parts: Parts,
@@ -80,7 +91,7 @@ async def page(
 ) -> Response:
     """Surfaces without the figures of their layers and levels; `next` is the address of the following page, or null."""
     start = _position(after)
-    following = [record for record in parts.storage.records() if (record.created, record.id) > start]
+    following = parts.storage.records_after(start, limit + 1)
     shown = following[:limit]
     address = None
     if len(following) > limit:
@@ -95,26 +106,80 @@ async def page(
     summary="Look at a surface",
     responses={200: examples.answer("State, and once ready the figures", examples.READY), **responses(404)},
 )
+@needs("read")
 async def look(request: Request, parts: Parts, surface: str) -> Response:
-    """State (queued, building, ready, failed with a reason), and once ready what ``lodestream info --json`` prints."""
+    """State, and once ready what ``lodestream info --json`` prints.
+
+    The state is queued, building or ready; or failed (the bytes are no surface), waiting (they could not be built,
+    until somebody asks for another attempt) or missing (they are not on the server's disk now), with a reason.
+
+    Of a surface that was uploaded as a container there is `errors` as well: `checked` where the errors of its layers
+    and levels were found to be right, as can be done where it is exact, else `told` by whoever uploaded it.
+    """
     return JSONResponse(_present(parts.storage.get(surface), parts, request, full=True))
 
 
-@router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(404))
-async def delete(parts: Parts, surface: str) -> Response:
-    """Remove a surface; its build is stopped. Streams of it that are open go on to their end."""
+@router.post(
+    "/{surface}/retry",
+    status_code=202,
+    summary="Try again to build a surface",
+    response_description="The surface will be built",
+    responses={
+        202: examples.answer("The surface will be built", examples.QUEUED, location=True),
+        200: examples.answer("The surface is ready", examples.READY, location=True),
+        **responses(404, 424, 429, 503),
+    },
+)
+@needs("write")
+async def retry(request: Request, parts: Parts, surface: str) -> Response:
+    """Build a surface that waits, failed or is missing once more; nothing happens to one that is ready or queued."""
+    caller = _caller(request)
+    if parts.storage.get(surface).state not in ("queued", "ready"):
+        parts.limits.check_builds(caller)
+    record = await parts.builder.retry(surface, caller.key)
+    if record.state in ("missing", "failed"):
+        ready(parts, surface)  # says that there is nothing to build it from
+    content = _present(record, parts, request, full=True)
+    return JSONResponse(content, 200 if content["state"] == "ready" else 202, {"location": content["url"]})
+
+
+@router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
+@needs("write")
+async def delete(request: Request, parts: Parts, surface: str) -> Response:
+    """Remove a surface; its build is stopped. Streams of it that are open go on to their end.
+
+    Only its owner, the token by whose name it was uploaded, and an admin may.
+    """
+    record = parts.storage.get(surface)
+    caller = caller_of(request)
+    if caller is None or not caller.may_delete(record.owner):
+        whose = "nobody's" if record.owner is None else "somebody else's"
+        raise NotOwnerError(f"expected the owner of {surface} or an admin, got {_called(caller)}: it is {whose}")
     await parts.builder.delete(surface)
+    if record.container is not None and not parts.storage.has_container(record.container):
+        parts.levels.forget(record.container)
     return Response(status_code=204)
 
 
-async def _keep(request: Request, chosen: options.SurfaceOptions, parts: State) -> tuple[uploads.Upload, Record]:
+def _called(caller: Caller | None) -> str:
+    return "nobody" if caller is None else caller.name
+
+
+def _caller(request: Request) -> Caller:
+    return caller_of(request) or anybody(request)
+
+
+async def _keep(
+    request: Request, chosen: options.SurfaceOptions, caller: Caller, parts: State
+) -> tuple[uploads.Upload, Record]:
     folder = await asyncio.to_thread(parts.storage.new_upload)
     try:
         received = await uploads.receive(request, folder, parts.settings, chosen.filename)
-        record = await asyncio.to_thread(_record, received, chosen)
-        record, _ = await parts.builder.accept(record, folder)
-    finally:
+        record = await asyncio.to_thread(_record, received, chosen, caller.owner, parts)
+    except BaseException:
         await asyncio.to_thread(remove, folder)
+        raise
+    record, _ = await parts.builder.accept(record, folder, caller.key)
     return received, record
 
 
@@ -123,38 +188,32 @@ def _perhaps_known(request: Request, parts: State) -> bool:
     said = request.headers.get("content-length", "")
     size = int(said) if said.isascii() and said.isdecimal() and len(said) < 19 else None
     form = request.headers.get("content-type", "").startswith("multipart/")
-    return any(
-        size is None or record.upload_bytes == size or (form and record.upload_bytes < size)
-        for record in parts.storage.records()
-        if record.state != "failed"
-    )
+    return parts.storage.may_have_upload(size, form=form)
 
 
-def _known(received: uploads.Upload, chosen: options.SurfaceOptions, parts: State) -> Record | None:
+def _known(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Record | None:
     """The surface that this upload, of which only the hash was kept, has made already."""
-    digest = received.digest.hexdigest()
-    for record in parts.storage.records():
-        if record.upload_sha256 == digest and record.state != "failed":
-            try:
-                # The same bytes, so they say the same of their format.
-                surface, _ = _identify(received, parts.storage.upload_files(record), chosen)
-            except FileNotFoundError:  # deleted since
-                continue
-            found = parts.storage.find(surface)
-            return found if found is not None and found.state != "failed" else None
+    for record in parts.storage.records_of(received.digest.hexdigest()):
+        try:
+            # The same bytes, so they say the same of their format.
+            surface, _ = _identify(received, parts.storage.upload_files(record), chosen, owner, parts)
+        except FileNotFoundError:  # deleted since, or not there now
+            continue
+        found = parts.storage.find(surface)
+        return found if found is not None and found.state in ("queued", "ready") else None
     return None
 
 
 def _identify(
-    received: uploads.Upload, files: list[Path], chosen: options.SurfaceOptions
+    received: uploads.Upload, files: list[Path], chosen: options.SurfaceOptions, owner: str | None, parts: State
 ) -> tuple[str, list[str | None]]:
     names = [options.plain_name(name or "") for name in received.names]
-    format_ = options.check(files, names, chosen)
-    return options.identify(received.digest, format_, names[0], chosen), names
+    format_ = options.check(files, names, chosen, parts.settings.formats)
+    return options.identify(received.digest, format_, names[0], chosen, owner), names
 
 
-def _record(received: uploads.Upload, chosen: options.SurfaceOptions) -> Record:
-    surface, names = _identify(received, received.paths, chosen)
+def _record(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Record:
+    surface, names = _identify(received, received.paths, chosen, owner, parts)
     return Record(
         id=surface,
         name=chosen.name,
@@ -163,18 +222,21 @@ def _record(received: uploads.Upload, chosen: options.SurfaceOptions) -> Record:
         upload_bytes=received.size,
         options=chosen.chosen,
         upload_sha256=received.digest.hexdigest(),
+        owner=owner,
     )
 
 
 def _present(record: Record, parts: State, request: Request, *, full: bool) -> dict[str, Any]:
     state, progress = parts.builder.state(record)
-    info = dict(record.info or {})
+    # What is built again has the figures of the container that was lost.
+    info = dict(record.info or {}) if state == "ready" else {}
     if not full:
         info = {key: info[key] for key in ("shape", "closed", "bytes") if key in info}
     return {
         "id": record.id,
         "url": f"{_base(request)}/{record.id}",
-        "name": record.name or (record.info or {}).get("metadata", {}).get("name"),
+        "name": record.name or options.printable((record.info or {}).get("metadata", {}).get("name") or ""),
+        **_owned(record, request),
         "state": state,
         "progress": progress,
         "reason": record.reason,
@@ -182,9 +244,15 @@ def _present(record: Record, parts: State, request: Request, *, full: bool) -> d
         "filenames": list(record.filenames),
         "upload_bytes": record.upload_bytes,
         "options": record.options,
-        "container": record.container,
+        "container": record.container if state == "ready" else None,
         **info,
     }
+
+
+def _owned(record: Record, request: Request) -> dict[str, Any]:
+    # The names of tokens are told to those who have one.
+    caller = caller_of(request)
+    return {"owner": record.owner} if caller is not None and (caller.admin or caller.owner is not None) else {}
 
 
 def _base(request: Request) -> str:

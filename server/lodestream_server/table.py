@@ -13,10 +13,37 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
+__all__ = ["FORMATS", "GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
 
 #: What the names of environment variables begin with.
 PREFIX = "LODESTREAM_"
+
+#: The formats that a server can read, by the names of `lodestream.formats` (`Format.names`), and containers themselves.
+FORMATS = (
+    "npy",
+    "npz",
+    "geotiff",
+    "netcdf",
+    "vmec",
+    "png",
+    "esri-ascii",
+    "usgs-dem",
+    "srtm-hgt",
+    "ply",
+    "off",
+    "obj",
+    "pcd",
+    "vtk",
+    "vts",
+    "cgns",
+    "bpt",
+    "text",
+    "plot3d",
+    "lode",
+)
+
+# Rare, or so loose that almost any text is one: each reader less is one less that strangers' files can go wrong in.
+_LEFT_OUT = ("usgs-dem", "bpt", "vmec", "text")
 
 _UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
 _UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("kmgt", 1)}
@@ -77,6 +104,15 @@ def _list(text: str) -> tuple[str, ...]:
     return tuple(filter(None, (part.strip() for part in text.split(","))))
 
 
+def _formats(text: str) -> tuple[str, ...]:
+    names = _list(text)
+    if names == ("all",):
+        return FORMATS
+    if not names or not set(names) <= set(FORMATS):
+        raise ValueError
+    return names
+
+
 def _choice(*words: str) -> Kind:
     def parse(text: str) -> str:
         if text not in words:
@@ -93,6 +129,7 @@ _SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", _size, _show_size)
 _SWITCH = Kind("yes or no", "", _switch, lambda value: "yes" if value else "no")
 _PATH = Kind("a path", "PATH", _path)
 _LIST = Kind("words separated by commas", "A,B", _list, ",".join)
+_FORMATS = Kind(f"all, or names out of {', '.join(FORMATS)} with commas between", "A,B", _formats, ",".join)
 
 
 @dataclass(frozen=True)
@@ -186,15 +223,10 @@ def _processors() -> int:
     return max(1, (os.cpu_count() or 1) - 1)
 
 
-def _half_the_memory() -> int:
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    # In a container the machine's memory is not what may be used.
-    for limit in (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes")):
-        try:
-            memory = min(memory, int(limit.read_text()))
-        except (OSError, ValueError):
-            continue
-    return max(memory // 2, 1 << 30)
+def _quarter_of_the_memory() -> int:
+    from lodestream.capacity import memory_limit
+
+    return max(memory_limit() // 4, 1 << 30)
 
 
 #: The groups of settings, and what they are about.
@@ -250,12 +282,21 @@ _SETTINGS = (
         "origins",
         _LIST,
         (),
-        "origins of other sites whose pages may use this server, such as https://maps.example.org",
+        "origins of other sites whose pages may use this server, such as https://maps.example.org; * is all of them, "
+        "which needs a token to be there",
         "access",
         metavar="A,B",
         usual="none",
     ),
     Setting("ticket_seconds", _SECONDS, 60.0, "how long a ticket for a browser's stream is valid", "access", above=0),
+    Setting(
+        "formats",
+        _FORMATS,
+        tuple(name for name in FORMATS if name not in _LEFT_OUT),
+        f"formats of files that are read: all, or names out of {', '.join(FORMATS)} (VMEC is a kind of NetCDF)",
+        "limits",
+        usual=f"all but {', '.join(_LEFT_OUT)}",
+    ),
     Setting("upload_bytes", _SIZE, 4 << 30, "most bytes of one upload", "limits", 1),
     Setting("upload_files", _INTEGER, 64, "most files of one upload", "limits", 1),
     Setting("max_uploads", _INTEGER, 64, "most uploads at the same time", "limits", 1),
@@ -270,7 +311,25 @@ _SETTINGS = (
         0,
         usual="1GiB, or a twentieth of the disk if that is less",
     ),
-    Setting("max_connections", _INTEGER, 5000, "most connections of all kinds at the same time", "limits", 1),
+    Setting(
+        "owner_bytes",
+        _SIZE,
+        None,
+        "most bytes on the disk, of uploads and containers, of one owner: of one token's name, or of all those without "
+        "a token together",
+        "limits",
+        1,
+        usual="as much as stays free beside them; no limit where only this machine can write",
+    ),
+    Setting(
+        "max_connections",
+        _INTEGER,
+        None,
+        "most connections of all kinds at the same time",
+        "limits",
+        1,
+        usual="5000, or as many as the limit of open files is enough for (ulimit -n)",
+    ),
     Setting("max_streams", _INTEGER, 2000, "most streams at the same time", "limits", 1),
     Setting(
         "max_client_streams",
@@ -280,13 +339,32 @@ _SETTINGS = (
         "limits",
         1,
     ),
+    Setting("max_level_requests", _INTEGER, 32, "most requests for levels that wait at the same time", "limits", 1),
     Setting(
-        "max_level_requests",
+        "max_client_level_requests",
         _INTEGER,
-        32,
-        "most requests for levels at the same time; one is worked on, the others wait",
+        16,
+        "most requests for levels of one client at the same time, counted until the answer has been read",
         "limits",
         1,
+    ),
+    Setting(
+        "level_memory",
+        _SIZE,
+        _quarter_of_the_memory,
+        "most memory of the process that makes levels as files, one at a time",
+        "limits",
+        256 << 20,
+        usual="a quarter of the memory there is",
+    ),
+    Setting(
+        "level_disk",
+        _SIZE,
+        None,
+        "disk space for levels as files, of which one may take a quarter",
+        "limits",
+        2 << 20,
+        usual="4GiB, or a twentieth of the disk if that is less",
     ),
     Setting("max_builds", _INTEGER, 1000, "most builds that wait or run", "limits", 1),
     Setting(
@@ -301,13 +379,14 @@ _SETTINGS = (
     Setting(
         "build_memory",
         _SIZE,
-        _half_the_memory,
+        None,
         "most memory of one build",
         "limits",
         64 << 20,
-        usual="half of the memory there is",
+        usual="half of the memory there is, divided by the builds at the same time",
     ),
-    Setting("build_seconds", _SECONDS, 3600.0, "longest time of one build", "time", above=0),
+    Setting("build_seconds", _SECONDS, 3600.0, "longest time of one build, and most processor time", "time", above=0),
+    Setting("level_seconds", _SECONDS, 120.0, "longest time in which one level is made", "time", above=0),
     Setting(
         "idle_seconds",
         _SECONDS,

@@ -45,8 +45,8 @@ def register(subparsers: Any) -> None:
         metavar="SCOPE",
         action="append",
         type=_scopes,
-        help="read: list, look at, fetch and stream surfaces; write: upload and delete them as well; admin: read the "
-        "metrics as well; may be repeated (default: read)",
+        help="read: list, look at, fetch and stream surfaces; write: upload and delete one's own too; admin: delete "
+        "everybody's and read the metrics too; may be repeated (default: read)",
     )
     make.add_argument("--days", metavar="N", type=_days, help="how long it is valid (default: until it is revoked)")
     make.set_defaults(run=create)

@@ -23,7 +23,8 @@ from typing import Any
 
 from lodestream.errors import LodestreamError, NotFoundError, OptionError
 
-from .durable import NewFile, rename
+from .durable import NewFile, remove, rename
+from .private import make_private
 
 __all__ = ["SCOPES", "Token", "TokenFile", "Tokens"]
 
@@ -120,7 +121,7 @@ class TokenFile:
                     f"expected version {_VERSION} of the token file {self.path}, got {document['version']!r}"
                 )
             return tuple(Token.from_json(values) for values in document["tokens"])
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise LodestreamError(f"expected a file of tokens, got {self.path}, which is none: {error!r}") from None
 
     def create(self, name: str, scopes: tuple[str, ...], days: float | None = None) -> tuple[str, Token]:
@@ -158,7 +159,7 @@ class TokenFile:
 
     @contextmanager
     def _change(self) -> Iterator[list[Token]]:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        make_private(self.path.parent)
         with self._alone():
             tokens = list(self.load())
             yield tokens
@@ -180,15 +181,21 @@ class TokenFile:
         with NewFile(new) as file:
             file.write(json.dumps(document, indent=1).encode() + b"\n")
         try:
+            self._hand_over(new)
+            rename(new, self.path)
+        except OSError:
+            remove(new)
+            raise
+
+    def _hand_over(self, new: Path) -> None:
+        # Whoever the server runs as goes on reading the file, also when somebody else changes it.
+        try:
             status = self.path.stat()
         except FileNotFoundError:
-            new.chmod(0o600)
-        else:
-            # Whoever the server runs as goes on reading the file, also when somebody else changes it.
-            new.chmod(status.st_mode & 0o777)
-            with suppress(PermissionError):
-                os.chown(new, status.st_uid, status.st_gid)
-        rename(new, self.path)
+            return
+        with suppress(PermissionError):
+            os.chown(new, status.st_uid, status.st_gid)
+        new.chmod(status.st_mode & 0o777)
 
 
 class Tokens:
@@ -228,6 +235,11 @@ class Tokens:
             if hmac.compare_digest(token.sha256, digest):
                 found = token
         return None if found is None or found.expired else found
+
+    def known(self, sha256: str) -> Token | None:
+        """The token with this hash, unless it was revoked or has expired."""
+        self._follow()
+        return next((token for token in self._tokens if token.sha256 == sha256 and not token.expired), None)
 
     def _follow(self) -> None:
         state = self._look()

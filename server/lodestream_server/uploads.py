@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -20,12 +20,13 @@ from lodestream.errors import FormatError, OptionError, TooLargeError
 
 from .durable import NewFile
 from .problems import SlowUploadError
+from .records import Record
 from .settings import Settings
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Body", "Upload", "digest_of", "receive", "take_apart"]
+__all__ = ["Body", "Upload", "check_upload", "digest_of", "receive", "take_apart"]
 
 # Larger blocks than the network's, so that a thread is asked less often; small enough for many uploads at once.
 _BUFFER = 64 * 1024
@@ -119,6 +120,26 @@ def digest_of(files: Iterable[Path]) -> str:
                 size += len(block)
         digest.update(size.to_bytes(8, "big"))
     return digest.hexdigest()
+
+
+def check_upload(files: Sequence[Path], record: Record) -> str | None:
+    """What is wrong with the files of an upload; None where nothing is.
+
+    Raises
+    ------
+    OSError
+        When they are there and cannot be read: what is wrong then is the disk, and perhaps for a moment only.
+    """
+    try:
+        found = sum(path.stat().st_size for path in files)
+        if found != record.upload_bytes:
+            return f"expected {record.upload_bytes} bytes, got {found}"
+        digest = digest_of(files) if record.upload_sha256 else None
+    except (FileNotFoundError, NotADirectoryError) as error:
+        return f"expected {len(files)} files: {error.strerror}"
+    if digest != record.upload_sha256:
+        return f"expected files with the SHA-256 {record.upload_sha256}, got {digest}"
+    return None
 
 
 class Body(Protocol):

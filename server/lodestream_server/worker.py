@@ -1,21 +1,28 @@
-"""What runs in a build process: reading strangers' files and encoding them; the server survives what happens here."""
+"""What runs in the process of a build: reading strangers' files and encoding them.
+
+The server survives what happens here, and believes nothing of it (`results`).
+"""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
-import resource
+import os
+import re
 import time
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatWarning, LodestreamError
+from lodestream.errors import FormatWarning, LodestreamError, SwitchedOffError, TooLargeError, UnavailableError
+from lodestream.metadata import with_notes
 
+from . import finished
 from .durable import NewFile
-from .records import plain
+from .warming import warm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +30,7 @@ if TYPE_CHECKING:
     from lodestream import Surface
 
 __all__ = [
+    "ALLOWED_BY",
     "ATTRIBUTE",
     "CLOSED",
     "UNNAMED",
@@ -30,7 +38,6 @@ __all__ = [
     "Job",
     "Refused",
     "build",
-    "limit_memory",
     "read_progress",
     "warm",
 ]
@@ -46,9 +53,41 @@ ATTRIBUTE = "precision="
 #: What a file without a name is called in messages, which must not tell where it lies on the server.
 UNNAMED = "upload"
 
+#: What is said to whoever brings a file of a format that is switched off.
+ALLOWED_BY = "on this server; its setting formats (LODESTREAM_FORMATS) says which are read"
+
+# Errors of the system that say nothing of what is in a file.
+_LOCAL = {
+    errno.EACCES,
+    errno.EAGAIN,
+    errno.EBADMSG,
+    errno.EDQUOT,
+    errno.EHOSTDOWN,
+    errno.EIO,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENODEV,
+    errno.ENOENT,
+    errno.ENOMEM,
+    errno.ENOSPC,
+    errno.ENXIO,
+    errno.EPERM,
+    errno.EREMOTEIO,
+    errno.EROFS,
+    errno.ESTALE,
+    errno.ETIMEDOUT,
+    errno.EUCLEAN,
+}
+
+_SHORT_OF_MEMORY = re.compile(
+    r"memory alloc|cannot allocate|can't allocate|unable to allocate|out of memory|bad_alloc|filter returned failure",
+    re.IGNORECASE,
+)
+
 _PROGRESS = "progress"
 _CONTAINER = "container"
 _REPORT_SECONDS = 0.1
+_LONGEST_PROGRESS = 20
 
 
 @dataclass(frozen=True)
@@ -73,6 +112,8 @@ class Job:
     max_vertices : int
     folder : Path
         Where the build may write; empty at the start.
+    allowed : tuple of str or None
+        Names of the formats that may be read; None for all.
     """
 
     files: tuple[Path, ...]
@@ -84,22 +125,43 @@ class Job:
     options: dict[str, str]
     max_vertices: int
     folder: Path
+    allowed: tuple[str, ...] | None = None
+
+    @property
+    def container(self) -> Path:
+        """Where the container is written."""
+        return self.folder / _CONTAINER
 
 
 @dataclass(frozen=True)
 class Built:
-    """A container was built and is on disk."""
+    """A container was built and is on disk, in the folder of its job.
 
-    path: Path
+    Attributes
+    ----------
+    sha256 : str
+    errors : str or None
+        Of a container that was uploaded, whose word its errors are (`finished.ERRORS`).
+    """
+
     sha256: str
-    info: dict[str, Any]
+    errors: str | None = None
 
 
 @dataclass(frozen=True)
 class Refused:
-    """The upload is not a surface that can be built, for this reason."""
+    """The upload was not built, for this reason.
+
+    Attributes
+    ----------
+    reason : str
+        In one line.
+    final : bool
+        The reader refuses the bytes, so that another attempt would end the same; otherwise the reason may pass.
+    """
 
     reason: str
+    final: bool = True
 
 
 def build(job: Job) -> Built | Refused:
@@ -107,65 +169,50 @@ def build(job: Job) -> Built | Refused:
     # Errors come back as values: not every exception survives the way between processes.
     try:
         return _build(job)
+    except SwitchedOffError as error:
+        return Refused(f"{error} {ALLOWED_BY}", final=False)
     except LodestreamError as error:
-        return Refused(str(error))
+        return Refused(str(error), final=not _may_pass(error))
 
 
-def limit_memory(most: int | None) -> None:
-    """Let this process have no more than so many bytes; beyond them it gets MemoryError, or ends.
-
-    What is counted is memory that it can write to and shares with nobody: neither code nor files that are mapped for
-    reading. None is no limit.
-    """
-    if most is not None:
-        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
+def _may_pass(error: LodestreamError) -> bool:
+    """Whether an upload was refused for what this machine lacks, or forbids, and not for its bytes."""
+    if isinstance(error, TooLargeError | UnavailableError):
+        return True
+    cause: BaseException | None = error
+    while cause is not None:  # what a reader made its own error of
+        if isinstance(cause, MemoryError) or getattr(cause, "errno", None) in _LOCAL:
+            return True
+        # HDF5 and GDAL say it in words only; a filter fails for want of memory as for damage.
+        if _SHORT_OF_MEMORY.search(str(cause)):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False
 
 
 def read_progress(folder: Path) -> float:
-    """How much of the build in a folder is done, from 0 to 1."""
+    """How much of the build in a folder is done, from 0 to 1; whatever lies there."""
     try:
-        return float((folder / _PROGRESS).read_text())
+        handle = os.open(folder / _PROGRESS, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return 0.0
+    try:
+        fraction = float(os.read(handle, _LONGEST_PROGRESS))
     except (OSError, ValueError):
         return 0.0
-
-
-def warm() -> None:
-    """Compile the kernels, or load them from the disk: find the grids of small meshes, and code small surfaces."""
-    import numpy as np
-
-    from lodestream import decode, encode
-    from lodestream.mesh import Mesh
-    from lodestream.mesh.recognise import recognise
-
-    rows, columns = np.mgrid[0:37, 0:41].astype(np.float64)
-    xyz = np.stack((rows, columns, np.sin(rows * columns / 99)), axis=-1)
-    heights = np.sin(rows / 5) * columns
-    number = np.arange(rows.size, dtype=np.int32).reshape(rows.shape)
-    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    none = np.full_like(a, -1)
-    quads = np.stack((a, b, c, d), axis=-1)
-    halves = np.concatenate((np.stack((a, b, c, none), axis=-1), np.stack((a, c, d, none), axis=-1)))
-    for corners in (quads, halves):
-        if not np.array_equal(recognise(Mesh(xyz.reshape(-1, 3), corners)).surface().points, xyz):
-            raise RuntimeError("expected the grid that the mesh was made of, got another one")
-    for points in (heights, xyz):
-        if not np.array_equal(decode(encode(points)).points, points):
-            raise RuntimeError("expected the surface that was encoded, got another one")
-    errors = decode(encode(heights, rms="1e-2d")).points - heights
-    if np.sqrt(np.mean(np.square(errors))) > 0.01 * np.ptp(heights):
-        raise RuntimeError("expected a surface within the error that it was encoded for, got another one")
-    # Of as many points as a stream by neighbours is thought of for.
-    many = np.mgrid[0:64, 0:65]
-    terraces = np.rint(4 * np.sin(many[0] / 9) * np.cos(many[1] / 7)).astype(np.int16)
-    if not np.array_equal(decode(encode(terraces)).points, terraces):
-        raise RuntimeError("expected the terraces that were encoded, got others")
+    finally:
+        os.close(handle)
+    return fraction if 0.0 <= fraction <= 1.0 else 0.0
 
 
 def _build(job: Job) -> Built:
     from lodestream import Tolerance, encode
-    from lodestream.container import describe, read_index
+    from lodestream.formats import check_allowed
 
+    path = job.container
+    if finished.is_container(job.files[0]):
+        check_allowed(("lode",), job.allowed)
+        return Built(*finished.keep(job, path, _reporter(job.folder)))
     surface = _read(job)
     precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
     precisions = {
@@ -174,11 +221,9 @@ def _build(job: Job) -> Built:
         if key.startswith(ATTRIBUTE)
     }
     container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
-    path = job.folder / _CONTAINER
     with NewFile(path) as file:
         file.write(container)
-    index = read_index(lambda offset, length: container[offset : offset + length], len(container))
-    return Built(path, hashlib.sha256(container).hexdigest(), plain(describe(index)))
+    return Built(hashlib.sha256(container).hexdigest())
 
 
 def _read(job: Job) -> Surface:
@@ -191,16 +236,16 @@ def _read(job: Job) -> Surface:
             closed=job.closed,
             max_vertices=job.max_vertices,
             filename=job.filename or UNNAMED,
+            allowed=job.allowed,
             **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
         )
     notes = list(dict.fromkeys(str(warning.message) for warning in found if warning.category is FormatWarning))
-    if notes:
-        surface.metadata["notes"] = notes  # whoever uploaded it does not see what happens here
     if job.name is not None:
         surface.metadata["name"] = job.name
     elif job.filename is None:
         # Nobody gave it one: the reader took it from the name that stands in for the file's.
         surface.metadata.pop("name", None)
+    surface.metadata = with_notes(surface.metadata, notes)  # whoever uploaded it does not see what happens here
     return surface
 
 

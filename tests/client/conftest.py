@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def container_file(terrain_file: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with running_server(tmp_path_factory.mktemp("server") / "data", workers=1) as url:
+    with running_server(tmp_path_factory.mktemp("server") / "data", workers=1, formats="all") as url:
         yield url
 
 
@@ -69,3 +70,11 @@ def run(capsysbinary: pytest.CaptureFixture[bytes]) -> Run:
         return code, captured.out.decode(), captured.err.decode()
 
     return call
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """Programs that are started heed them, also where these tests run in the background and ignore them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, Thread
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Ranged", "nginx", "plain", "ranged"]
+__all__ = ["Ranged", "nginx", "plain", "ranged", "running"]
 
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
@@ -92,7 +92,8 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 
 @contextmanager
-def _running(server: ThreadingHTTPServer) -> Iterator[None]:
+def running(server: ThreadingHTTPServer) -> Iterator[None]:
+    """A server that answers within the block."""
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:
@@ -107,7 +108,7 @@ def _running(server: ThreadingHTTPServer) -> Iterator[None]:
 def ranged(folder: Path) -> Iterator[Ranged]:
     """A server that knows Range."""
     server = Ranged(folder)
-    with _running(server):
+    with running(server):
         yield server
 
 
@@ -116,7 +117,7 @@ def plain(folder: Path) -> Iterator[str]:
     """The server of Python's library, which does not know Range."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
     server.daemon_threads = True
-    with _running(server):
+    with running(server):
         yield f"http://127.0.0.1:{server.server_port}"
 
 

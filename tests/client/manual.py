@@ -10,7 +10,21 @@ from pathlib import Path
 from lodestream_client.__main__ import main
 
 PATH = Path(__file__).parents[2] / "docs" / "cli.md"
-COMMANDS = ("demo", "serve", "fsck", "token", "encode", "decode", "info", "push", "pull", "list", "rm", "formats")
+COMMANDS = (
+    "demo",
+    "serve",
+    "fsck",
+    "token",
+    "encode",
+    "decode",
+    "info",
+    "push",
+    "retry",
+    "pull",
+    "list",
+    "rm",
+    "formats",
+)
 ACTIONS = {"token": ("create", "list", "revoke")}
 
 _INTRODUCTION = """\
@@ -21,11 +35,16 @@ This page is `--help` of every command, written by `python -m tests.client.manua
 - Results go to standard output; progress, notes and errors to standard error. With `--json`, standard output is one
   JSON object.
 - Exit code 0: done. 1: it could not be done, and one line says why. 2: the command line alone is wrong. 130:
-  interrupted.
+  interrupted by Ctrl-C; 143: ended by SIGTERM.
 - A path `-` is standard input or output. A file is written beside its name and renamed when it is whole.
 - `decode` and `pull` with `--json` print `bytes` (held of the surface, comparable with the layers of `info`),
   `wire_bytes` (all that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
   bytes, seconds, stopped or truncated.
+- A `pull` that is interrupted, or whose server is gone for good, writes OUT from what came, as after an early stop. Its
+  exit code is then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer there is no OUT, and one
+  that was there stays as it was. What came is kept, whether `--resume` was given or not, also of a `pull` that is
+  killed; the next one with `--resume` asks only for the rest. A `pull` that ends as it should removes what it kept,
+  unless it was given `--resume`. Where nothing can be kept, the `pull` goes on without.
 - A limit that is out of reach gives the complete surface, with a note.
 - `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the whole surface, `--attributes speed,kind`
   these attributes beside the points, `--attributes none` the points alone; both go with each other and with the limits,

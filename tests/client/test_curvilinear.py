@@ -18,7 +18,7 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 
 #: Files, options, the suffix to pull as, and whether that format warns of what it cannot hold.
 CASES = [
-    (("combxyz.bin", "combq.bin"), {"plane": "k-1"}, "vts", False),
+    (("combxyz.bin", "combq.bin"), {"plane": "k-1"}, "vts", True),
     (("multi-bin-2D.xyz",), {}, "ply", False),
     (("StructuredGrid.vts",), {"plane": "k0"}, "obj", True),
     (("office.binary.vtk",), {"plane": "j3"}, "glb", False),

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.errors import InputError, OptionError
+from lodestream.errors import OptionError
 from lodestream_client import sync
 
 from .conftest import Run, make_terrain
@@ -141,6 +141,27 @@ def test_info_tells_holes_attributes_and_what_was_recognised(run: Run, addresses
     assert "grid" in run("info", addresses["lattice.npy"])[1]
 
 
+def test_infinities_are_told_and_come_back_from_a_server(run: Run, server: str, tmp_path: Path) -> None:
+    heights = np.hypot(*np.mgrid[:40, :50]).astype(np.float32)
+    heights[3, 4:9], heights[20, 7], heights[30, 30:33] = np.inf, -np.inf, np.nan
+    np.save(tmp_path / "lake.npy", heights)
+    code, address, _ = run("push", tmp_path / "lake.npy", server)
+    assert code == 0
+    _, out, _ = run("info", address.strip())
+    assert "2000, 9 of them holes, 6 of these infinite or in part NaN" in " ".join(out.split())
+    assert "yes, bit for bit wherever there is a value" in " ".join(out.split())
+    details = json.loads(run("info", address.strip(), "--json")[1])
+    assert (details["holes"], details["non_finite"], details["exact"]) == (9, 6, True)
+    assert run("pull", address.strip(), tmp_path / "back.npy")[0] == 0
+    assert np.load(tmp_path / "back.npy").tobytes() == heights.tobytes()
+    # From memory too, where a mask says more than the values do.
+    mask = np.ones(heights.shape, bool)
+    mask[10, 10] = False
+    back = pulled(sync.upload(server, ls.Surface(heights, mask=mask)).url)
+    heights[10, 10] = np.nan
+    assert back.points.tobytes() == heights.tobytes()
+
+
 def test_holes_are_noted(run: Run, server: str, files: Path, tmp_path: Path) -> None:
     code, _, err = run("encode", files / "scan.pcd", tmp_path / "scan.lode")
     assert (code, "lodestream: 250 of 2700 points are holes\n" in err) == (0, True)
@@ -250,21 +271,3 @@ def test_precisions_that_cannot_be(run: Run, server: str, files: Path, tmp_path:
         sync.upload(server, files / "scan.pcd", attribute_precision={"colour": 0.5})
     with pytest.raises(OptionError):
         sync.upload(server, files / "scan.pcd", attribute_precision={"ring": "much"})
-
-
-def test_surfaces_in_memory_are_sent_where_one_array_says_all(server: str) -> None:
-    heights = make_terrain(20, 30)
-    holes = np.ones(heights.shape, bool)
-    holes[3:6, 4:9] = False
-    back = pulled(sync.upload(server, ls.Surface(heights, mask=holes)).url)
-    assert back.mask is not None
-    assert np.array_equal(back.mask, holes)
-    assert back.points[holes].tobytes() == heights[holes].tobytes()
-    block = ls.Block(heights)
-    for surface in (
-        ls.Surface(blocks=[block, block]),
-        ls.Surface(heights, attributes={"depth": heights}),
-        ls.Surface(heights.astype(np.int16), mask=holes),
-    ):
-        with pytest.raises(InputError):
-            sync.upload(server, surface)

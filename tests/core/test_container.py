@@ -15,9 +15,10 @@ import pytest
 
 import lodestream as ls
 from lodestream import CorruptStreamError, Decoder, StreamError, TruncatedStreamError, UnsupportedVersionError
-from lodestream.container import FrameReader, Index, describe, sections
+from lodestream.container import FrameReader, Index, describe, read_index, read_metadata, sections
 from lodestream.container.fields import FieldReader, FieldWriter
 from lodestream.plan import plan
+from lodestream.reception import Reception
 
 from .surfaces import contained, figures, follow, index_of
 
@@ -325,6 +326,64 @@ def test_metadata_that_json_cannot_hold_are_read_all_the_same() -> None:
     packed = msgpack.packb({"raw": b"\x00", "when": msgpack.Timestamp(1, 2)})
     values = sections.parse_metadata(memoryview(packed), 0)
     assert values["raw"] == b"\x00"
+
+
+def with_long_metadata(size: int) -> tuple[bytes, Index]:
+    """A container whose metadata take so many bytes, which no encoder makes; and what its index says."""
+    container, index = contained("small")
+    values = {**index.metadata_values, "values_sha256": index.digest, "crs": ""}
+    missing = size - len(sections.serialize_metadata(values)) - 2  # of the longer kind of string
+    metadata = sections.section(sections.METADATA, sections.serialize_metadata({**values, "crs": "x" * missing}))
+    place = replace(index.metadata, length=len(metadata))
+    moved = replace(index, metadata=place, index=replace(index.index, offset=place.end))
+    last = sections.section(sections.INDEX, sections.serialize_index(moved))
+    footer = sections.serialize_footer(replace(moved.index, length=len(last)))
+    return container[: place.offset] + metadata + last + footer, moved
+
+
+def test_metadata_as_long_as_they_may_be_are_read() -> None:
+    data, index = with_long_metadata(1 << 16)
+    assert index.metadata.length == (1 << 16) + 8
+    assert len(index_of(data).metadata_values["crs"]) > 65_000
+    decoder = Decoder()
+    decoder.feed(data)
+    decoder.finish()
+    assert decoder.metadata is not None
+    assert decoder.metadata["crs"] == index_of(data).metadata_values["crs"]
+
+
+def test_metadata_that_are_longer_are_refused_before_they_are_read() -> None:
+    data, index = with_long_metadata((1 << 16) + 1)
+    metadata = index.metadata
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes of metadata, got 65,537") as caught:
+        ls.decode(data)
+    assert caught.value.offset == metadata.offset
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
+        read_metadata(data[metadata.offset : metadata.end], metadata)
+    # By their first bytes, which is all that has come: what came before stays.
+    decoder = Decoder()
+    views = decoder.feed(data[: metadata.offset])
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
+        decoder.feed(data[metadata.offset : metadata.offset + 4])
+    assert views[-1].points.tobytes() == expected_views(contained("small")[0])[-1][1]
+    # By what the index says of them: nobody reads so much.
+    read: list[tuple[int, int]] = []
+
+    def reading(offset: int, length: int) -> bytes:
+        read.append((offset, length))
+        return long[offset : offset + length]
+
+    long, index = with_long_metadata(5_000_000)
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
+        read_index(reading, len(long))
+    assert sum(length for _, length in read) < 100_000
+    # A section by itself, as in a stream, and a header that promises one.
+    loose = Decoder()
+    loose.feed(long[: index.layers[0].end])
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
+        loose.feed_at(index.metadata.offset, long[index.metadata.offset : index.metadata.offset + 6])
+    with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
+        Reception(ls.Target()).expect(100, (200, 50), (100, 70_000), True)
 
 
 @pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**31, 2**62])

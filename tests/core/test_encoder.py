@@ -273,3 +273,11 @@ def test_planes_and_fraction_together_fit_a_coefficient() -> None:
         header = index_of(assert_comes_back(points)).header
         planes = max(segment.top for segment in index_of(ls.encode(points)).segments)
         assert planes + header.fraction <= 28
+
+
+@pytest.mark.parametrize("precision", [None, 0.5])
+def test_a_level_surface_of_many_points(precision: float | None) -> None:
+    points = np.full((64, 70), 7.5)
+    container = ls.encode(points, precision)
+    assert np.array_equal(ls.decode(container).points, points)
+    assert len(container) < 400

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from functools import cache
 from random import Random
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from lodestream.container import Header, Index, read_index
 from lodestream.download import Download, Ended
 from lodestream.errors import OptionError
 from lodestream.focus import focused
-from lodestream.messages import MAX_DATA, Focus, Layer, MessageError, Open, Segments
+from lodestream.messages import MAX_DATA, MAX_HELD, Focus, Layer, MessageError, Open, Segments
 from lodestream.plan import plan
 from lodestream.ranges import RangeSet
 from lodestream.reception import MemoryStore, Reception
@@ -341,6 +343,65 @@ def test_changes_without_end_are_earned_by_taking_something(monkeypatch: pytest.
     link.run()
     assert before < len(calls), "the last one is obeyed in the end"
     check_end(link.reception, "integers", ls.Target())
+
+
+def steps_of(work: Callable[[], object]) -> int:
+    """How many functions are called and generators resumed, in Python and in C: work, whatever the machine does."""
+    count = 0
+
+    def step(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(step)
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def crumbs(kind: str, count: int) -> tuple[tuple[int, int], ...]:
+    """So many ranges all over a container."""
+    stride = len(container(kind)) // count
+    return tuple((number * stride, max(stride // 2, 1)) for number in range(count))
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_work_of_a_plan_grows_as_what_it_is_made_of(target: ls.Target) -> None:
+    found = index("floats")
+    sha256 = hashlib.sha256(container("floats")).hexdigest()
+    for count in (MAX_HELD // 8, MAX_HELD):
+        server = Sender(found, sha256)
+        server.receive(serialize(Open(target, held=crumbs("floats", count), container=sha256)))
+        assert server.pieces == count + len(found.segments)
+        while server.next_message() is not None:
+            pass
+        opening = steps_of(lambda server=server: plan(found, target, server.held))  # type: ignore[misc]
+        server.receive(serialize(Focus(NEAR)))
+        turning = steps_of(server.wanted)
+        assert opening < 12 * server.pieces
+        assert turning < 29 * server.pieces
+
+
+def test_changes_among_many_pieces_are_earned_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def counted(*arguments: object) -> object:
+        calls.append(arguments)
+        return focused(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("lodestream.sender.focused", counted)
+    sha256 = hashlib.sha256(container("floats")).hexdigest()
+    server = Sender(index("floats"), sha256)
+    server.receive(serialize(Open(held=crumbs("floats", MAX_HELD), container=sha256)))
+    while server.next_message() is not None:
+        pass
+    for number in range(200):
+        server.receive(serialize(Focus(((0, 1 + number), (0, 10)))))
+        assert server.wanted() is not None
+    assert 1 <= len(calls) <= 4
+    assert not server.turning
 
 
 def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:

@@ -20,7 +20,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, InputError, OptionError, TooLargeError
+from lodestream.errors import (
+    FormatError,
+    FormatWarning,
+    InputError,
+    OptionError,
+    SwitchedOffError,
+    TooLargeError,
+    UnavailableError,
+)
 from lodestream.surface import Surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -82,12 +90,14 @@ def test_npy_that_is_written_is_read_by_numpy(points: NDArray[Any]) -> None:
 def test_npz_gives_its_only_surface_and_keeps_numbers_beside_it(tmp_path: Path, save: Any) -> None:
     heights = np.arange(12, dtype=np.int16).reshape(3, 4)
     save(tmp_path / "a.npz", x=np.arange(4.0), heights=heights, dx=0.5, zone=np.array([17]), note=np.array("metres"))
-    surface = formats.read(tmp_path / "a.npz")
+    with pytest.warns(FormatWarning, match="^left out arrays of the archive: x, note$"):
+        surface = formats.read(tmp_path / "a.npz")
     np.testing.assert_array_equal(surface.points, heights)
     assert surface.points.dtype == np.int16
     assert surface.metadata == {"name": "a", "format": "npz", "scalars": {"dx": 0.5, "zone": 17}}
 
 
+@pytest.mark.filterwarnings("ignore::lodestream.errors.FormatWarning")  # of what is left out
 def test_npz_gives_heights_their_coordinates(tmp_path: Path) -> None:
     heights = np.arange(12.0).reshape(3, 4)
     x, y = np.array([1.5, 2.0, 2.5, 3.0]), np.array([8.0, 6.0, 4.0])
@@ -136,7 +146,8 @@ def test_npz_of_two_surfaces_asks_which(tmp_path: Path) -> None:
     np.savez(path, bed=np.zeros((3, 4)), ice=np.ones((3, 4), np.float32, order="F"))
     with pytest.raises(FormatError, match=r"one array that is a surface, got 2: choose one with array= bed or ice"):
         formats.read(path)
-    assert formats.read(path, array="ice").points.tolist() == np.ones((3, 4)).tolist()
+    with pytest.warns(FormatWarning, match="^left out arrays of the archive: bed$"):
+        assert formats.read(path, array="ice").points.tolist() == np.ones((3, 4)).tolist()
     with pytest.raises(OptionError, match=r"array= one of bed \(3 x 4 float64\), ice \(3 x 4 float32\), got 'snow'"):
         formats.read(path, array="snow")
 
@@ -217,7 +228,7 @@ def test_geotiff_looks_for_nothing_beside_it(tmp_path: Path) -> None:
 def test_geotiff_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(100))
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(FormatError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
         formats.read(tmp_path / "a.tif")
 
 
@@ -285,6 +296,16 @@ def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
         formats.read(tmp_path / "a.npy", max_vertices="9")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="expected one file of format npy, got 3"):
         formats.read(tmp_path / "a.npy", tmp_path / "b.npy", tmp_path / "c.npy")
+
+
+def test_only_formats_that_are_allowed_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((3, 4)))
+    for allowed in (None, ["npy"], ("text", "npy")):
+        assert formats.read(path, allowed=allowed).shape == (3, 4)
+    for nothing in ([], ["text"], {"vmec", "netcdf"}):
+        with pytest.raises(SwitchedOffError, match=r"a\.npy: .* got npy, which is switched off"):
+            formats.read(path, allowed=nothing)
 
 
 def test_a_missing_file_is_an_error_of_the_system(tmp_path: Path) -> None:

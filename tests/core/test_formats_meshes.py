@@ -81,6 +81,7 @@ def test_closed_axes_are_found_whatever_the_order_and_sense_of_faces(
     assert (surface.shape, surface.closed) == (shape, closed)
 
 
+@pytest.mark.filterwarnings("ignore::lodestream.errors.FormatWarning")  # of what is left out
 def test_obj_forms_of_points_and_faces() -> None:
     heights = np.arange(6.0).reshape(2, 3)
     plain = text(Surface(heights))

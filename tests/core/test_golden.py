@@ -37,6 +37,8 @@ def test_golden_containers_hold_their_originals(name: str) -> None:
         assert found.closed == block.closed
         valid = np.ones(block.shape, bool) if block.mask is None else block.mask
         assert np.array_equal(valid, np.ones(block.shape, bool) if found.mask is None else found.mask)
+        if block.kept is not None:
+            assert found.points[block.kept].tobytes() == block.points[block.kept].tobytes()
         assert (found.points.dtype, found.points.shape) == (block.points.dtype, block.points.shape)
         if original.precision is None and original.rms is None:
             assert found.points[valid].tobytes() == block.points[valid].tobytes()

@@ -107,6 +107,8 @@ def test_holes_need_no_coordinates() -> None:
     assert back.mask is not None
     assert np.array_equal(back.mask, surface.mask)
     assert back.points[surface.mask].tobytes() == full[surface.mask].tobytes()
+    assert back.points[9, 9].tobytes() == points[9, 9].tobytes()  # an infinite height has a place
+    surface.mask[9, 9] = True
     assert np.isnan(back.points[~surface.mask]).all()
     assert np.array_equal(back.attributes["scan"], surface.attributes["scan"])
 

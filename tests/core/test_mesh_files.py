@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from lodestream import formats
-from lodestream.errors import FormatError, TooLargeError
+from lodestream.errors import FormatError, FormatWarning, TooLargeError
 from lodestream.surface import Surface
 
 from .meshes import grid_faces
@@ -49,9 +50,14 @@ def test_obj_corners(tmp_path: Path, corner: str, names: set[str], slow: bool) -
     faces = [" ".join(corner.format(index + 1) for index in face) for face in FACES]
     if slow:  # a comment makes lines be read one by one
         faces = [f"{face} # here" for face in faces]
-    surface = read(tmp_path, "mesh.obj", obj(words(POINTS), faces, texture + normals))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        surface = read(tmp_path, "mesh.obj", obj(words(POINTS), faces, texture + normals))
     assert_points(surface)
     assert set(surface.attributes) == names
+    unnamed = [("uv", "places in a texture (vt)"), ("normal", "normals (vn)")]
+    expected = [f"{what} that no face names left out" for name, what in unnamed if name not in names]
+    assert [str(warning.message) for warning in caught] == expected
     if "uv" in names:
         np.testing.assert_array_equal(surface.attributes["uv"].reshape(-1, 2)[:, 1], range(12))
     if "normal" in names:
@@ -141,7 +147,8 @@ def test_ply_properties_that_no_surface_keeps_are_named(tmp_path: Path) -> None:
     content = ply("ascii").decode().replace("vertex_indices\n", "vertex_index\nproperty int flags\n")
     lines = content.splitlines()
     lines[-6:] = [f"{line} 7" for line in lines[-6:]]
-    surface = read(tmp_path, "mesh.ply", "\n".join(lines) + "\n")
+    with pytest.warns(FormatWarning, match="^flags of faces left out$"):
+        surface = read(tmp_path, "mesh.ply", "\n".join(lines) + "\n")
     assert_points(surface)
     assert surface.metadata["recognised"].endswith("; flags of faces left out")
 
@@ -208,7 +215,8 @@ def test_off_meshes(tmp_path: Path, head: str, extra: str, shapes: dict[str, int
 def test_off_colours(tmp_path: Path) -> None:
     surface = read(tmp_path, "mesh.off", off("COFF\n12 6 0", " 255 {0} 3"))
     assert surface.attributes["color"].dtype == np.uint8
-    surface = read(tmp_path, "mesh.off", off(colours=" 255 0 0"))
+    with pytest.warns(FormatWarning, match="^colours of faces left out$"):
+        surface = read(tmp_path, "mesh.off", off(colours=" 255 0 0"))
     assert surface.metadata["recognised"] == "grid, 3 x 4; 12 vertices; colours of faces left out"
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, OptionError
+from lodestream.errors import FormatError, OptionError, SwitchedOffError, UnavailableError
 from lodestream.heights import coordinates
 from lodestream.seams import restore
 
@@ -163,6 +163,7 @@ def test_the_conventions_tell_coordinates_from_variables(tmp_path: Path) -> None
     np.testing.assert_array_equal(formats.read(save(tmp_path / "c.nc", variables | plain)).points, surface.points)
 
 
+@pytest.mark.filterwarnings("ignore:left out variables of the same grid:lodestream.errors.FormatWarning")
 def test_options_name_the_variable_and_its_coordinates(tmp_path: Path) -> None:
     rows, columns = np.indices((6, 9)).astype(np.float64)
     path = save(
@@ -306,6 +307,7 @@ def test_the_core_of_a_tokamak_is_closed(tmp_path: Path, inside: int, closed: tu
     assert formats.read(path, x="Rxy", y="Zxy", closed="none").closed == (False, False)
 
 
+@pytest.mark.filterwarnings("ignore:left out variables of the same grid:lodestream.errors.FormatWarning")
 def test_the_boundary_of_a_stellarator_is_a_torus(tmp_path: Path) -> None:
     modes: Variables = {
         "rmnc": (("radius", "mode"), np.array([[0.0, 0.0, 0.0], [3.0, 1.0, 0.1]])),
@@ -321,6 +323,12 @@ def test_the_boundary_of_a_stellarator_is_a_torus(tmp_path: Path) -> None:
     np.testing.assert_allclose(surface.points[..., 2], np.sin(u) + 0.1 * np.sin(u - 5 * v), atol=1e-12)
     assert formats.read(tmp_path / "a.nc").shape == (64, 256)
     assert formats.read(tmp_path / "a.nc", variable="rmnc").shape == (2, 3)
+    assert formats.read(tmp_path / "a.nc", allowed=["vmec"]).shape == (64, 256)
+    assert formats.read(tmp_path / "a.nc", allowed=["netcdf"], variable="rmnc").shape == (2, 3)
+    with pytest.raises(SwitchedOffError, match="got vmec, which is switched off"):
+        formats.read(tmp_path / "a.nc", allowed=["netcdf"])
+    with pytest.raises(SwitchedOffError, match="got netcdf, which is switched off"):
+        formats.read(tmp_path / "a.nc", allowed=["vmec"], variable="rmnc")
     for wrong in ("8", "2x9", "0x0", "1e9x4"):
         with pytest.raises(OptionError, match=f"resolution= as two numbers from 3 such as 64x256, got '{wrong}'"):
             formats.read(tmp_path / "a.nc", resolution=wrong)
@@ -336,5 +344,5 @@ def test_only_what_is_wanted_is_read(tmp_path: Path) -> None:
 def test_a_netcdf_without_its_libraries_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "a.nc", {"z": (("y", "x"), hills())})
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(FormatError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
         formats.read(path)

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, FormatWarning, OptionError
+from lodestream.errors import FormatError, FormatWarning, OptionError, UnavailableError
 from lodestream.surface import Surface
 
 pytest.importorskip("PIL")
@@ -163,7 +163,7 @@ def test_shifted_heights_are_announced_and_their_rule_is_a_text(tmp_path: Path) 
 def test_what_a_png_cannot_hold_is_said(tmp_path: Path) -> None:
     metadata = {"crs": "here", "geotransform": [0, 1, 0, 0, 0, 1], "unit": "m"}
     surface = Surface(shades(np.uint16), (True, False), attributes={"n": shades(np.uint8)}, metadata=metadata)
-    with pytest.warns(FormatWarning, match="PNG holds heights only: geotransform, crs, closure, attributes left out"):
+    with pytest.warns(FormatWarning, match="PNG holds heights only: crs, geotransform, unit, closure, n left out"):
         formats.write(surface, tmp_path / "a.png")
 
 
@@ -185,5 +185,5 @@ def test_other_pngs_are_refused(tmp_path: Path) -> None:
 def test_a_png_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "a.png", shades(np.uint8))
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(FormatError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
         formats.read(path)

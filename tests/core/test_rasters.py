@@ -91,6 +91,7 @@ def test_transparency_is_one_of_holes(tmp_path: Path) -> None:
 def test_every_type_comes_back(tmp_path: Path, dtype: str) -> None:
     heights = hills(dtype, (300, 280))
     metadata = {"crs": utm(), "geotransform": PLACE, "unit": "ft", "scale": 0.1, "offset": -5.0, "name": "b"}
+    metadata["area_or_point"] = "Area"  # as GDAL says of what does not say otherwise
     formats.write(Surface(heights, metadata=metadata), tmp_path / "b.tif")
     surface = formats.read(tmp_path / "b.tif")
     assert (surface.dtype, surface.points.tobytes()) == (heights.dtype, heights.tobytes())

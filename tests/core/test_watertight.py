@@ -170,6 +170,7 @@ FILES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:materials .* left out:lodestream.errors.FormatWarning")
 @pytest.mark.parametrize("name", FILES)
 def test_real_surfaces_stay_together(name: str) -> None:
     path = DATA / name

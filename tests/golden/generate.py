@@ -162,6 +162,34 @@ def _with_holes() -> dict[str, Original]:
     }
 
 
+def _not_finite() -> dict[str, Original]:
+    """Infinities, and NaN beside numbers, in heights, in x, y, z, beside a rule of x and y, and in blocks."""
+    heights = _wave(41, 60).astype(np.float32)
+    heights[5:9, 20:31], heights[30, 7:12], heights[0, 0], heights[20, 20] = np.inf, -np.inf, -0.0, np.nan
+    points = _torus(20, 26)
+    points[5:9, 20, 0], points[7, 3, 1], points[9:12, 8, 2], points[1, 1] = np.inf, -np.inf, np.nan, np.nan
+    named: dict[str, NDArray[Any]] = {
+        "t": np.where(_wave(20, 26) > 1, np.inf, _wave(20, 26)),
+        "n": np.arange(520, dtype=np.uint16).reshape(20, 26),
+    }
+    row, column = np.mgrid[:33, :47].astype(np.float64)
+    plane = np.stack([500000.0 + 30.0 * column, (4 * row - 7) / 10, np.round(_wave(33, 47), 2)], axis=-1)
+    plane[4:7, 20:25, 2], plane[8, 20:25, 2], plane[20:23, :4] = np.inf, np.nan, np.nan
+    blocks = _cut(_terrain(24, 31), [0, 9, 23], [0, 30])
+    for block, place in zip(blocks, (np.s_[9, 4:7, 2], np.s_[0, 4:7, 2]), strict=True):
+        block[place] = -np.inf
+    steps = np.floor(10 * _wave(66, 64)).astype(np.float32)
+    steps[3:5, 7:20], steps[30, 30:40] = np.inf, np.nan
+    return {
+        "infinite-heights": Original(ls.Surface(heights)),
+        "infinite-points": Original(ls.Surface(points, (True, True), attributes=named)),
+        "infinite-plane": Original(ls.Surface(plane)),
+        "infinite-blocks": Original(_blocks(blocks)),
+        "infinite-brief": Original(ls.Surface(steps)),
+        "infinite-error": Original(ls.Surface(heights), rms="1e-2d"),
+    }
+
+
 def _terraces() -> dict[str, Original]:
     """Heights in steps, which cost least by their neighbours, and rough ones at a wide precision."""
     rng = np.random.default_rng(2005)
@@ -308,6 +336,7 @@ def originals() -> dict[str, Original]:
     return {
         **_simple(),
         **_with_holes(),
+        **_not_finite(),
         **_terraces(),
         **_with_attributes(),
         **_planes(),

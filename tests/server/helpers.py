@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
 from lodestream.wire import parse, serialize
+from lodestream_server.markers import MARKER
 
 T = TypeVar("T")
 
@@ -56,9 +58,19 @@ def settled(http: httpx.Client, location: str) -> dict[str, Any]:
 
     def look() -> dict[str, Any] | None:
         surface: dict[str, Any] = http.get(location).raise_for_status().json()
-        return surface if surface["state"] in ("ready", "failed") else None
+        return surface if surface["state"] in ("ready", "failed", "waiting", "missing") else None
 
     return eventually(look, "the build to end")
+
+
+def kept(data: Path, folder: str) -> list[str]:
+    """The names in a folder of the data folder, its marker aside."""
+    return sorted(path.name for path in (data / folder).iterdir() if path.name != MARKER)
+
+
+def upload_of(data: Path, surface: dict[str, Any]) -> Path:
+    """The folder with the uploaded files of a surface."""
+    return data / "uploads" / str(json.loads((data / "records" / f"{surface['id']}.json").read_text())["upload"])
 
 
 def push(http: httpx.Client, data: bytes, **query: str) -> dict[str, Any]:

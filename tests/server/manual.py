@@ -18,9 +18,9 @@ This page is the table `lodestream_server.table`, written by `python -m tests.se
 - Sizes are bytes, or written like `500MB` (powers of 1000) or `4GiB` (powers of 1024). Switches are `yes` or `no`; as
   an option `--public-reads` or `--no-public-reads`. Lists are separated by commas.
 - What a limit answers: 413 what is too large in itself; 408 a client that is too slow; 429 a client that has too much
-  at the same time; 503 a server that has too much to do; 507 no room. 429 and 503 carry `Retry-After`. A build beyond
-  its limits fails, and the surface says why. In a stream the same words come as an `error`, before a close code of 4000
-  plus the status.
+  at the same time; 503 a server that has too much to do; 507 no room. 429, 503 and 507 carry `Retry-After`, and say
+  whose bound it is. A build beyond its limits waits, and the surface says why. In a stream the same words come as an
+  `error`, before a close code of 4000 plus the status.
 - [operating.md](operating.md) says which of them to think about before others can reach the server.
 """
 

@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 import pytest
 
-__all__ = ["Server", "Within", "descendants", "resident", "server"]
+__all__ = ["Server", "Within", "alive", "descendants", "resident", "server"]
 
 # Long enough for a machine that does several other things.
 _PATIENCE = 60.0
@@ -147,6 +147,14 @@ def descendants(process: int) -> list[int]:
     return found
 
 
+def alive(process: int) -> bool:
+    """Whether a process is there and has not ended."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def _within() -> dict[str, Any]:
     gc.collect()
     tasks, sockets, files = 0, 0, []
@@ -170,9 +178,11 @@ def _answer() -> None:
 def main() -> None:
     """Serve until told to end."""
     from lodestream_server import Settings
+    from lodestream_server.logs import configure
     from lodestream_server.running import make_server
 
     settings = Settings(**json.loads(sys.argv[1]))
+    configure(settings.log_format, settings.log_level)
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
     make_server(settings, lambda address: print(address, flush=True)).run()

@@ -2,27 +2,68 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
+import resource
 import signal
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-from lodestream_server import durable
+from lodestream_server import durable, jobs, level_queue
+from lodestream_server.levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from lodestream_server.processes import Allowed
 from lodestream_server.worker import Built, Job, Refused, build
 from tests.server.disks import FullDisk
 
 __all__ = [
+    "allow_levels_more",
+    "allow_more",
+    "end_by",
     "end_once",
     "explode",
     "full_at_each_step",
     "hoard",
+    "hoard_level",
     "kill",
+    "kill_level_once",
     "kill_once",
+    "leave",
+    "listed",
+    "make_coarsest",
+    "nothing",
     "number",
+    "out_of_processor_time",
+    "processor_seconds_left",
     "raise_error",
+    "raise_full",
+    "refuse",
     "sleep",
+    "take",
+    "unkept",
+    "use_processors",
     "wait",
 ]
+
+
+def allow_more(job: Job, *args: object) -> Allowed:
+    """What `jobs` allows a build, and the data folder, where those below leave a mark for the next attempt."""
+    return replace(_allowed(job, *args), write=job.folder.parent.parent)
+
+
+def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
+    """The same of those who make levels."""
+    return replace(_allowed_level(job, *args), write=job.folder.parent.parent, file_bytes=None)
+
+
+_allowed: Callable[..., Allowed] = jobs._allowed
+_allowed_level: Callable[..., Allowed] = level_queue._allowed
+
+
+def nothing() -> None:
+    """Do nothing."""
 
 
 def number() -> int:
@@ -38,9 +79,45 @@ def sleep(begun: Path) -> None:
     time.sleep(600)
 
 
-def raise_error(error: BaseException) -> None:
-    """Raise what is given."""
-    raise error
+def raise_error(kind: str, number: int | None = None) -> None:
+    """Raise an error of a built-in class."""
+    error = {"KeyError": KeyError, "OSError": OSError, "ZeroDivisionError": ZeroDivisionError}[kind]
+    raise error("secret") if number is None else error(number, "secret")
+
+
+def leave(code: int) -> None:
+    """End without an answer."""
+    os._exit(code)
+
+
+def end_by(number: int) -> None:
+    """End as a signal ends a process."""
+    os.kill(os.getpid(), number)
+
+
+def processor_seconds_left() -> float:
+    """Of the processor time that this process may use, what is left."""
+    return resource.getrlimit(resource.RLIMIT_CPU)[0] - time.process_time()
+
+
+def use_processors(seconds: float) -> float:
+    """Compute for so long."""
+    began = time.process_time()
+    while time.process_time() - began < seconds:
+        pass
+    return time.process_time()
+
+
+def out_of_processor_time(job: Job) -> Built | Refused:
+    """End as the kernel ends a process that has used up its processor time."""
+    os.kill(os.getpid(), signal.SIGXCPU)
+    return Refused("survived")
+
+
+def unkept() -> str:
+    """Find no folder for the kernels; and say so as a build process would, which nobody is to hear."""
+    logging.getLogger("lodestream.kernels").warning("no folder, says a build process")
+    return "no folder for the kernels"
 
 
 def wait(job: Job) -> Built | Refused:
@@ -53,6 +130,13 @@ def wait(job: Job) -> Built | Refused:
             return Refused("nobody said go")
         time.sleep(0.01)
     return build(job)
+
+
+def listed(job: Job) -> Built | Refused:
+    """Write down in which order surfaces are built."""
+    with (job.folder.parent.parent / "order").open("a") as file:
+        file.write(job.folder.name.partition(".")[0] + "\n")
+    return wait(job)
 
 
 def kill(job: Job) -> Built | Refused:
@@ -76,6 +160,11 @@ def explode(job: Job) -> Built | Refused:
     raise ZeroDivisionError(f"with a secret: {job.folder}")
 
 
+def refuse(job: Job) -> Built | Refused:
+    """Refuse the bytes, as a reader does that has become stricter."""
+    return Refused("expected a better file")
+
+
 def kill_once(job: Job) -> Built | Refused:
     """Be killed the first time."""
     marker = job.folder.parent.parent / "killed"
@@ -90,6 +179,11 @@ def hoard(job: Job) -> Built | Refused:
     return Refused(f"got {len(bytearray(2 << 30))} bytes")
 
 
+def take(count: int) -> int:
+    """Take so many bytes of memory."""
+    return len(bytearray(count))
+
+
 def full_at_each_step(job: Job) -> Built | Refused:
     """Find the disk full at the first step of writing the container, the next time at the second, and so on."""
     marker = job.folder.parent.parent / "fuller"
@@ -97,3 +191,36 @@ def full_at_each_step(job: Job) -> Built | Refused:
     marker.write_text(str(done + 1))
     durable.disk = FullDisk(done)
     return build(job)
+
+
+def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Say who makes a level, then make the coarsest at once and the others when ``go`` appears beside the folders."""
+    begun = job.folder.parent.parent / "begun"
+    with begun.open("a") as file:
+        file.write(f"{os.getpid()} {job.level}\n")
+    until = time.monotonic() + 60
+    while job.level and not (begun.parent / "go").exists():
+        if time.monotonic() > until:
+            return RefusedLevel("OptionError", "nobody said go")
+        time.sleep(0.01)
+    return make_level(job)
+
+
+def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Take more memory than the process may have."""
+    return RefusedLevel("OptionError", f"got {len(bytearray(2 << 30))} bytes")
+
+
+def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Be killed the first time, with half a file written."""
+    marker = job.folder.parent.parent / "killed"
+    if not marker.exists():
+        marker.touch()
+        (job.folder / "level").write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return make_level(job)
+
+
+def raise_full(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Find the disk full."""
+    raise OSError(errno.ENOSPC, "no space left", str(job.folder))

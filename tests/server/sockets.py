@@ -15,9 +15,25 @@ from lodestream import Target
 from lodestream.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, End, Error, Header, Open, Segments
 from lodestream.wire import parse, serialize
 
-__all__ = ["BINARY", "CLOSE", "Frames", "Place", "Reader", "frame", "handshake", "read_stream"]
+__all__ = [
+    "BINARY",
+    "CHUNKS",
+    "CLOSE",
+    "CONTINUATION",
+    "PING",
+    "Frames",
+    "Place",
+    "Reader",
+    "chunked",
+    "frame",
+    "handshake",
+    "read_stream",
+]
 
-TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
+CONTINUATION, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
+
+#: A body in chunks of a byte, without its end.
+CHUNKS = b"1\r\na\r\n" * 40_000
 
 
 @dataclass(frozen=True)
@@ -52,13 +68,18 @@ def handshake(place: Place) -> bytes:
     return "\r\n".join((*lines, "", "")).encode()
 
 
-def frame(data: bytes, opcode: int = BINARY) -> bytes:
-    """A client's frame: masked, as it has to be, with a mask that changes nothing."""
+def chunked(request: bytes = b"POST /v1/surfaces") -> bytes:
+    """The head of a request whose body comes in chunks."""
+    return request + b" HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+
+def frame(data: bytes, opcode: int = BINARY, *, last: bool = True) -> bytes:
+    """A client's frame, the last of its message or not: masked, as it has to be, with a mask that changes nothing."""
     if len(data) < 126:
         length = bytes([0x80 | len(data)])
     else:
         length = b"\xfe" + struct.pack(">H", len(data)) if len(data) < 65536 else b"\xff" + struct.pack(">Q", len(data))
-    return bytes([0x80 | opcode]) + length + bytes(4) + data
+    return bytes([0x80 * last | opcode]) + length + bytes(4) + data
 
 
 class Frames:

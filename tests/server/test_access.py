@@ -6,7 +6,9 @@ import base64
 import io
 import json
 import socket
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +21,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
 from lodestream.errors import RemoteError
-from lodestream.messages import CODES, SUBPROTOCOL, Error, Header, Open
+from lodestream.messages import CODES, SUBPROTOCOL, End, Error, Header, Open, Stop
 from lodestream.opening import OPENED, to_address
 from lodestream.wire import serialize
 from lodestream_client import sync
 from lodestream_server import running_server
 from lodestream_server.tokens import SCOPES, TokenFile
-from tests.server.helpers import Keys, Raw, hills, npy, problem, push, raw_stream
+from tests.server.helpers import Keys, Raw, closed, hills, npy, problem, push, raw_stream
 
 
 @dataclass
@@ -171,6 +173,63 @@ def test_a_ticket_that_is_too_old_is_refused(tmp_path: Path) -> None:
         with raw_stream(address) as stream:
             stream.socket.send("open, please")
             assert refused(stream) == "bad-message"
+
+
+def test_the_streams_of_a_token_end_with_it(served: Served, http: httpx.Client) -> None:
+    file = TokenFile(served.keys.folder / "tokens.json")
+    seconds = 1 / (24 * 60 * 60)
+    header = {
+        name: {"authorization": f"Bearer {file.create(name, ('read',), days)[0]}"}
+        for name, days in (("leaving", None), ("staying", None), ("short", 4 * seconds))
+    }
+    tickets = {name: http.post("/v1/tickets", headers=header[name]).json()["ticket"] for name in header}
+    with ExitStack() as held:
+
+        def begun(message: Open, **options: Any) -> Raw:
+            stream = held.enter_context(raw_stream(served.surface, **options))
+            if OPENED not in options.get("subprotocols", ()):
+                stream.send(message)
+            assert isinstance(stream.receive(), Header)
+            return stream
+
+        def streams(name: str) -> list[Raw]:
+            shown = Open(credit=1, ticket=tickets[name])
+            return [
+                begun(Open(credit=1), additional_headers=header[name]),
+                begun(shown),
+                begun(shown, **opening(shown)),
+                # All is sent, and the client does not say bye.
+                begun(Open(), additional_headers=header[name]),
+            ]
+
+        short, leaving, staying = (streams(name) for name in ("short", "leaving", "staying"))
+        file.revoke("leaving")
+        file.create("leaving", ("read",))  # another token, whatever it is called
+        over = time.monotonic() + 10
+        for stream in (*leaving, *short):
+            assert last_error(stream) == "bad-token"
+            assert time.monotonic() < over
+        for name in ("leaving", "short"):
+            with raw_stream(served.surface) as stream:
+                stream.send(Open(ticket=tickets[name]))
+                assert refused(stream) == "bad-token"
+        for stream in staying[:3]:
+            stream.send(Stop())
+            assert stream.until_end()[-1] == End("stopped")
+        assert staying[3].until_end()[-1] == End("complete")
+    assert (
+        'lodestream_streams_total{result="bad-token"} 8.0'
+        in http.get("/metrics", headers=served.keys.header("admin")).text
+    )
+
+
+def last_error(stream: Raw) -> str:
+    """The code of the error that ends a stream, once the close code fits it."""
+    event = stream.receive()
+    while not isinstance(event, Error):
+        event = stream.receive()
+    closed(stream, CODES[event.code].close)
+    return event.code
 
 
 def test_without_tokens_a_stream_with_a_forged_host_needs_one(server: str) -> None:

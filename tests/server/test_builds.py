@@ -14,10 +14,11 @@ import httpx
 import pytest
 
 from lodestream.errors import LodestreamError
-from lodestream_server import running_server, worker
+from lodestream_server import jobs, running_server, worker
+from lodestream_server.markers import MARKER
 from lodestream_server.storage import Storage
 from tests.server import slow
-from tests.server.helpers import eventually, hills, npy, push, settled
+from tests.server.helpers import eventually, hills, kept, npy, push, settled, upload_of
 
 
 @contextmanager
@@ -72,7 +73,7 @@ def test_deleting_stops_the_build_and_frees_its_process(tmp_path: Path, monkeypa
         assert http.get(location).status_code == 404
         monkeypatch.undo()
         assert push(http, npy(hills(seed=2)))["state"] == "ready"
-        assert len(list((data / "uploads").iterdir())) == 1
+        assert len(kept(data, "uploads")) == 1
         # A surface is ready a moment before the folder of its build is gone.
         eventually(lambda: not list((data / "work").iterdir()) or None, "the work folder empty")
 
@@ -82,10 +83,10 @@ def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkey
     monkeypatch.setattr(worker, "build", slow.kill)
     with running(data) as http:
         surface = settled(http, post(http, 1))
-        assert surface["state"] == "failed"
+        assert surface["state"] == "waiting"
         assert "process ended" in surface["reason"]
         assert "9" in surface["reason"]
-        assert not (data / "uploads" / surface["id"]).exists()
+        assert len(kept(data, "uploads")) == 1
         monkeypatch.undo()
         # The same bytes again are a new attempt.
         assert settled(http, post(http, 1))["state"] == "ready"
@@ -93,16 +94,27 @@ def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkey
 
 def test_a_process_that_is_killed_once_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.kill_once)
+    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
     with running(tmp_path / "data") as http:
         assert settled(http, post(http, 1))["state"] == "ready"
         assert (tmp_path / "data" / "killed").exists()
 
 
-def test_a_build_that_needs_too_much_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_that_uses_too_much_processor_time_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.out_of_processor_time)
+    with running(tmp_path / "data", build_seconds=50.0) as http:
+        surface = settled(http, post(http, 1))
+        assert surface["state"] == "waiting"
+        assert surface["reason"] == "the build took more processor time than 50 s"
+        monkeypatch.undo()
+        assert settled(http, post(http, 1))["state"] == "ready"
+
+
+def test_a_build_that_needs_too_much_memory_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.hoard)
     with running(tmp_path / "data", build_memory=1 << 30) as http:
         surface = settled(http, post(http, 1))
-        assert surface["state"] == "failed"
+        assert surface["state"] == "waiting"
         assert "more memory than one may have, 1024 MiB, 2 times" in surface["reason"]
         monkeypatch.undo()
         assert settled(http, post(http, 1))["state"] == "ready"
@@ -110,6 +122,7 @@ def test_a_build_that_needs_too_much_memory_fails(tmp_path: Path, monkeypatch: p
 
 def test_a_process_that_is_told_to_end_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.end_once)
+    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
     with running(tmp_path / "data") as http:
         assert settled(http, post(http, 1))["state"] == "ready"
         assert (tmp_path / "data" / "told").exists()
@@ -119,14 +132,14 @@ def test_what_nobody_foresaw_does_not_tell_the_servers_inside(tmp_path: Path, mo
     monkeypatch.setattr(worker, "build", slow.explode)
     with running(tmp_path / "data") as http:
         surface = settled(http, post(http, 1))
-        assert (surface["state"], surface["reason"]) == ("failed", "the build failed inside: ZeroDivisionError")
+        assert (surface["state"], surface["reason"]) == ("waiting", "the build failed inside: ZeroDivisionError")
 
 
-def test_a_build_that_takes_too_long_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_that_takes_too_long_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.wait)
     with running(tmp_path / "data", build_seconds=0.3) as http:
         surface = settled(http, post(http, 1))
-        assert (surface["state"], surface["reason"]) == ("failed", "the build took longer than 0.3 s")
+        assert (surface["state"], surface["reason"]) == ("waiting", "the build took longer than 0.3 s")
 
 
 def test_identical_uploads_at_once_are_one_surface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +160,7 @@ def test_identical_uploads_at_once_are_one_surface(tmp_path: Path, monkeypatch: 
         (location,) = {answer.headers["location"] for answer in answers}
         building(http, location)
         assert len(list((data / "work").iterdir())) == 1
-        assert [len(list((data / name).iterdir())) for name in ("records", "uploads", "incoming")] == [1, 1, 0]
+        assert [len(kept(data, name)) for name in ("records", "uploads", "incoming")] == [1, 1, 0]
         (data / "go").touch()
         assert settled(http, location)["state"] == "ready"
         assert http.post("/v1/surfaces", content=bytes_).status_code == 200
@@ -207,7 +220,7 @@ def test_a_build_under_which_server_after_server_dies_is_given_up(
     crash(data)
     with running(data) as http:
         surface = settled(http, location)
-        assert surface["state"] == "failed"
+        assert surface["state"] == "waiting"
         assert surface["reason"] == "the server ended 3 times while this was being built"
 
 
@@ -227,27 +240,43 @@ def test_what_a_dead_server_left_half_done_is_swept_away(tmp_path: Path) -> None
     (data / "records" / "x.json.0123.new").write_bytes(b"{")
     with running(data) as http:
         assert [entry["id"] for entry in http.get("/v1/surfaces").json()["surfaces"]] == [surface["id"]]
-    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
+    (upload,) = kept(data, "uploads")
+    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file() and path.name != MARKER)
+    # What was whole, and nobody speaks of, is not removed.
     assert files == [
         f"containers/{surface['container']}.lode",
+        f"damaged/containers/{'0' * 64}.lode",
+        "damaged/uploads/0123456789abcdef0123/0",
         "lock",
         f"records/{surface['id']}.json",
-        f"uploads/{surface['id']}/0",
-        f"uploads/{surface['id']}/record.json",
+        f"uploads/{upload}/0",
+        f"uploads/{upload}/{surface['id']}.json",
     ]
 
 
-def test_a_lost_container_is_built_again_and_a_lost_upload_is_a_failure(tmp_path: Path) -> None:
+def test_a_lost_container_is_built_again_and_without_its_upload_it_is_missing(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with running(data) as http:
         one, two = push(http, npy(hills(seed=1))), push(http, npy(hills(seed=2)))
     for surface in (one, two):
         (data / "containers" / f"{surface['container']}.lode").unlink()
-    (data / "uploads" / two["id"] / "0").unlink()
+    upload = upload_of(data, two)
+    upload.rename(data / "away")
+    before = (data / "records" / f"{two['id']}.json").read_bytes()
     with running(data) as http:
         assert settled(http, one["url"])["container"] == one["container"]
-        lost = settled(http, two["url"])
-        assert (lost["state"], lost["reason"]) == ("failed", "the upload is gone")
+        lost = http.get(two["url"]).json()
+        assert lost["state"] == "missing"
+        assert lost["reason"] == "neither its upload nor its container is on the server's disk"
+        for path in (f"{two['url']}/container", f"{two['url']}/levels/0", f"/v1/containers/{two['container']}.lode"):
+            answer = http.get(path)
+            assert (answer.status_code, answer.json()["code"]) in ((503, "missing"), (404, "not-found"))
+        assert http.get(f"{two['url']}/container").status_code == 503
+        # Once it is there again it is enough to ask.
+        (data / "away").rename(upload)
+        assert (data / "records" / f"{two['id']}.json").read_bytes() == before
+        assert http.post(f"{two['url']}/retry").status_code == 202
+        assert settled(http, two["url"])["container"] == two["container"]
 
 
 def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Path) -> None:
@@ -255,12 +284,15 @@ def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Pat
     with running(data) as http:
         surface = push(http, npy(hills()))
     path = data / "records" / f"{surface['id']}.json"
+    copy = upload_of(data, surface) / path.name
     path.write_text("{not json")
+    copy.write_text("{not json")
     storage = Storage(data)
-    assert storage.records() == []
+    (record,) = storage.records()
+    assert (record.id, record.state) == (surface["id"], "missing")
     storage.close()
-    assert path.read_text() == "{not json"
-    assert (data / "uploads" / surface["id"] / "0").is_file()
+    assert path.read_text() == copy.read_text() == "{not json"
+    assert (copy.parent / "0").is_file()
     assert (data / "containers" / f"{surface['container']}.lode").is_file()
 
 
@@ -277,7 +309,7 @@ def test_a_record_written_by_a_later_version_is_read(tmp_path: Path) -> None:
     with running(data) as http:
         surface = push(http, npy(hills()))
     path = data / "records" / f"{surface['id']}.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "owner": "somebody"}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), "later": "something"}))
     storage = Storage(data)
     assert storage.get(surface["id"]).state == "ready"
     storage.close()

@@ -63,9 +63,8 @@ def keeps(folder: Path, promises: Promises) -> None:
             assert record.state == "failed"
         if surface in promises.stored:
             assert record.state in ("queued", "ready")
-        if record.state != "failed":
-            (path,) = storage.upload_files(record)
-            assert path.read_bytes() == UPLOADS[surface]
+        (path,) = storage.upload_files(record)
+        assert path.read_bytes() == UPLOADS[surface]
         if record.state == "ready":
             assert storage.container(SHA256).read_bytes() == CONTAINER
     # Only what this test takes for a container is wrong with what is left.

@@ -18,7 +18,7 @@ from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.fsck_command import register
 from lodestream_server.storage import Storage
-from tests.server.helpers import hills, npy, push
+from tests.server.helpers import hills, npy, push, upload_of
 
 Fsck = Callable[..., tuple[int, dict[str, Any]]]
 
@@ -63,7 +63,12 @@ def fsck(data: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Fsck]:
     # Whatever was repaired: a server takes the folder, and leaves nothing to repair.
     Storage(data).close()
     code, report = call()
-    assert (code, report["findings"]) == (0, [])
+    # What cannot be found again is told as long as it is not deleted.
+    lost = {
+        finding["surface"] for finding in report["findings"] if finding["what"] in ("upload", "container", "record")
+    }
+    assert {finding["surface"] for finding in report["findings"]} == lost
+    assert code == bool(lost)
 
 
 def flip(path: Path, place: int) -> None:
@@ -77,8 +82,9 @@ def is_whole(data: Path, original: Path, *surfaces: dict[str, Any]) -> bool:
     names = []
     for surface in surfaces:
         names += [f"records/{surface['id']}.json"]
+        names += [str((upload_of(original, surface) / "0").relative_to(original))]
         if surface["container"]:
-            names += [f"containers/{surface['container']}.lode", f"uploads/{surface['id']}/0"]
+            names += [f"containers/{surface['container']}.lode"]
     return all((data / name).read_bytes() == (original / name).read_bytes() for name in names)
 
 
@@ -89,8 +95,8 @@ def state(data: Path, surface: dict[str, Any]) -> str:
 def test_a_folder_in_order(fsck: Fsck, data: Path) -> None:
     code, report = fsck()
     assert (code, report["clean"], report["findings"]) == (0, True, [])
-    assert (report["surfaces"], report["uploads"], report["containers"]) == (3, 2, 2)
-    files = [*data.glob("containers/*"), *data.glob("uploads/*/0")]
+    assert (report["surfaces"], report["uploads"], report["containers"]) == (3, 3, 2)
+    files = [*data.glob("containers/*.lode"), *data.glob("uploads/*/0")]
     assert report["bytes"] == sum(path.stat().st_size for path in files)
 
 
@@ -158,7 +164,8 @@ def test_what_is_damaged_is_set_aside_and_built_again(
     assert (code, report["clean"]) == (0, True)
     repairs = {finding["what"]: finding["repair"] for finding in report["findings"] if finding["what"] != "leftover"}
     assert repairs.keys() == {"container", "record"}
-    assert all(words.endswith("built again") for words in repairs.values())
+    assert all(words.endswith("whole again") for words in repairs.values())
+    assert all(finding["repaired"] for finding in report["findings"])
     assert (data / "damaged" / "containers" / container.name).read_bytes() == damaged
     assert (data / "damaged" / "records" / record.name).read_text() == "{"
     assert is_whole(data, original, *surfaces)
@@ -170,45 +177,63 @@ def test_what_is_damaged_is_set_aside_and_built_again(
 
 def test_a_damaged_upload_leaves_its_surface(fsck: Fsck, data: Path, surfaces: list[dict[str, Any]]) -> None:
     one, two, failed = surfaces
-    flip(data / "uploads" / one["id"] / "0", 500)
-    shutil.rmtree(data / "uploads" / two["id"])
+    damaged = upload_of(data, one)
+    flip(damaged / "0", 500)
+    shutil.rmtree(upload_of(data, two))
     code, report = fsck()
     assert code == 1
     found = {(finding["what"], finding["surface"]) for finding in report["findings"]}
     assert found == {("upload", one["id"]), ("upload", two["id"])}
     code, report = fsck("--repair")
-    assert code == 0
-    assert all("is whole and is served" in finding["repair"] for finding in report["findings"])
-    assert (data / "damaged" / "uploads" / one["id"] / "0").is_file()
+    # What is not there may be elsewhere: nothing is written that says that it is gone.
+    assert code == 1
+    repairs = {finding["surface"]: finding for finding in report["findings"]}
+    assert "is whole and is served" in repairs[one["id"]]["repair"]
+    assert "is it elsewhere?" in repairs[two["id"]]["repair"]
+    assert [repairs[surface["id"]]["repaired"] for surface in (one, two)] == [True, False]
+    assert (data / "damaged" / "uploads" / damaged.name / "0").is_file()
     assert [state(data, surface) for surface in surfaces] == ["ready", "ready", "failed"]
-    assert fsck()[1]["findings"] == []
+    assert [finding["surface"] for finding in fsck()[1]["findings"]] == [two["id"]]
     # From now on there is nothing to build it from.
     (data / "containers" / f"{one['container']}.lode").unlink()
     code, report = fsck("--repair")
-    assert (code, report["findings"][0]["lost"]) == (1, True)
-    assert [state(data, surface) for surface in (one, two, failed)] == ["failed", "ready", "failed"]
+    assert (code, report["findings"][0]["lost"], report["findings"][0]["repaired"]) == (1, True, False)
+    # Its record is as it was: what comes back to its place is served again.
+    assert [state(data, surface) for surface in (one, two, failed)] == ["ready", "ready", "failed"]
 
 
 def test_upload_and_container_damaged_at_once(fsck: Fsck, data: Path, surfaces: list[dict[str, Any]]) -> None:
     one, two, _ = surfaces
-    flip(data / "uploads" / one["id"] / "0", 500)
+    flip(upload_of(data, one) / "0", 500)
     flip(data / "containers" / f"{one['container']}.lode", 10)
     code, report = fsck("--repair")
     assert code == 1
     assert {finding["what"] for finding in report["findings"] if finding["lost"]} == {"upload", "container"}
-    assert [state(data, surface) for surface in (one, two)] == ["failed", "ready"]
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        assert [http.get(surface["url"]).json()["state"] for surface in (one, two)] == ["missing", "ready"]
+        assert http.get(f"{one['url']}/container").status_code == 503
+        # The same file again is all that it takes.
+        again = push(http, npy(hills(90, 80, seed=1)), name="one", precision="0.01")
+        assert (again["state"], again["id"], again["container"]) == ("ready", one["id"], one["container"])
 
 
 def test_a_record_that_is_lost_keeps_what_may_be_its(
     fsck: Fsck, data: Path, made: tuple[Path, list[dict[str, Any]]]
 ) -> None:
     original, (one, two, failed) = made
+    upload = upload_of(data, one)
     (data / "records" / f"{one['id']}.json").write_text("{")
-    (data / "uploads" / one["id"] / "record.json").write_text("{")
-    assert fsck("--repair")[0] == 1
-    kept = {str(path.relative_to(data / "damaged")) for path in data.glob("damaged/*/*")}
-    assert kept == {f"records/{one['id']}.json", f"uploads/{one['id']}", f"containers/{one['container']}.lode"}
+    (upload / f"{one['id']}.json").write_text("{")
+    code, report = fsck("--repair")
+    assert (code, [finding["what"] for finding in report["findings"]]) == (1, ["record"])
+    # Nothing is moved that may be what the record spoke of, and the surface is not forgotten.
+    assert list(data.glob("damaged/*/*")) == []
+    assert (upload / "0").is_file()
+    assert (data / "containers" / f"{one['container']}.lode").is_file()
     assert is_whole(data, original, two, failed)
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        assert http.get(one["url"]).json()["state"] == "missing"
+        assert http.get(f"{one['url']}/container").status_code == 503
 
 
 def test_figures_that_are_not_those_of_the_container(
@@ -266,5 +291,5 @@ def test_it_says_in_words_what_it_found(
     assert args.run(args) == 1
     first, last = capsys.readouterr().out.splitlines()
     assert first.startswith(f"container of surface {surfaces[0]['id']}, containers/{path.name}: expected bytes with")
-    assert last.startswith("3 surfaces, 2 uploads, 2 containers, ")
+    assert last.startswith("3 surfaces, 3 uploads, 2 containers, ")
     assert last.endswith(": 1 damaged")

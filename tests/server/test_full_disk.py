@@ -10,7 +10,7 @@ from lodestream_server import durable, jobs, worker
 from lodestream_server.storage import Storage
 from tests.server import slow
 from tests.server.disks import CountingDisk, FullDisk
-from tests.server.helpers import eventually, hills, npy, push, settled
+from tests.server.helpers import eventually, hills, kept, npy, push, settled
 from tests.server.test_builds import running
 from tests.torture import small_disk
 
@@ -30,7 +30,7 @@ def test_an_upload_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(worker, "build", slow.wait)
     with running(data) as http:
         kept = http.post("/v1/surfaces", content=npy(hills(seed=1))).json()
-        eventually(lambda: http.get(kept["url"]).json()["state"] == "building" or None, "the build to begin")
+        eventually(lambda: http.get(kept["url"]).json()["progress"] == 0.5 or None, "the build to begin")
         before = files(data)
         counting = CountingDisk()
         monkeypatch.setattr(durable, "disk", counting)
@@ -62,9 +62,9 @@ def test_a_second_upload_of_what_failed_at_every_step(tmp_path: Path, monkeypatc
             if answer.status_code == 202:
                 break
             assert answer.status_code == 507
-            # Whether the failure is still known, or was forgotten for want of room: no upload is left.
-            assert http.get(failed["url"]).json().get("state") in (None, "failed")
-            assert list((data / "uploads").iterdir()) == []
+            # What was known of it is known still, and what it was made of is there.
+            assert http.get(failed["url"]).json() == failed
+            assert len(kept(data, "uploads")) == 1
         assert step > 5
         assert settled(http, failed["url"])["state"] == "failed"
 
@@ -72,6 +72,7 @@ def test_a_second_upload_of_what_failed_at_every_step(tmp_path: Path, monkeypatc
 def test_a_build_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
     monkeypatch.setattr(worker, "build", slow.full_at_each_step)
+    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
     with running(data) as http:
         surface = push(http, npy(hills()))
         assert surface["state"] == "ready"
@@ -93,7 +94,7 @@ def test_keeping_what_was_built_at_every_step(tmp_path: Path, monkeypatch: pytes
         waiting = eventually(lambda: http.get(location).json()["reason"], "the build to wait")
         assert waiting == "waits for room on the server's disk"
         assert http.get(location).json()["state"] == "queued"
-        assert list((data / "containers").iterdir()) == []
+        assert kept(data, "containers") == []
         for step in range(100):
             disk = FullDisk(step)
             monkeypatch.setattr(durable, "disk", disk)
@@ -117,8 +118,9 @@ def test_a_failure_that_cannot_be_written_down(tmp_path: Path, monkeypatch: pyte
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
         assert settled(http, location)["reason"] == "the build took longer than 0.5 s"
     monkeypatch.undo()
+    # It is found out again.
     storage = Storage(data)
-    assert [(record.state, record.reason) for record in storage.records()] == [("failed", "the upload is gone")]
+    assert [(record.state, record.reason) for record in storage.records()] == [("queued", None)]
     storage.close()
 
 

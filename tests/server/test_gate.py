@@ -15,6 +15,7 @@ from starlette.types import Receive, Scope, Send
 from lodestream_server import Settings, create_app
 from lodestream_server.access import Access
 from lodestream_server.gate import Gate
+from lodestream_server.scopes import needed_scope, routes_of, scope_of
 from lodestream_server.tokens import SCOPES
 from tests.server.helpers import Keys, problem
 
@@ -22,7 +23,6 @@ from tests.server.helpers import Keys, problem
 ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/"): None,
     ("GET", "/docs"): None,
-    ("GET", "/docs/oauth2-redirect"): None,
     ("GET", "/openapi.json"): None,
     ("GET", "/healthz"): None,
     ("GET", "/readyz"): None,
@@ -32,6 +32,7 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("POST", "/v1/surfaces"): "write",
     ("GET", "/v1/surfaces/{surface}"): "read",
     ("DELETE", "/v1/surfaces/{surface}"): "write",
+    ("POST", "/v1/surfaces/{surface}/retry"): "write",
     ("GET", "/v1/surfaces/{surface}/container"): "read",
     ("GET", "/v1/surfaces/{surface}/levels/{level}"): "read",
     ("GET", "/v1/containers/{sha256}.lode"): "read",
@@ -89,9 +90,8 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Door:
 def test_every_route_is_known_here(tmp_path: Path) -> None:
     app: FastAPI = create_app(Settings(data=tmp_path))
     routes = {
-        (method, route.path)
-        for group in (app.routes, *app.state.routes)
-        for route in group
+        (method, getattr(route, "path", ""))
+        for route in routes_of(app)
         for method in getattr(route, "methods", None) or ()
         if method != "HEAD"
     }
@@ -165,6 +165,64 @@ def test_a_path_that_looks_like_an_open_one_is_not(locked: Door, path: str) -> N
 
     asyncio.run(locked.gate(scope, None, send))  # type: ignore[arg-type]
     assert sent[0]["status"] == 401
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+def test_every_route_declares_its_scope(locked: Door, method: str, path: str) -> None:
+    found = [
+        route
+        for route in routes_of(locked.app)
+        if getattr(route, "path", "") == path and method in getattr(route, "methods", ())
+    ]
+    assert [scope_of(route) for route in found] == [ROUTES[method, path]]
+
+
+def test_a_route_without_a_scope_needs_admin(keys: Keys) -> None:
+    door = Door(Settings(data=keys.folder, public_reads=True))
+
+    @door.app.get("/forgotten")
+    async def forgotten() -> None: ...
+
+    @door.app.websocket("/forgotten/stream")
+    async def stream() -> None: ...
+
+    assert door.ask("GET", "/forgotten").status_code == 401
+    assert problem(door.ask("GET", "/forgotten", keys.header("write"))) == (403, "small-scope")
+    assert door.ask("GET", "/forgotten", keys.header("admin")).status_code == 299
+    assert door.ask("GET", "/nowhere").status_code == 299  # where the application says that there is nothing
+    assert needed_scope({"type": "websocket", "path": "/forgotten/stream", "app": door.app}) == "admin"
+    assert needed_scope({"type": "websocket", "path": "/v1/surfaces/0/stream", "app": door.app}) == "read"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/metrics%0A",
+        "/metrics%0a",
+        "/metrics%00",
+        "/metrics%0D%0A",
+        "/metrics%7F",
+        "/metrics%C2%85",
+        "/healthz%0A",
+        "/v1/surfaces/0%00",
+        "/v1/surfaces%0A",
+        "/v1%2Fsurfaces",
+        "/v1/surfaces/0%2f..%2fmetrics",
+        "/%2Fmetrics",
+        "/metrics%2F",
+    ],
+)
+@pytest.mark.parametrize("method", ["GET", "HEAD", "POST", "DELETE"])
+def test_control_characters_and_encoded_slashes_lead_nowhere(
+    locked: Door, alone: Door, keys: Keys, method: str, path: str
+) -> None:
+    for door, headers in ((locked, {}), (locked, keys.header("read")), (locked, keys.header("admin")), (alone, {})):
+        answer = door.ask(method, path, headers)
+        assert answer.status_code == 404, (path, answer.status_code)
+        if method != "HEAD":
+            assert problem(answer) == (404, "not-found")
+    # A slash in the query is somebody's own.
+    assert alone.ask(method, "/v1/surfaces?name=a%2Fb").status_code == 299
 
 
 @pytest.mark.parametrize(("method", "path"), GUARDED)

@@ -19,7 +19,8 @@ from websockets.exceptions import ConnectionClosed
 
 from lodestream.messages import Error, Header, Open
 from lodestream_server import Settings, durable, running_server
-from lodestream_server.limits import Limits, Turnstile
+from lodestream_server.access import Caller
+from lodestream_server.limits import Limits
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
 from lodestream_server.tokens import TokenFile
 from tests.server.disks import FullDisk
@@ -32,8 +33,27 @@ class Disk(NamedTuple):
     free: int
 
 
-def limits(folder: Path, surfaces: int = 0, builds: int = 0, **settings: Any) -> Limits:
-    return Limits(Settings(data=folder, **settings), folder, lambda: surfaces, lambda: builds)
+ANNA, BERT, CARL = (Caller(f"token {name}", name, name) for name in ("anna", "bert", "carl"))
+
+
+def limits(
+    folder: Path,
+    surfaces: int = 0,
+    builds: int = 0,
+    own: int = 0,
+    kept: int = 0,
+    alone: bool = True,
+    **settings: Any,
+) -> Limits:
+    """Of which ``own`` builds and ``kept`` bytes on the disk are Anna's."""
+    return Limits(
+        Settings(data=folder, **settings),
+        folder,
+        lambda: surfaces,
+        lambda caller: (builds, own if caller == ANNA.key else 0),
+        lambda owner: kept if owner == ANNA.owner else 0,
+        lambda: alone,
+    )
 
 
 def request(*chunks: bytes, length: int | str | None = None) -> Request:
@@ -49,8 +69,8 @@ def request(*chunks: bytes, length: int | str | None = None) -> Request:
     return Request({"type": "http", "method": "POST", "headers": headers}, receive)
 
 
-async def read(made: Limits, asked: Request) -> bytes:
-    async with made.upload(asked) as watched:
+async def read(made: Limits, asked: Request, caller: Caller = ANNA) -> bytes:
+    async with made.upload(asked, caller) as watched:
         return b"".join([chunk async for chunk in watched.stream()])
 
 
@@ -88,7 +108,7 @@ def test_uploads_under_way_are_counted_until_they_are_on_the_disk(tmp_path: Path
     made = limits(tmp_path, keep_free=0)
 
     async def together() -> None:
-        async with made.upload(request(b"x" * 300, b"", length=600)) as first:
+        async with made.upload(request(b"x" * 300, b"", length=600), ANNA) as first:
             with pytest.raises(FullError):
                 await read(made, request(b"", length=401))
             await anext(aiter(first.stream()))
@@ -103,7 +123,7 @@ def test_an_upload_that_does_not_say_its_size_stops_at_the_mark(tmp_path: Path, 
     made = limits(tmp_path, keep_free=500)
 
     async def fill() -> None:
-        async with made.upload(request(*[bytes(1 << 24)] * 3)) as watched:
+        async with made.upload(request(*[bytes(1 << 24)] * 3), ANNA) as watched:
             chunks = aiter(watched.stream())
             await anext(chunks)
             disk["free"] = 400
@@ -126,7 +146,7 @@ def test_numbers_are_limits_too(tmp_path: Path) -> None:
 
     async def together() -> None:
         made = limits(tmp_path, max_uploads=1)
-        async with made.upload(request(b"x")):
+        async with made.upload(request(b"x"), ANNA):
             with pytest.raises(BusyError, match="at most 1 uploads"):
                 await read(made, request(b"x"))
         await read(made, request(b"x"))
@@ -155,33 +175,6 @@ def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:
     for _ in range(5):
         with made.stream("a"), made.stream("a"):
             pass
-
-
-def test_one_at_a_time_and_some_waiting() -> None:
-    async def crowd() -> None:
-        door, order = Turnstile(3), list[int]()
-
-        async def pass_through(number: int) -> None:
-            async with door:
-                order.append(number)
-                await asyncio.sleep(0)
-                order.append(number)
-
-        tasks = [asyncio.create_task(pass_through(number)) for number in range(4)]
-        results = await asyncio.gather(*tasks, return_exceptions=True)
-        assert [type(result) for result in results] == [type(None)] * 3 + [BusyError]
-        assert order == [0, 0, 1, 1, 2, 2]
-        # Whoever gives up waiting makes room.
-        async with door:
-            waiting = [asyncio.create_task(pass_through(number)) for number in range(2)]
-            await asyncio.sleep(0)
-            waiting[0].cancel()
-            await asyncio.sleep(0)
-            waiting.append(asyncio.create_task(pass_through(9)))
-        await asyncio.gather(*waiting, return_exceptions=True)
-        assert order[-2:] == [9, 9]
-
-    asyncio.run(crowd())
 
 
 # Over real sockets.

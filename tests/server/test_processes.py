@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 
-from lodestream_server.processes import Call, Pool, ProcessDiedError, UnforeseenError
-from lodestream_server.worker import limit_memory
+from lodestream_server.processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError
 from tests.server import slow
 from tests.server.helpers import PATIENCE, eventually
+from tests.server.programs import alive
 
 _MEMORY = 512 << 20
 
@@ -41,18 +41,27 @@ print(len(before), sorted(versions() - before))
 """
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[ForkServer]:
+    made = ForkServer()
+    yield made
+    made.close()
+
+
 @asynccontextmanager
-async def pool(size: int = 1) -> AsyncIterator[Pool]:
-    made = Pool(size, partial(limit_memory, _MEMORY))
+async def pool(server: ForkServer, size: int = 1) -> AsyncIterator[Pool]:
+    made = Pool(size, server)
     try:
         yield made
     finally:
         await asyncio.to_thread(made.close)
 
 
-async def ask(made: Pool, function: Callable[..., Any], *args: Any, seconds: float | None = None) -> Any:
+async def ask(
+    made: Pool, function: Callable[..., Any], *args: Any, seconds: float | None = None, write: Path | None = None
+) -> Any:
     async with asyncio.timeout(PATIENCE):
-        return await made.run(Call(function, args, seconds))
+        return await made.run(Call(function, args, seconds, allowed=Allowed(write=write, memory=_MEMORY)))
 
 
 def gone(process: int) -> bool:
@@ -63,52 +72,87 @@ def gone(process: int) -> bool:
     return False
 
 
-def test_a_process_killed_while_it_idles_harms_nobody() -> None:
+def test_a_fork_server_killed_while_it_idles_harms_nobody() -> None:
+    server = ForkServer()
+
     async def check() -> None:
-        async with pool() as made:
+        async with pool(server) as made:
             first = await ask(made, slow.number)
-            assert await ask(made, slow.number) == first
-            os.kill(first, signal.SIGKILL)
+            before = server.pid
+            assert before is not None
+            os.kill(before, signal.SIGKILL)
             # At once, before anybody can have noticed, and again when it is known.
             second = await ask(made, slow.number)
-            assert second not in (first, os.getpid())
-            assert await ask(made, slow.number) == second
+            assert second not in (first, before, os.getpid())
+            assert server.pid not in (before, None)
+            assert await ask(made, slow.number) not in (first, second)
+            # What others hear of the end of a service it leaves to its parent.
+            os.kill(server.pid or 0, signal.SIGTERM)
+            assert await ask(made, slow.number)
 
-    asyncio.run(check())
+    try:
+        asyncio.run(check())
+    finally:
+        server.close()
 
 
-def test_what_happens_to_a_call_is_told_and_the_next_one_works(tmp_path: Path) -> None:
+def test_a_fork_server_that_dies_takes_its_calls_with_it(tmp_path: Path) -> None:
+    server = ForkServer()
+    begun = tmp_path / "begun"
+
     async def check() -> None:
-        async with pool() as made:
+        async with pool(server) as made:
+            task = asyncio.create_task(ask(made, slow.sleep, begun, write=tmp_path))
+            await asyncio.to_thread(eventually, begun.exists, "the call to begin")
+            os.kill(server.pid or 0, signal.SIGKILL)
+            with pytest.raises(ProcessDiedError):
+                await task
+            sleeper = int(begun.read_text())
+            assert eventually(lambda: not alive(sleeper), "the process to end with it")
+
+    try:
+        asyncio.run(check())
+    finally:
+        server.close()
+
+
+def test_what_happens_to_a_call_is_told_and_the_next_one_works(server: ForkServer, tmp_path: Path) -> None:
+    async def check() -> None:
+        async with pool(server) as made:
             with pytest.raises(ProcessDiedError, match="SIGKILL") as died:
-                await ask(made, slow.kill, None)
+                await ask(made, slow.end_by, int(signal.SIGKILL))
             assert died.value.exitcode == -signal.SIGKILL
             with pytest.raises(ProcessDiedError, match="exit code 3"):
-                await ask(made, os._exit, 3)
+                await ask(made, slow.leave, 3)
             with pytest.raises(MemoryError):
-                await ask(made, slow.hoard, None)
+                await ask(made, slow.take, 2 << 30)
             with pytest.raises(TimeoutError):
-                await ask(made, slow.sleep, tmp_path / "begun", seconds=0.5)
+                await ask(made, slow.sleep, tmp_path / "begun", seconds=0.5, write=tmp_path)
             with pytest.raises(UnforeseenError, match="ZeroDivisionError") as raised:
-                await ask(made, slow.raise_error, ZeroDivisionError("secret"))
+                await ask(made, slow.raise_error, "ZeroDivisionError")
             assert "secret" in raised.value.traceback
             with pytest.raises(UnforeseenError) as raised:
-                await ask(made, slow.raise_error, OSError(28, "full"))
+                await ask(made, slow.raise_error, "OSError", 28)
             assert raised.value.errno == 28
-            # What a function raises is no reason to give its process up.
-            process = await ask(made, slow.number)
-            with pytest.raises(UnforeseenError):
-                await ask(made, slow.raise_error, KeyError())
-            assert await ask(made, slow.number) == process
+            assert await ask(made, slow.take, 1 << 20) == 1 << 20
 
     asyncio.run(check())
 
 
-def test_a_cancelled_call_has_ended_when_it_says_so(tmp_path: Path) -> None:
+def test_each_call_has_a_process_of_its_own(server: ForkServer) -> None:
     async def check() -> None:
-        async with pool() as made:
+        async with pool(server, 3) as made:
+            asked = [ask(made, slow.number) for _ in range(20)]
+            assert len({*await asyncio.gather(*asked)} - {server.pid, os.getpid()}) == 20
+
+    asyncio.run(check())
+
+
+def test_a_cancelled_call_has_ended_when_it_says_so(server: ForkServer, tmp_path: Path) -> None:
+    async def check() -> None:
+        async with pool(server) as made:
             begun = tmp_path / "begun"
-            call = Call(slow.sleep, (begun,))
+            call = Call(slow.sleep, (begun,), allowed=Allowed(write=tmp_path))
             task = asyncio.create_task(made.run(call))
             waiting = asyncio.create_task(made.run(Call(slow.number, before=partial(pytest.fail, "it began"))))
             await asyncio.to_thread(eventually, begun.exists, "the call to begin")
@@ -127,13 +171,13 @@ def _threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name.startswith("lodestream-process")}
 
 
-def test_closing_kills_what_runs(tmp_path: Path) -> None:
+def test_closing_kills_what_runs(server: ForkServer, tmp_path: Path) -> None:
     others = _threads()  # of servers that other tests share
 
     async def check() -> None:
         begun = tmp_path / "begun"
-        async with pool() as made:
-            task = asyncio.create_task(made.run(Call(slow.sleep, (begun,))))
+        async with pool(server) as made:
+            task = asyncio.create_task(made.run(Call(slow.sleep, (begun,), allowed=Allowed(write=tmp_path))))
             await asyncio.to_thread(eventually, begun.exists, "the call to begin")
         with pytest.raises(ProcessDiedError):
             await task
@@ -147,10 +191,10 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     program = (
         "import asyncio, pathlib, sys\n"
-        "from lodestream_server.processes import Call, Pool\n"
+        "from lodestream_server.processes import Allowed, Call, ForkServer, Pool\n"
         "from tests.server import slow\n"
-        "if __name__ == '__main__':\n"
-        "    asyncio.run(Pool(1).run(Call(slow.sleep, (pathlib.Path(sys.argv[1]),))))\n"
+        "begun = pathlib.Path(sys.argv[1])\n"
+        "asyncio.run(Pool(1, ForkServer()).run(Call(slow.sleep, (begun,), allowed=Allowed(write=begun.parent))))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(program)
@@ -176,3 +220,27 @@ def test_the_first_mesh_finds_its_loops_compiled(tmp_path: Path, faces: str) -> 
     count, _, new = done.stdout.partition(" ")
     assert int(count) >= 10
     assert new == "[]\n"
+
+
+def test_each_call_has_its_own_processor_time(server: ForkServer) -> None:
+    async def call() -> None:
+        async with pool(server) as made:
+            used = await ask(made, slow.use_processors, 1.2, seconds=30.0)
+            left = await ask(made, slow.processor_seconds_left, seconds=30.0)
+            assert used > 1.2
+            # The system counts whole seconds; what the call before has used is no longer in it.
+            assert 29.9 < left < 31.1
+            assert await ask(made, slow.processor_seconds_left) < 0  # no limit is -1
+
+    asyncio.run(call())
+
+
+def test_a_process_that_has_used_up_its_processor_time_ends(server: ForkServer) -> None:
+    async def call() -> None:
+        async with pool(server) as made:
+            with pytest.raises(TimeoutError, match="processor time"):
+                await ask(made, slow.end_by, int(signal.SIGXCPU))
+            with pytest.raises(TimeoutError, match=r"^$"):
+                await ask(made, slow.use_processors, 60.0, seconds=0.5)
+
+    asyncio.run(call())

@@ -28,6 +28,8 @@ def example(setting: Setting) -> str:
         return setting.kind.expected.split()[-1]
     if setting.default is False:
         return "yes"
+    if setting.name == "formats":
+        return "text,npy"
     return {
         "an integer": "7",
         "seconds": "0.5",

@@ -48,14 +48,19 @@ def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
 def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> None:
     body = npy(hills(seed=2))
     first = push(http, body, precision="0.5", filename="a.npy")
-    again = http.post("/v1/surfaces", content=body, params={"precision": "5e-1", "name": "another name"})
+    again = http.post("/v1/surfaces", content=body, params={"precision": "5e-1", "filename": "another.npy"})
     assert again.status_code == 200
     assert again.headers["location"] == first["url"]
     assert again.json()["id"] == first["id"]
     form = http.post("/v1/surfaces", files=[("file", ("b.npy", body))], params={"precision": "0.50"})
     assert (form.status_code, form.json()["id"]) == (200, first["id"])
-    others = [push(http, body)["id"], push(http, body, precision="0.25")["id"], push(http, body, closed="rows")["id"]]
-    assert len({first["id"], *others}) == 4
+    others = [
+        push(http, body)["id"],
+        push(http, body, precision="0.25")["id"],
+        push(http, body, closed="rows")["id"],
+        push(http, body, precision="0.5", name="another name")["id"],
+    ]
+    assert len({first["id"], *others}) == 5
 
 
 def test_a_root_mean_square_error_is_part_of_the_surface(http: httpx.Client) -> None:
@@ -233,6 +238,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/v1/tickets",
         "/v1/surfaces",
         "/v1/surfaces/{surface}",
+        "/v1/surfaces/{surface}/retry",
         "/v1/surfaces/{surface}/container",
         "/v1/surfaces/{surface}/levels/{level}",
         "/v1/containers/{sha256}.lode",
@@ -240,7 +246,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
     assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "rms", "closed", "name", "filename"}
-    assert set(post["responses"]) == {"200", "202", "401", "403", "408", "413", "422", "503", "507"}
+    assert set(post["responses"]) == {"200", "202", "401", "403", "408", "413", "422", "429", "503", "507"}
     example = post["responses"]["202"]["content"]["application/json"]["example"]
     real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()
     # The framework leaves nulls out of examples.

@@ -10,11 +10,12 @@ import msgpack
 
 from tests.stranger.fields import DamagedError, Fields
 from tests.stranger.header import Header, read_header
+from tests.stranger.masks import Masks, read_masks
 
 MAGIC = b"\x89LODE\r\n"
 VERSION = 3
 FOOTER_MAGIC = b"LODEEND\n"
-HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
+HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS = 1, 2, 3, 4, 5, 6, 7
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,19 @@ def read_layer(section: Section) -> Layer:
     return Layer(rms, maximum, segments, section.end)
 
 
-def pieces_of(header: Header) -> list[tuple[int, range, range, int]]:
-    """The pieces of exactness, in order: block, rows, columns, channel."""
+def pieces_of(header: Header, masks: Masks | None) -> list[tuple[int, range, range, int, bool]]:
+    """The pieces of exactness, in order: block, rows, columns, channel, and whether it is of kept holes."""
     down, along = (2 ** (t + 1) for t in header.tile)
     return [
-        (number, range(row, min(row + down, block.rows)), range(column, min(column + along, block.columns)), channel)
+        (
+            number,
+            range(row, min(row + down, block.rows)),
+            range(column, min(column + along, block.columns)),
+            channel,
+            kept,
+        )
         for number, block in enumerate(header.blocks)
+        for kept in ((False, True) if masks is not None and masks.kept[number].any() else (False,))
         for row in range(0, block.rows, down)
         for column in range(0, block.columns, along)
         for channel in range(header.channels)
@@ -98,11 +106,11 @@ class Exactness:
     pieces: list[bytes]
 
 
-def read_exactness(section: Section, header: Header) -> Exactness:
+def read_exactness(section: Section, header: Header, masks: Masks | None) -> Exactness:
     """The pieces of exactness."""
     fields = Fields(section.payload)
     rms, maximum = fields.f64(), fields.f64()
-    lengths = [fields.varint() for _ in pieces_of(header)]
+    lengths = [fields.varint() for _ in pieces_of(header, masks)]
     pieces = [fields.take(length) for length in lengths]
     fields.finish()
     return Exactness(rms, maximum, pieces)
@@ -113,7 +121,7 @@ class Container:
     """What a file or the beginning of one holds."""
 
     header: Header
-    masks: bytes | None = None
+    masks: Masks | None = None
     layers: list[Layer] = field(default_factory=list)
     exactness: Exactness | None = None
     metadata: dict[str, Any] | None = None
@@ -134,10 +142,10 @@ def read_container(data: bytes) -> Container:
             return container
         if section.kind == LAYER:
             container.layers.append(read_layer(section))
-        elif section.kind == MASKS:
-            container.masks = section.payload
+        elif section.kind in (MASKS, KEPT_MASKS):
+            container.masks = read_masks(section.payload, container.header.blocks, section.kind == KEPT_MASKS)
         elif section.kind == EXACTNESS:
-            container.exactness = read_exactness(section, container.header)
+            container.exactness = read_exactness(section, container.header, container.masks)
         elif section.kind == METADATA:
             container.metadata = msgpack.unpackb(section.payload)
         elif section.kind == INDEX:
@@ -185,8 +193,11 @@ def read_index(data: bytes, header: Header, levels: int) -> Index:
     if section.kind != INDEX or section.end - offset != length or section.end + 24 != len(data):
         raise DamagedError("the footer does not name the index")
     position = read_section(data, 8).end
+    masks = None
     if header.has_masks:
-        position = read_section(data, position).end
+        marked = read_section(data, position)
+        masks = read_masks(marked.payload, header.blocks, marked.kind == KEPT_MASKS)
+        position = marked.end
     fields = Fields(section.payload)
     errors: list[tuple[float, float]] = []
     entries: list[list[Entry]] = []
@@ -208,7 +219,7 @@ def read_index(data: bytes, header: Header, levels: int) -> Index:
     level_errors = [(fields.f64(), fields.f64()) for _ in range(levels)]
     exactness_length = fields.varint()
     position += exactness_length
-    pieces = _read_pieces(fields, data, header, position - 4) if exactness_length else []
+    pieces = _read_pieces(fields, data, pieces_of(header, masks), position - 4) if exactness_length else []
     position += fields.varint()
     fields.finish()
     if position != offset:
@@ -216,9 +227,9 @@ def read_index(data: bytes, header: Header, levels: int) -> Index:
     return Index(errors, entries, level_errors, pieces)
 
 
-def _read_pieces(fields: Fields, data: bytes, header: Header, end: int) -> list[bytes]:
+def _read_pieces(fields: Fields, data: bytes, wanted: list[Any], end: int) -> list[bytes]:
     named = []
-    for _ in pieces_of(header):
+    for _ in wanted:
         length = fields.varint()
         named.append((length, fields.number("I") if length else zlib.crc32(b"")))
     pieces = []

@@ -11,7 +11,7 @@ from tests.stranger.container import Container, Exactness, Segment, pieces_of
 from tests.stranger.exactness import restore
 from tests.stranger.header import Header
 from tests.stranger.layout import Levels, units_of
-from tests.stranger.masks import Masks, read_masks
+from tests.stranger.masks import Masks
 from tests.stranger.neighbours import NEIGHBOURS, numbers_of
 from tests.stranger.picture import Arrays, Values, block_places, plane_value, put_together, rounded, value
 
@@ -33,9 +33,7 @@ class Decoder:
         self.units = units_of(self.header, self.levels)
         self.named = -1  # the index names nothing more of the levels up to this one
         self.known = [self._remaining()]  # passes that remain of every unit, after 0, 1, 2, ... layers
-        self.masks: Masks | None = None
-        if container.masks is not None:
-            self.masks = read_masks(container.masks, self.header.blocks)
+        self.masks: Masks | None = container.masks
 
     def _remaining(self) -> list[int]:
         return [unit.remaining for unit in self.units]
@@ -88,30 +86,31 @@ class Decoder:
         found = [self._channel(n, level, self.known[layers], complete) for n in range(self.header.channels)]
         return [[channel[block] for channel in found] for block in range(len(self.header.blocks))]
 
-    def shown(self, channels: list[list[Values]], level: int | None = None) -> list[Shown]:
+    def shown(self, channels: list[list[Values]], level: int | None = None, exact: bool = False) -> list[Shown]:
         """Blocks as they are handed out, from the values of their channels: with x and y, and with holes."""
         level = self.levels.last if level is None else level
-        return [self._block(number, values, level) for number, values in enumerate(channels)]
+        return [self._block(number, values, level, exact) for number, values in enumerate(channels)]
 
-    def _block(self, number: int, channels: list[Values], level: int) -> Shown:
+    def _block(self, number: int, channels: list[Values], level: int, exact: bool) -> Shown:
         header = self.header
         rows, columns = block_places(header, self.levels, number, level)
         valid = np.ones((len(rows), len(columns)), bool)
         if self.masks is not None:
             valid = self.masks.masks[number][np.ix_(rows, columns)]
+        said = valid | self.masks.kept[number] if exact and self.masks is not None else valid
         points = list(channels[: header.points_channels])
         if header.plane is not None and level in (None, self.levels.last):
             size = header.blocks[number].rows, header.blocks[number].columns
             for axis, rule in zip((0, 1), reversed(header.plane["grid"]), strict=True):
                 numbers = [plane_value(rule, axis, (row, column), size) for row in rows for column in columns]
                 points.insert(0, rounded(np.array(numbers).reshape(valid.shape), header.type))
-        arrays = [_with_holes(np.stack(points, axis=-1), valid, 0 if self.masks is None else self.masks.hole)]
+        arrays = [_with_holes(np.stack(points, axis=-1), said, 0 if self.masks is None else self.masks.hole)]
         if header.flat and header.plane is None:
             arrays[0] = arrays[0][..., 0]
         first = header.points_channels
         for attribute in header.attributes:
             array = np.stack(channels[first : first + attribute.channels], axis=-1)
-            array = _with_holes(array, valid, 0)
+            array = _with_holes(array, said, 0)
             arrays.append(array if attribute.components else array[..., 0])
             first += attribute.channels
         return Shown(arrays, valid)
@@ -123,19 +122,20 @@ class Decoder:
     def exact(self, exactness: Exactness) -> list[Shown]:
         """The surface itself."""
         found = self.channels()
-        for piece, (block, rows, columns, channel) in zip(exactness.pieces, pieces_of(self.header), strict=True):
+        for piece, place in zip(exactness.pieces, pieces_of(self.header, self.masks), strict=True):
+            block, rows, columns, channel, kept = place
             window = (slice(rows.start, rows.stop), slice(columns.start, columns.stop))
             valid = np.ones((len(rows), len(columns)), bool)
             if self.masks is not None:
-                valid = self.masks.masks[block][window]
+                valid = (self.masks.kept if kept else self.masks.masks)[block][window]
             values = found[block][channel][window]
-            if piece[:1] == NEIGHBOURS:
+            if piece[:1] == NEIGHBOURS and not kept:
                 lattice = self.header.lattices[channel]
                 told = value(lattice, np.array(numbers_of(piece[1:], values, valid, lattice), float))
                 values[valid] = rounded(told, self.header.types[channel])[valid]
             else:
                 values[valid] = restore(piece, values[valid])
-        return self.shown(found)
+        return self.shown(found, exact=True)
 
 
 def _with_holes(array: Values, valid: Values, hole: int) -> Values:

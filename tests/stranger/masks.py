@@ -19,14 +19,15 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Masks:
-    """What stands for integer points in holes, and for each block its mask, True where a point is valid."""
+    """What stands for integer points in holes, and for each block where a point is valid, and where a hole is kept."""
 
     hole: int
     masks: list[Mask]
+    kept: list[Mask]
 
 
-def read_masks(payload: bytes, blocks: list[Block]) -> Masks:
-    """The masks section."""
+def read_masks(payload: bytes, blocks: list[Block], with_kept: bool) -> Masks:
+    """The section of masks, or of kept masks."""
     fields = Fields(payload)
     hole = fields.number("q")
     masks = []
@@ -38,8 +39,21 @@ def read_masks(payload: bytes, blocks: list[Block]) -> Masks:
         if int((~mask).sum()) != holes:
             raise ValueError("a mask has other holes than it says")
         masks.append(mask)
+    kept = [_read_kept(fields, mask) if with_kept else np.zeros_like(mask) for mask in masks]
     fields.finish()
-    return Masks(hole, masks)
+    return Masks(hole, masks, kept)
+
+
+def _read_kept(fields: Fields, valid: Mask) -> Mask:
+    count, holes = fields.varint(), int((~valid).sum())
+    kept = np.full_like(valid, False)
+    if count == holes:
+        kept = ~valid
+    elif count:
+        kept = decode_mask(fields.take(fields.varint()), *valid.shape)
+    if int(kept.sum()) != count or (kept & valid).any():
+        raise ValueError("the kept holes are others than there are")
+    return kept
 
 
 def decode_mask(data: bytes, rows: int, columns: int) -> Mask:

@@ -14,7 +14,9 @@ from typing import Any
 from lodestream.messages import MAX_CREDIT, Open
 from lodestream.wire import serialize
 from tests.server.programs import Server, Within, resident
-from tests.server.sockets import Place, Reader, frame, handshake, read_stream
+from tests.server.sockets import CHUNKS, CONTINUATION, PING, Place, Reader, chunked, frame, handshake, read_stream
+
+from .health import Health, watched
 
 __all__ = ["BEHAVIOURS", "Outcome", "settings", "visit"]
 
@@ -23,6 +25,10 @@ IDLE_SECONDS = 3.0
 
 _PATIENCE = 120.0
 _SAMPLE_SECONDS = 0.05
+
+# How many come in a second, of each kind: a system forgets connections that come faster than they are accepted, and
+# whoever was forgotten tries again seconds later, the honest ones too.
+_ARRIVALS = 100
 
 
 def settings(count: int) -> dict[str, Any]:
@@ -52,6 +58,8 @@ class Outcome:
         What the server held before the crowd came, and when it was gone.
     seconds : float
         Until the last honest client had finished.
+    health : Health
+        How ``/healthz`` was answered meanwhile.
     """
 
     honest: int
@@ -61,6 +69,7 @@ class Outcome:
     before: Within
     after: Within
     seconds: float
+    health: Health
 
     @property
     def remains(self) -> tuple[str, ...]:
@@ -81,6 +90,11 @@ class _Client:
         self.random = random_
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self.socket.setblocking(False)
+
+    @property
+    def host(self) -> str:
+        """What a request says of where it goes."""
+        return f"{self.place.host}:{self.place.port}"
 
     async def connect(self, *, small: bool = False) -> None:
         if small:
@@ -159,11 +173,51 @@ async def never_speaks(client: _Client) -> None:
 async def slow_upload(client: _Client) -> None:
     """Promise a file, and send a byte of it each second."""
     await client.connect()
-    host = f"{client.place.host}:{client.place.port}"
-    await client.send(f"POST /v1/surfaces HTTP/1.1\r\nHost: {host}\r\nContent-Length: 1000000\r\n\r\n".encode())
+    await client.send(f"POST /v1/surfaces HTTP/1.1\r\nHost: {client.host}\r\nContent-Length: 1000000\r\n\r\n".encode())
     while True:
         await client.send(client.random.randbytes(1))
         await asyncio.sleep(1)
+
+
+async def pings_unread(client: _Client) -> None:
+    """Open a stream, and send pings without end, of whose pongs none is read."""
+    await client.open(small=True)
+    await _on_and_on(client, frame(bytes(125), PING) * 2000)
+
+
+async def empty_fragments(client: _Client) -> None:
+    """Open a stream, and begin a message that goes on in empty fragments."""
+    await client.open(small=True)
+    await client.send(frame(b"", last=False))
+    await _on_and_on(client, frame(b"", CONTINUATION, last=False) * 20_000)
+
+
+async def endless_message(client: _Client) -> None:
+    """Open a stream, and begin a message that goes on in fragments of a byte, no faster than frames may come."""
+    await client.open(small=True)
+    await client.send(frame(b"a", last=False))
+    await _on_and_on(client, frame(b"a", CONTINUATION, last=False), 0.025)
+
+
+async def one_byte_chunks(client: _Client) -> None:
+    """Upload in chunks of a byte."""
+    await client.connect()
+    await client.send(chunked())
+    await _on_and_on(client, CHUNKS)
+
+
+async def refused_upload(client: _Client) -> None:
+    """Upload what is refused at once, and go on."""
+    await client.connect()
+    path, size = ("/v1/surfaces", 1 << 50) if client.random.random() < 0.5 else ("/v1/nothing", 1 << 30)
+    await client.send(f"POST {path} HTTP/1.1\r\nHost: {client.host}\r\nContent-Length: {size}\r\n\r\n".encode())
+    await _on_and_on(client, bytes(1 << 16))
+
+
+async def _on_and_on(client: _Client, data: bytes, pause: float = 0.0) -> None:
+    while True:
+        await client.send(data)
+        await asyncio.sleep(pause)
 
 
 BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
@@ -173,6 +227,11 @@ BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
     garbage,
     never_speaks,
     slow_upload,
+    pings_unread,
+    empty_fragments,
+    endless_message,
+    one_byte_chunks,
+    refused_upload,
 )
 
 
@@ -193,16 +252,18 @@ async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1
     before = await _settled(server)
     most = [before.resident]
     watching = asyncio.create_task(_sample(server.pid, most))
-    hostile = [
-        asyncio.create_task(_behave(behave, place, random.Random(random_.random())))
-        for _ in range(count)
-        for behave in BEHAVIOURS
-    ]
-    started = asyncio.get_running_loop().time()
-    wrong = await _honest(place, sha256, count)
-    seconds = asyncio.get_running_loop().time() - started
-    # The server has had enough of each of them by itself, before they are gone.
-    await asyncio.sleep(IDLE_SECONDS)
+    async with watched(server.url) as watching_health:
+        hostile = [
+            asyncio.create_task(_behave(behave, place, random.Random(random_.random()), number / _ARRIVALS))
+            for number in range(count)
+            for behave in BEHAVIOURS
+        ]
+        await asyncio.sleep(count / _ARRIVALS / 2)
+        started = asyncio.get_running_loop().time()
+        wrong = await _honest(place, sha256, count)
+        seconds = asyncio.get_running_loop().time() - started
+        # The server has had enough of each of them by itself, before they are gone.
+        await asyncio.sleep(IDLE_SECONDS)
     after = await _settled(server, before)
     watching.cancel()
     for task in hostile:
@@ -210,10 +271,13 @@ async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1
     await asyncio.gather(*hostile, return_exceptions=True)
     connections = count * (1 + len(BEHAVIOURS))
     grown = (most[0] - before.resident) // connections
-    return Outcome(count, len(hostile), wrong, grown, before, after, seconds)
+    return Outcome(count, len(hostile), wrong, grown, before, after, seconds, watching_health.health)
 
 
-async def _behave(behave: Callable[[_Client], Awaitable[None]], place: Place, random_: random.Random) -> None:
+async def _behave(
+    behave: Callable[[_Client], Awaitable[None]], place: Place, random_: random.Random, seconds: float
+) -> None:
+    await asyncio.sleep(seconds)
     async with _Client(place, random_) as client:
         # What the server does with it is seen in the server.
         with contextlib.suppress(OSError):

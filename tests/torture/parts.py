@@ -20,12 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import benchmarks.server as throughput
+import tests.faults.run as faults
 from lodestream.container import read_index
 from lodestream.plan import plan
+from tests.faults.shim import CannotError
 from tests.server.helpers import hills, npy, push
 from tests.server.programs import server
 
-from . import crowd, fuzz, kills, small_disk, streams
+from . import crowd, fuzz, history, kills, small_disk, streams
 
 __all__ = ["PARTS", "Part", "Result", "sent"]
 
@@ -120,6 +122,8 @@ def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
     return count, (
         f"{outcome.hostile} hostile connections of {len(crowd.BEHAVIOURS)} kinds and {outcome.honest} honest ones",
         f"all {outcome.honest} honest streams right, the last after {outcome.seconds:.1f} s",
+        f"meanwhile {outcome.health.answers} answers of /healthz: median {1000 * outcome.health.median:.0f} ms, 99th "
+        f"percentile {1000 * outcome.health.late:.0f} ms, the latest {1000 * outcome.health.last:.0f} ms",
         f"the server's memory grew by {outcome.grown / 1024:.0f} KiB a connection (allowed: 128)",
         "afterwards no task, socket or file more than before",
     )
@@ -170,6 +174,30 @@ def _disk(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
     )
 
 
+def _history(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    done = history.run(folder, count, seconds)
+    cases = sum(done.disasters[kind] for kind in history.possible())
+    facts = (
+        f"{done.operations:,} operations of {history.CLIENTS} clients, with the tokens of {done.owners} owners and an "
+        f"admin: {done.uploads:,} uploads and {done.deletes:,} deletes acknowledged, {done.refused:,} uploads answered "
+        f"507, {done.reads:,} reads answered, {done.unanswered:,} without an answer",
+        ", ".join(f"{kind} {number}" for kind, number in sorted(done.disasters.items())),
+        f"at the end {done.ready} surfaces ready; findings: {len(done.findings)}",
+    )
+    assert not done.findings, "\n".join((*facts, *map(str, done.findings[:20])))
+    return cases, facts
+
+
+def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    try:
+        report = faults.run(folder, count / 100, seconds)
+    except CannotError as error:
+        return 0, (f"skipped: {error}",)
+    # The figures come last: of many problems the page shows the end.
+    assert not report.problems, "\n".join(map(str, (*report.problems, *report.facts())))
+    return 100 * len(report.outcomes) // report.cases, report.facts()
+
+
 def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
     from .targets import TARGETS
 
@@ -206,6 +234,8 @@ PARTS = {
         Part("throughput", "Many streams at once from one server", "streams at once", 500, _throughput),
         Part("kills", "Kill -9 under upload, build, stream and delete", "kills", 200, _kills),
         Part("disk", "A disk that is full most of the time", "requests", 2000, _disk),
+        Part("history", "One history through disasters, every acknowledged state in order", "disasters", 200, _history),
+        Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults),
         Part("fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz),
     )
 }

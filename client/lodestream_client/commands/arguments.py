@@ -24,6 +24,7 @@ __all__ = [
     "add_command",
     "add_json_option",
     "add_rate_option",
+    "add_size_option",
     "add_surface_options",
     "add_target_options",
     "add_token_option",
@@ -112,6 +113,12 @@ def _level(text: str) -> int:
     return int(text)
 
 
+def _count(text: str) -> int:
+    if not re.fullmatch("[0-9]{1,18}", text) or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a number of 1 or more, got {text!r}")
+    return int(text)
+
+
 def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     # argparse hides the message of any other exception behind "invalid value".
     def checked(text: str) -> T:
@@ -176,6 +183,22 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
         type=parse_rate,
         metavar="RATE",
         help="receive at most this much a second, such as 1mbit or 200kB",
+    )
+
+
+def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) -> None:
+    """Add ``--max-vertices``; without decoding only the container's tables count."""
+    what = (
+        "refuse a surface of more vertices, or one that takes more than 128 bytes for each of N with all its channels, "
+        "before memory is taken for it"
+        if decodes
+        else "refuse a container whose tables take more than 128 bytes for each of N, before they are read"
+    )
+    parser.add_argument(
+        "--max-vertices",
+        type=_count,
+        metavar="N",
+        help=f"{what} (default: what takes two fifths of the memory there is)",
     )
 
 

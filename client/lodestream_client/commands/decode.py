@@ -15,8 +15,9 @@ from lodestream.errors import (
 )
 from lodestream.target import Target
 
-from .arguments import Subparsers, add_command, add_json_option, add_target_options, target_of
+from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_target_options, target_of
 from .inputs import input_files
+from .interrupts import interruptible
 from .outcome import Outcome, check_grid, check_out, note_unmet
 from .output import note, progress_bar
 
@@ -43,6 +44,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("container", metavar="IN.lode", help="container to read; - for standard input")
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
     add_target_options(parser)
+    add_size_option(parser)
     parser.add_argument(
         "--partial",
         action="store_true",
@@ -51,6 +53,7 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+@interruptible()
 def run(args: argparse.Namespace) -> int:
     """Decode, write, report."""
     target = target_of(args)
@@ -58,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     started = time.monotonic()
     with input_files(args.parser, [args.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
         task = bar.add_task("decoding", total=1.0, figures="")
-        job = _Job(file, args.out, target, started, lambda done: bar.update(task, completed=done))
+        job = _Job(file, args.out, target, args.max_vertices, started, lambda done: bar.update(task, completed=done))
         try:
             job.decode()
         except StreamError as error:
@@ -88,12 +91,18 @@ class _Job:
     """One container on its way through a decoder."""
 
     def __init__(
-        self, file: BinaryIO, out: str, target: Target, started: float, progress: Callable[[float], None]
+        self,
+        file: BinaryIO,
+        out: str,
+        target: Target,
+        max_vertices: int | None,
+        started: float,
+        progress: Callable[[float], None],
     ) -> None:
         from lodestream.decoder import Decoder
         from lodestream.selection import wish_of
 
-        self.decoder: Decoder = Decoder(wish_of(target))
+        self.decoder: Decoder = Decoder(wish_of(target), max_vertices=max_vertices, level=target.level)
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
         self.read_bytes = 0
@@ -107,10 +116,11 @@ class _Job:
 
     def decode(self) -> None:
         """Decode as far as the target says; `ended` says why it ends there."""
+        from lodestream.capacity import Capacity
         from lodestream.container import read_index
 
         try:
-            index = read_index(self._read, self._size)
+            index = read_index(self._read, self._size, Capacity(self.decoder.capacity.max_vertices))
         except (CorruptStreamError, TruncatedStreamError):
             # Without its index a container still has its prefix, which is all that quality order needs.
             if self._target.level is not None or self._target.order == "level":

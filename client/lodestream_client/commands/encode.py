@@ -13,6 +13,7 @@ from lodestream.errors import OptionError
 
 from .arguments import Subparsers, add_command, add_json_option, add_surface_options, precisions, surface_options
 from .inputs import input_files
+from .interrupts import interruptible
 from .output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 
 __all__ = ["register", "run"]
@@ -33,6 +34,7 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+@interruptible()
 def run(args: argparse.Namespace) -> int:
     """Read, encode, write."""
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
@@ -45,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
         require_folder(Path(args.out))
 
     import lodestream as ls
+    from lodestream.formats.holes import note_attributes
 
     started = time.monotonic()
     with input_files(args.parser, args.files) as files:
@@ -68,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
             temporary.write_bytes(container)
     seconds = time.monotonic() - started
     blocks = surface.blocks
+    note_attributes(surface)
     note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks))
     raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
     if args.json:

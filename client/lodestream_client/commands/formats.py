@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from .arguments import Subparsers, add_command, add_json_option
-from .output import console, print_json
+from .output import cell, console, print_json
 
 __all__ = ["register", "run"]
 
@@ -50,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
 def _show(rows: list[dict[str, Any]]) -> None:
     from rich import box
     from rich.table import Table
-    from rich.text import Text
 
     out = console()
     table = Table(box=box.SIMPLE_HEAD if out.is_terminal else None, pad_edge=False)
@@ -61,6 +60,5 @@ def _show(rows: list[dict[str, Any]]) -> None:
         options = [f"-o {name}= {text}" for name, text in row["options"].items()]
         if row["more"]:
             options.insert(0, f"further files: {row['more']}")
-        cells = (row["name"], " ".join(row["suffixes"]), ways, "\n".join(options))
-        table.add_row(*map(Text, cells))
+        table.add_row(cell(row["name"]), cell(" ".join(row["suffixes"])), cell(ways), cell(*options))
     out.print(table)

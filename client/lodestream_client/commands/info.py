@@ -8,11 +8,14 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from .. import addresses
-from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
+from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
 from .inputs import input_files
-from .output import console, human_size, point_words, print_json
+from .output import cell, console, human_size, point_words, print_json
 
 __all__ = ["register", "run"]
+
+# Of a surface that was uploaded as a container.
+_ERRORS = {"checked": "checked by the server", "told": "as told by whoever uploaded them"}
 
 _MOST_KINDS = 12  # sizes of blocks that are named
 
@@ -32,6 +35,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="FILE|URL",
         help="container, - for standard input, or the address of a surface or of a container on any web server",
     )
+    add_size_option(parser, decodes=False)
     add_token_option(parser)
     add_json_option(parser)
 
@@ -51,12 +55,13 @@ def _of_url(args: argparse.Namespace) -> Mapping[str, Any]:
 
     url = addresses.source_url(args.what)
     if not addresses.is_surface(url):
-        return sync.describe_file(url, token=token_of(args))
+        return sync.describe_file(url, token=token_of(args), max_vertices=args.max_vertices)
     surface = sync.describe(url, token=token_of(args))
     return {**surface.details, "url": surface.url}
 
 
 def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
+    from lodestream.capacity import Capacity
     from lodestream.container import describe, read_index
 
     with input_files(args.parser, [args.what]) as files, files.paths[0].open("rb") as file:
@@ -66,7 +71,7 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
             file.seek(offset)
             return file.read(length)
 
-        return describe(read_index(read, size))
+        return describe(read_index(read, size, Capacity(args.max_vertices)))
 
 
 def _show(what: str, details: Mapping[str, Any]) -> None:
@@ -77,8 +82,8 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     facts.add_column(style="bold" if out.is_terminal else "")
     facts.add_column()
     for name, value in _facts(details):
-        facts.add_row(name, value)
-    out.print(what)
+        facts.add_row(cell(name), cell(value))
+    out.print(cell(what))
     out.print(facts)
     for kind in ("levels", "layers"):
         if details.get(kind):
@@ -98,12 +103,16 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
         facts.append(("points", point_words(details)))
     if details.get("attributes"):
         facts.append(("attributes", ", ".join(map(str, details["attributes"]))))
-    if "dtype" in details:
+    if details.get("dtype") is not None:
         facts.append(("type", str(details["dtype"])))
-    if "bytes" in details:
+    if details.get("bytes") is not None:
         facts.append(("size", f"{human_size(details['bytes'])} ({details['bytes']} bytes)"))
-    if "exact" in details:
-        facts.append(("exact", "yes, bit for bit" if details["exact"] else "no, within the error asked for"))
+    if details.get("exact") is not None:
+        lost = (details.get("holes") or 0) - (details.get("non_finite") or 0)
+        exact = "yes, bit for bit" + (" wherever there is a value" if lost else "")
+        facts.append(("exact", exact if details["exact"] else "no, within the error asked for"))
+    if errors := _ERRORS.get(str(details.get("errors"))):
+        facts.append(("errors", errors))
     if details.get("sha256"):
         facts.append(("sha256", str(details["sha256"])))
     return facts + [(str(name), _short(value)) for name, value in metadata.items()]
@@ -149,8 +158,8 @@ def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
         table.add_column(name, justify="right")
     for number, state in enumerate(states):
         place = [_size(state["shape"])] if grids else [str(state["level"])] if kind == "layers" else []
-        figures = (f"{state['bytes']:,}", _figure(state["rms"]), _figure(state["max"]))
-        table.add_row(str(number), *place, *figures)
+        figures = (f"{state['bytes']:,}", _figure(state.get("rms")), _figure(state.get("max")))
+        table.add_row(*map(cell, (number, *place, *figures)))
     return table
 
 

@@ -1,24 +1,38 @@
-"""What a command says and writes: results to standard output, everything else to standard error, files by rename."""
+"""What a command says and writes: results to standard output, everything else to standard error, files by rename.
+
+Nothing else of the client writes to a terminal. What is said comes in part from files and servers, so it passes
+`printable` here: in a line by `note` and `say`, in a table by `cell`, which also keeps brackets from being taken for
+markup. JSON is written in ASCII, with escapes of its own, and is exact.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
+import logging
 import math
 import os
 import secrets
 import sys
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from lodestream.errors import InputError
+from lodestream.errors import FormatWarning, InputError
+from lodestream.text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
+    from rich.text import Text
 
 __all__ = [
+    "Parser",
+    "cell",
+    "clean_warnings",
     "console",
     "human_size",
     "human_time",
@@ -30,18 +44,72 @@ __all__ = [
     "progress_bar",
     "replacing",
     "require_folder",
+    "say",
 ]
 
 
 def note(text: str) -> None:
-    """Say something that is not the result."""
-    print(f"lodestream: {text}", file=sys.stderr)
+    """Say something that is not the result, in a line."""
+    print(f"lodestream: {printable(' '.join(text.split()))}", file=sys.stderr)
+
+
+def say(text: str) -> None:
+    """Print a line of the result."""
+    print(printable(text))
+
+
+def cell(*lines: object) -> Text:
+    """What stands in a table, or is printed beside one, as it is."""
+    from rich.text import Text
+
+    return Text("\n".join(printable(str(line)) for line in lines))
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser of the command line whose errors name what was given as it is."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and message, and end the program with 2."""
+        super().error(printable(message))
+
+
+@contextmanager
+def clean_warnings() -> Iterator[None]:
+    """Show what warnings and the logs of libraries say, of files for the most part, as `note` does."""
+    handler = logging.lastResort  # what is used where nobody has set anything up, as here
+    formatter = handler.formatter if handler is not None else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", FormatWarning)
+        warnings.showwarning = partial(_show_warning, warnings.showwarning)
+        if handler is not None:
+            handler.setFormatter(_Printable())
+        try:
+            yield
+        finally:
+            if handler is not None:
+                handler.setFormatter(formatter)
+
+
+class _Printable(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return "\n".join(map(printable, super().format(record).splitlines()))
+
+
+def _show_warning(
+    others: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any, **more: Any
+) -> None:
+    """What a file leaves out is a note, not a line of the program."""
+    if issubclass(category, FormatWarning):
+        note(str(message))
+    else:
+        others(printable(str(message)), category, *place, **more)
 
 
 def point_words(details: Mapping[str, Any]) -> str:
     """How many points a surface has, and how many of them are holes, from the keys of ``info``."""
-    total, holes = _points(details), details.get("holes") or 0
-    return f"{total}, {holes} of them holes" if holes else str(total)
+    total, holes, kept = _points(details), details.get("holes") or 0, details.get("non_finite") or 0
+    words = f", {kept} of these infinite or in part NaN, which come back" if kept else ""
+    return f"{total}, {holes} of them holes{words}" if holes else str(total)
 
 
 def _points(details: Mapping[str, Any]) -> int:
@@ -57,14 +125,14 @@ def note_holes(holes: int, total: int) -> None:
 def note_details(details: Mapping[str, Any]) -> None:
     """Say what a server noted when it read a surface: what it left out or chose, and holes."""
     for text in (details.get("metadata") or {}).get("notes") or ():
-        note(" ".join(str(text).split()))
+        note(str(text))
     if details.get("blocks"):
         note_holes(details.get("holes") or 0, _points(details))
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object, alone on a line of standard output."""
-    print(json.dumps(value, allow_nan=False))
+    """Print one JSON object, alone on a line of standard output, in printable ASCII."""
+    print(json.dumps(value, allow_nan=False, ensure_ascii=True))
 
 
 def human_size(size: float) -> str:
@@ -112,9 +180,9 @@ def progress_bar() -> Iterator[Progress]:
             return Text(human_time(min(left)) if left else "", style="progress.remaining")
 
     bar = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
-        TextColumn("{task.fields[figures]}"),
+        TextColumn("{task.fields[figures]}", markup=False),
         TimeLeft(),
         console=console(stderr=True),
         transient=True,

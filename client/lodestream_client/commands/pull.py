@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import CorruptStreamError, LodestreamError, NotFoundError
+from lodestream.errors import (
+    CorruptStreamError,
+    FormatError,
+    InputError,
+    LodestreamError,
+    NotFoundError,
+    TooLargeError,
+    UnsupportedVersionError,
+)
 from lodestream.target import Target
 
 from .. import addresses
@@ -17,6 +23,7 @@ from .arguments import (
     add_command,
     add_json_option,
     add_rate_option,
+    add_size_option,
     add_target_options,
     add_token_option,
     parse_seconds,
@@ -24,18 +31,21 @@ from .arguments import (
     target_of,
     token_of,
 )
+from .interrupts import exit_code, interruptible
+from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
 from .output import human_size, note, progress_bar
 
 if TYPE_CHECKING:
-    from ..cache import Part
-    from ..requests import Identity
     from ..sync import Stream
 
 __all__ = ["register", "run"]
 
 # Seconds without a word after which a connection counts as lost.
 _SILENCE = 30.0
+
+# Seconds for what is fetched after an interruption: somebody waits for the end, or the server is gone.
+_HURRY = 3.0
 
 
 def register(subparsers: Subparsers) -> None:
@@ -46,7 +56,8 @@ def register(subparsers: Subparsers) -> None:
         run,
         "stream a surface, or as much of it as is wanted, from a server into a file",
         "The suffix of OUT names its format; standard output gets NPY. A connection that breaks is replaced, and what\n"
-        "has come is not sent again.",
+        "has come is not sent again. After Ctrl-C, or when the server is gone for good, OUT is written as far as\n"
+        "the surface came, and what came is kept for --resume.",
     )
     parser.add_argument(
         "url", type=parse_source, metavar="URL", help="the surface's address, or that of a container on any web server"
@@ -54,11 +65,12 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
     add_target_options(parser)
     add_rate_option(parser)
+    add_size_option(parser)
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="keep what comes in LODESTREAM_CACHE (default: the user's cache folder) until the whole surface has been "
-        "written, and ask only for what is not there",
+        help="go on from what an earlier pull left in LODESTREAM_CACHE (default: the user's cache folder), ask only "
+        "for what is not there, and keep what comes until the whole surface has been written",
     )
     parser.add_argument(
         "--transport",
@@ -89,29 +101,69 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Stream, write, report."""
+    """Stream, write, report; of what came before an interruption too."""
     target = target_of(args)
     if args.transport == "ws" and not all(map(addresses.is_surface, (args.url, *args.replicas))):
         args.parser.error("argument --transport: a file's address has no WebSocket")
     check_out(args)
+    with interruptible(), Kept(args.resume) as kept:
+        return _pull(args, target, kept)
 
+
+def _pull(args: argparse.Namespace, target: Target, kept: Kept) -> int:
+    name = "standard output" if args.out == "-" else args.out
+    try:
+        outcome, broke = _written(args, target, kept, name)
+    except KeyboardInterrupt as interrupt:
+        raise type(interrupt)(f"{_words(interrupt)}: {name} is not written") from None
+    outcome.report(args.json)
+    if broke is None or outcome.ended == "complete":
+        part = target.region is not None or target.attributes is not None or target.level is not None
+        kept.done(outcome.ended == "complete" and not part)
+    if broke is None:
+        return 0
+    note("; ".join(filter(None, (f"what came is written to {name}", kept.words))))
+    return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
+
+
+def _written(
+    args: argparse.Namespace, target: Target, kept: Kept, name: str
+) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
+    """What has been written, and what ended the stream before it had all that was asked for."""
     import lodestream.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
-    started = time.monotonic()
-    with _part(args) as (part, identity):
-        outcome = _pull(args, target, part, identity, started)
-        outcome.write(args.out)
-        outcome.report(args.json)
-        if part is not None and outcome.ended == "complete":
-            part.discarded = True
-    return 0
-
-
-def _pull(
-    args: argparse.Namespace, target: Target, part: Part | None, identity: Identity | None, started: float
-) -> Outcome:
     from .. import sync
 
+    started = time.monotonic()
+    if args.resume:
+        kept.use(sync.identify(args.url, token=token_of(args)))
+    stream, broke = _receive(args, target, kept)
+    if broke is not None:
+        if not stream.decoder.layers:
+            if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
+                broke.args = (f"{_words(broke)}: the first layer has not come, and {name} is not written",)
+            raise broke
+        note(_words(broke))
+        kept.failed(broke)
+    outcome = _outcome(args, target, kept, stream, started, hurried=broke is not None)
+    outcome.write(args.out)
+    return outcome, broke
+
+
+def _receive(
+    args: argparse.Namespace, target: Target, kept: Kept
+) -> tuple[Stream, KeyboardInterrupt | LodestreamError | None]:
+    """The stream at its end, and what ended it before it had all that was asked for.
+
+    Raises
+    ------
+    KeyboardInterrupt, LodestreamError
+        Before there is a stream, or when what came is of no use, or not to be written.
+    """
+    from .. import sync
+
+    broke: KeyboardInterrupt | LodestreamError | None = None
+    identity = kept.identity
     with _Progress(target) as bar:
         stream = sync.connect(
             [args.url, *args.replicas],
@@ -121,22 +173,36 @@ def _pull(
             deadline=args.retry,
             silence=min(args.retry, _SILENCE) or _SILENCE,
             limit_rate=args.limit_rate,
-            store=part,
+            store=kept.store,
             container=identity.container if identity is not None else None,
             size=identity.size if identity is not None else None,
             progress=bar.received,
+            sink=None if args.resume else kept.write,
+            max_vertices=args.max_vertices,
         )
-        with stream:
-            for number, view in enumerate(stream):
-                if number == 0 and stream.decoder.header is not None:
-                    check_grid(args.out, stream.decoder.header)
-                bar.figures = f"{human_size(view.bytes)}, level {view.level}, RMS error {view.rms:.4g}"
+        kept.follow(stream)
+        try:
+            with stream:
+                for number, view in enumerate(stream):
+                    if number == 0 and stream.decoder.header is not None:
+                        check_grid(args.out, stream.decoder.header)
+                    bar.figures = f"{human_size(view.bytes)}, level {view.level}, RMS error {view.rms:.4g}"
+        except (FormatError, CorruptStreamError, TooLargeError, UnsupportedVersionError):
+            raise
+        except (KeyboardInterrupt, LodestreamError) as error:
+            broke = error
+    return stream, broke
+
+
+def _outcome(
+    args: argparse.Namespace, target: Target, kept: Kept, stream: Stream, started: float, *, hurried: bool
+) -> Outcome:
     seconds = time.monotonic() - started
     decoder = stream.decoder
     wire_bytes = stream.wire_bytes
     metadata = decoder.metadata
     if metadata is None:
-        metadata, more = _metadata(stream, part, token_of(args))
+        metadata, more = _metadata(stream, kept, token_of(args), hurried=hurried)
         wire_bytes += more
     view = decoder.view()
     header, ended = decoder.header, stream.ended
@@ -147,37 +213,8 @@ def _pull(
     return Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, seconds, ended)
 
 
-@contextmanager
-def _part(args: argparse.Namespace) -> Iterator[tuple[Part | None, Identity | None]]:
-    """What is kept from before, and room for more; nothing where that is not wanted or not possible."""
-    if not args.resume:
-        yield None, None
-        return
-    from .. import sync
-    from ..cache import Part, cache_folder, forget_old
-
-    identity = sync.identify(args.url, token=token_of(args))
-    if identity.name is None or identity.size is None:
-        note("the server does not tell one version of the file from another: nothing is kept")
-        yield None, None
-        return
-    folder = cache_folder()
-    forget_old(folder)
-    part = Part(folder, identity.name, identity.size)
-    if part.ranges.total:
-        note(f"{human_size(part.ranges.total)} are here from before")
-    try:
-        yield part, identity
-    except CorruptStreamError:
-        # Not to be met again next time.
-        part.discarded = True
-        raise
-    except LodestreamError:
-        if part.ranges.total:
-            note(f"{human_size(part.ranges.total)} are kept; pull --resume goes on from there")
-        raise
-    finally:
-        part.close()
+def _words(error: BaseException) -> str:
+    return " ".join(str(error).split()) or "interrupted"
 
 
 class _Progress:
@@ -202,24 +239,24 @@ class _Progress:
         self._shown.update(self._task, total=planned, completed=received, figures=self.figures)
 
 
-def _metadata(stream: Stream, part: Part | None, token: str | None) -> tuple[dict[str, Any], int]:
+def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -> tuple[dict[str, Any], int]:
     # A stop of our own takes effect at once, so the stream has not brought the metadata, which stand at the end.
     from lodestream.container import ByteRange, read_metadata
 
-    from .. import sync
+    from .. import requests, sync
 
     place = stream.metadata_place
-    assert place is not None, "there is a view, so it is known where things stand"
-    if part is not None and part.ranges.covers(*place):
-        return read_metadata(part.read(*place), ByteRange(*place)), 0
+    if place is None:  # over HTTP layers may come before it is known
+        note("written without its name and place, which have not come")
+        return {}, 0
+    if (data := kept.read(*place)) is not None:
+        return read_metadata(data, ByteRange(*place)), 0
     try:
-        data = sync.fetch_range(stream.url, *place, token=token)
-    except NotFoundError:
-        raise
+        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else requests.TIMEOUT)
     except LodestreamError as error:
+        if isinstance(error, NotFoundError) and not hurried:
+            raise
         note(f"written without its name and place, which could not be fetched: {error}")
         return {}, 0
-    if part is not None:
-        for offset, length in list(part.ranges.missing(*place)):
-            part.write(offset, data[offset - place[0] : offset - place[0] + length])
+    kept.write(place[0], data)
     return read_metadata(data, ByteRange(*place)), len(data)

@@ -19,7 +19,7 @@ from .arguments import (
     token_of,
 )
 from .inputs import input_files
-from .output import human_size, note_details, print_json, progress_bar
+from .output import human_size, note_details, print_json, progress_bar, say
 
 if TYPE_CHECKING:
     from ..bodies import Source
@@ -34,7 +34,9 @@ def register(subparsers: Subparsers) -> None:
         "push",
         run,
         "upload a file, or several of one surface, to a server",
-        "Waits until the surface is ready; the last line of standard output is its address.",
+        "Waits until the surface is ready; the last line of standard output is its address.\n"
+        "A container (.lode) is sent and kept as it is; of the surface options only --name goes with it.\n"
+        "A surface that waits, or whose container is missing, is an error; the server keeps it for retry.",
     )
     parser.add_argument("files", nargs="+", metavar="FILE", help="what to upload; - for standard input")
     parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")
@@ -80,5 +82,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**surface.details, "url": surface.url})
     else:
-        print(surface.url)
+        say(surface.url)
     return 0

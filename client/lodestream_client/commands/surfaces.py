@@ -13,7 +13,7 @@ from .arguments import (
     parse_surface,
     token_of,
 )
-from .output import console, human_size, note, print_json
+from .output import cell, console, human_size, note, print_json
 
 __all__ = ["register", "run_list", "run_rm"]
 
@@ -31,7 +31,7 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Ask, print one line for each."""
+    """Ask, print one line for each: address, state, shape, bytes, name, owner, and why it is not ready."""
     from .. import sync
 
     surfaces = sync.list_surfaces(args.url, token=token_of(args))
@@ -45,8 +45,11 @@ def run_list(args: argparse.Namespace) -> int:
     for surface in surfaces:
         details = surface.details
         shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
-        size = human_size(details["bytes"]) if isinstance(details.get("bytes"), int) else "-"
-        table.add_row(surface.url, surface.state, shape, size, str(details.get("name") or ""))
+        size = human_size(details["bytes"]) if details.get("bytes") is not None else "-"
+        names = [name for name in details.get("filenames") or () if name]
+        name = details.get("name") or ", ".join(names)
+        words = (surface.url, surface.state, shape, size, name, details.get("owner") or "", details.get("reason") or "")
+        table.add_row(*map(cell, words))
     if surfaces:
         console().print(table)
     else:

@@ -13,11 +13,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 
 import httpx
 
 from lodestream.errors import LodestreamError
+
+from ..commands.interrupts import raising
 
 __all__ = ["own_server"]
 
@@ -37,7 +38,7 @@ def own_server() -> Iterator[str]:
     LodestreamError
         When it does not start; with the last lines that it said.
     """
-    with tempfile.TemporaryDirectory(prefix="lodestream-demo-", ignore_cleanup_errors=True) as folder, _terminable():
+    with tempfile.TemporaryDirectory(prefix="lodestream-demo-", ignore_cleanup_errors=True) as folder, raising():
         log = Path(folder) / "server.log"
         port = _free_port()
         command = [sys.executable, "-m", "lodestream_client", "serve"]
@@ -84,20 +85,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         # Its workers too: they are in its session, which is its own.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    # SIGTERM ends Python without unwinding; as an exception it lets the server be ended first.
-    def leave(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    try:
-        previous = signal.signal(signal.SIGTERM, leave)
-    except ValueError:  # not in the main thread, where signals never arrive anyway
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

@@ -13,7 +13,7 @@ import lodestream as ls
 from lodestream.errors import LodestreamError
 
 from .. import sync
-from ..commands.output import console, human_size, print_json
+from ..commands.output import cell, console, human_size, print_json
 from . import models, picture
 from .service import own_server
 
@@ -78,7 +78,8 @@ def show(folder: Path, *, as_json: bool = False) -> int:
         runs = [_run(model, url, out) for model in chosen]
     agreed = [_compare(run, out) for run in runs]
     paths = _write(runs, folder)
-    out.print(f"\nWritten: {', '.join(map(str, paths))}")
+    out.print()
+    out.print(cell(f"Written: {', '.join(map(str, paths))}"))
     if as_json:
         print_json({"surfaces": [_summary(run) for run in runs], "files": [str(path) for path in paths]})
     if not all(agreed):

@@ -1,6 +1,6 @@
 """Bytes into frames and back, and the index of a complete container."""
 
-from .frames import Frame, FrameReader
+from .frames import Frame, FrameReader, section_lengths
 from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Segment
 from .reader import describe, index_from, read_index, read_metadata
 
@@ -17,4 +17,5 @@ __all__ = [
     "index_from",
     "read_index",
     "read_metadata",
+    "section_lengths",
 ]

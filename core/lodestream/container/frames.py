@@ -5,14 +5,24 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import BinaryIO
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
+from ..metadata import check_length
 from . import sections
 
-__all__ = ["Frame", "FrameReader", "section_extent", "whole_section"]
+__all__ = ["Frame", "FrameReader", "section_extent", "section_lengths", "whole_section"]
 
 _START = len(sections.MAGIC) + 1
-_KNOWN = {sections.HEADER, sections.LAYER, sections.EXACTNESS, sections.METADATA, sections.INDEX, sections.MASKS}
+_KNOWN = {
+    sections.HEADER,
+    sections.LAYER,
+    sections.EXACTNESS,
+    sections.METADATA,
+    sections.INDEX,
+    sections.MASKS,
+    sections.KEPT_MASKS,
+}
 
 
 @dataclass(frozen=True)
@@ -29,7 +39,8 @@ class Frame:
 class FrameReader:
     """Sections in file order.
 
-    Memory grows with what has arrived, never with what a length promises.
+    Memory grows with what has arrived, never with what a length promises. Metadata that are too long are refused as
+    soon as they say so.
     """
 
     def __init__(self) -> None:
@@ -96,6 +107,26 @@ class FrameReader:
         return True
 
 
+def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
+    """The kind of each section of a container in a file, and how many bytes of payload it announces.
+
+    Nothing else is read or checked; it ends where the bytes are no section any more.
+    """
+    place = _START
+    while True:
+        file.seek(place)
+        head = file.read(10)
+        length = 0
+        for number, byte in enumerate(head[1:]):
+            length |= (byte & 127) << 7 * number
+            if byte < 128:
+                break
+        else:
+            return
+        yield head[0], length
+        place += 1 + (number + 1) + length + 4
+
+
 def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | None:
     """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told.
 
@@ -106,6 +137,8 @@ def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | No
         length |= (data[place] & 127) << shift
         shift += 7
         if data[place] < 128:
+            if data[0] == sections.METADATA:
+                check_length(length, offset)
             return place + 1, place + 1 + length + 4
     if len(data) >= 10:
         raise CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", offset)

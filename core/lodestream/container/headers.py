@@ -14,11 +14,13 @@ from ..layout import Layout
 from ..predictors import CURVES, default_predictors, fitted_steps
 from ..quantiser import MOST_BASE, Quantiser
 from .fields import FieldReader, FieldWriter
+from .frames import Frame
 from .model import Header
-from .sections import HEADER, MAGIC, MASKS, VERSION, section
+from .sections import HEADER, KEPT_MASKS, MAGIC, MASKS, VERSION, section
 from .shape import (
     DTYPES,
     LARGEST_SURFACE,
+    Extras,
     parse_arrangement,
     parse_extras,
     serialize_arrangement,
@@ -40,7 +42,7 @@ _QUANTISED = 16
 def serialize_header(header: Header) -> bytes:
     """Magic, version, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
-    extras = serialize_extras(header.attributes, header.plane)
+    extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
     marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
     out.byte(sum(1 << place for place, flag in enumerate((*header.closed, *marks)) if flag))
     out.byte(DTYPES.index(header.dtype))
@@ -71,7 +73,9 @@ def serialize_header(header: Header) -> bytes:
             if axis < CURVES or channel < header.geometric:
                 out.pack("bb", *(int(x) for x in predictors[level, axis]))
     data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
-    return data + section(MASKS, _serialize_masks(header)) if header.masked else data
+    if not header.masked:
+        return data
+    return data + section(KEPT_MASKS if any(header.kept) else MASKS, _serialize_masks(header))
 
 
 def _serialize_masks(header: Header) -> bytes:
@@ -82,21 +86,40 @@ def _serialize_masks(header: Header) -> bytes:
         if holes:
             out.varint(len(data))
             out.data += data
+    for kept, data in zip(header.kept, header.kept_data, strict=True):
+        out.varint(kept)
+        if data:
+            out.varint(len(data))
+            out.data += data
     return bytes(out.data)
 
 
-def parse_masks(header: Header, payload: memoryview, offset: int, length: int) -> Header:
-    """The header with the masks of their section, which stands at ``offset`` and ends at ``length``."""
+def parse_masks(header: Header, frame: Frame) -> Header:
+    """The header with the masks of their section."""
+    payload, offset = frame.payload, frame.payload_offset
     fields = FieldReader(payload, offset)
     (hole,) = fields.unpack("q")
     holes, coded = [], []
     for shape, _ in header.blocks:
         holes.append(fields.varint(shape[0] * shape[1]))
         coded.append(bytes(fields.take(fields.varint(len(payload)))) if holes[-1] else b"")
+    kept, kept_data = [], []
+    for count in holes if frame.kind == KEPT_MASKS else ():
+        kept.append(fields.varint(count))
+        some = 0 < kept[-1] < count
+        kept_data.append(bytes(fields.take(fields.varint(len(payload)))) if some else b"")
     fields.end()
     if header.dtype.kind != "f" and not np.iinfo(header.dtype).min <= hole <= np.iinfo(header.dtype).max:
         raise CorruptStreamError(f"expected holes as a value of {header.dtype}, got {hole}", offset)
-    return replace(header, hole=int(hole), holes=tuple(holes), mask_data=tuple(coded), length=length)
+    return replace(
+        header,
+        hole=int(hole),
+        holes=tuple(holes),
+        mask_data=tuple(coded),
+        kept=tuple(kept),
+        kept_data=tuple(kept_data),
+        length=frame.end,
+    )
 
 
 def parse_header(payload: memoryview, offset: int, length: int) -> Header:
@@ -120,9 +143,10 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     else:
         shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
         blocks = ((shape, (bool(flags & 1), bool(flags & 2))),)
-    attributes, plane = parse_extras(fields.take(fields.varint(len(payload))), offset) if flags & 128 else ((), None)
-    channels = point_channels + sum(kind.channels for kind in attributes)
     points = sum(rows * columns for (rows, columns), _ in blocks)
+    extras = parse_extras(fields.take(fields.varint(len(payload))), offset, points) if flags & 128 else Extras()
+    attributes = extras.attributes
+    channels = point_channels + sum(kind.channels for kind in attributes)
     few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
     if few or points * channels > LARGEST_SURFACE:
         raise CorruptStreamError(
@@ -173,8 +197,9 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
         layer_count=layer_count,
-        plane=plane,
+        plane=extras.plane,
         masked=bool(flags & 32),
         quantiser=quantiser,
+        joint_changes=extras.joint_changes,
         length=length,
     )

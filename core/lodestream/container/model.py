@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrangement import grids_of
+from ..arrangement import grids_of, shared_points
+from ..errors import CorruptStreamError
+from ..joints import Change, Groups, Joints, Runs
 from ..lattice import Lattice
 from ..layout import Layout
 from ..parts import level_shapes
@@ -18,7 +20,20 @@ from ..quantiser import Quantiser
 from ..sides import Arrangement, Part, whole_part
 from ..surface import Closed
 
-__all__ = ["AttributeKind", "ByteRange", "Header", "Index", "LayerRecord", "LevelRecord", "Piece", "Segment"]
+__all__ = [
+    "AttributeKind",
+    "ByteRange",
+    "Header",
+    "Index",
+    "JointChanges",
+    "LayerRecord",
+    "LevelRecord",
+    "Piece",
+    "Segment",
+]
+
+#: To the points at one place, and to those that are one vertex; as `joints.Change.runs` has them.
+JointChanges = tuple[tuple[Runs, Runs], tuple[Runs, Runs]]
 
 
 @dataclass(frozen=True, order=True)
@@ -90,8 +105,15 @@ class Header:
         Points that are not valid.
     mask_data : tuple of bytes, one for each block
         Coded masks; empty where all points are valid.
+    kept : tuple of int, one for each block; empty where there are none
+        Holes whose values come back, with pieces of the exactness section of their own.
+    kept_data : tuple of bytes, one for each block
+        Coded masks of them; empty where they are all or none of the holes.
     quantiser : Quantiser or None
         How the coefficients of coordinates are quantised; None: in whole lattice steps.
+    joint_changes : two of (runs, runs), or None
+        How the points at one place differ from those that are one by the arrangement, and how those that are one vertex
+        differ from these, see `joints.Change`; None: not at all.
     length : int
         Bytes from the start of the container to the end of the header and the masks.
     """
@@ -116,7 +138,10 @@ class Header:
     hole: int = 0
     holes: tuple[int, ...] = ()
     mask_data: tuple[bytes, ...] = ()
+    kept: tuple[int, ...] = ()
+    kept_data: tuple[bytes, ...] = ()
     quantiser: Quantiser | None = None
+    joint_changes: JointChanges | None = None
     length: int = 0
 
     @property
@@ -160,6 +185,18 @@ class Header:
             return Layout(grids_of(self.arrangement), self.tile)
         return Layout.single(*self.blocks[0], self.tile)
 
+    @cached_property
+    def joints(self) -> Joints:
+        """Which points of the blocks are one."""
+        shapes = tuple(shape for shape, _ in self.blocks)
+        places = Groups.none() if self.arrangement is None else shared_points(self.arrangement, shapes)
+        vertices = places
+        if self.joint_changes is not None:
+            to_places, to_vertices = map(Change.of, self.joint_changes)
+            places = places.changed(to_places)
+            vertices = places.changed(to_vertices)
+        return Joints(shapes, places, vertices)
+
     @property
     def levels(self) -> int:
         """Number L of the finest level, the surface itself."""
@@ -167,8 +204,15 @@ class Header:
 
     def level_shape(self, level: int) -> tuple[int, int] | None:
         """Rows and columns of a level of the only block; None where there are several."""
-        shapes = level_shapes(self.parts, self.layout, level, [shape for shape, _ in self.blocks])
-        return shapes[0] if len(shapes) == 1 else None
+        if len(self.blocks) > 1:
+            return None
+        return level_shapes(self.parts, self.layout, level, [self.shape])[0]
+
+    @property
+    def tables(self) -> int:
+        """About how many tiles all channels have, and blocks: told without laying them out."""
+        tiles = sum(max(1, r >> self.tile[0]) * max(1, c >> self.tile[1]) for (r, c), _ in self.blocks)
+        return (16 + len(self.blocks) + 2 * tiles) * self.channels
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
@@ -181,6 +225,31 @@ class Header:
             decode_mask(data, shape, self.length) if data else None
             for data, (shape, _) in zip(self.mask_data, self.blocks, strict=True)
         )
+
+    @cached_property
+    def kept_masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
+        """For each block which holes have values that come back; None: none of them.
+
+        Raises
+        ------
+        CorruptStreamError
+            When these are not so many holes.
+        """
+        if not any(self.kept):
+            return (None,) * len(self.blocks)
+        from ..mask import decode_mask  # only where there is one: it needs the compiler
+
+        found: list[NDArray[np.bool_] | None] = []
+        for mask, count, data, (shape, _) in zip(self.masks, self.kept, self.kept_data, self.blocks, strict=True):
+            if mask is None or not count:
+                found.append(None)
+                continue
+            kept = decode_mask(data, shape, self.length) if data else ~mask
+            holes = np.count_nonzero(kept & ~mask)
+            if not np.count_nonzero(kept) == holes == count:
+                raise CorruptStreamError(f"expected {count} holes that are kept, got {holes}", self.length)
+            found.append(kept)
+        return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -11,22 +11,26 @@ __all__ = ["Window", "windows"]
 
 
 class Window(NamedTuple):
-    """A piece's channel and place: rows and columns, half-open, of a block."""
+    """A piece's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept."""
 
     channel: int
     block: int
     rows: tuple[int, int]
     columns: tuple[int, int]
+    kept: bool = False
 
 
 def windows(header: Header) -> Iterator[Window]:
     """All pieces in the order of the file: block by block, row by row of windows, channel by channel.
 
-    A window has twice the rows and columns of a tile: about the points that a tile of the finest level makes.
+    A window has twice the rows and columns of a tile: about the points that a tile of the finest level makes. A block
+    of which holes are kept has as many pieces again, in the same order, of these.
     """
     height, width = (2 << exponent for exponent in header.tile)
     for block, ((rows, columns), _) in enumerate(header.blocks):
-        for top in range(0, rows, height):
-            for left in range(0, columns, width):
-                for channel in range(header.channels):
-                    yield Window(channel, block, (top, min(top + height, rows)), (left, min(left + width, columns)))
+        for kept in (False, True) if header.kept and header.kept[block] else (False,):
+            for top in range(0, rows, height):
+                for left in range(0, columns, width):
+                    down, across = (top, min(top + height, rows)), (left, min(left + width, columns))
+                    for channel in range(header.channels):
+                        yield Window(channel, block, down, across, kept)

@@ -6,18 +6,22 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from ..capacity import Capacity
 from ..digest import DIGEST
 from ..errors import CorruptStreamError, TruncatedStreamError
 from . import headers, sections
 from .frames import FrameReader, whole_section
 from .model import ByteRange, Header, Index
 
-__all__ = ["describe", "index_from", "read_index", "read_metadata", "with_level_bytes"]
+__all__ = ["INDEX_GROWTH", "describe", "index_from", "read_index", "read_metadata", "with_level_bytes"]
+
+#: How many times its bytes an index takes in memory.
+INDEX_GROWTH = 32
 
 _FIRST_READ = 512
 
 
-def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
+def read_index(read: Callable[[int, int], bytes], size: int, capacity: Capacity | None = None) -> Index:
     """Index of a complete container.
 
     Parameters
@@ -26,39 +30,52 @@ def read_index(read: Callable[[int, int], bytes], size: int) -> Index:
         Fewer bytes only where the container ends.
     size : int
         Bytes of the container.
+    capacity : Capacity or None
+        What the header, the index with all that it lists, and the metadata may take before they are asked for; None for
+        a container of one's own.
 
     Raises
     ------
     CorruptStreamError, UnsupportedVersionError
+    TooLargeError
+        When they take more.
     TruncatedStreamError
         When the container does not end with a footer, but is otherwise one.
     """
-    header = _read_header(read, size)
+    header = _read_header(read, size, capacity)
+    if capacity is not None:
+        capacity.promise(0, (), masked=0, tables=header.tables)
     tail = size - sections.FOOTER_LENGTH
     try:
         place = sections.parse_footer(read(max(tail, 0), sections.FOOTER_LENGTH), tail)
     except CorruptStreamError:
         raise TruncatedStreamError(f"expected a container that ends with a footer, got {size} bytes without") from None
+    if capacity is not None:
+        capacity.take(INDEX_GROWTH * place.length)
     index = index_from(read(place.offset, place.length), place, header)
     if index.size != size:
         raise CorruptStreamError(f"expected a container of {index.size} bytes, got {size}", tail)
     metadata = index.metadata
+    if capacity is not None:
+        capacity.take(metadata.length)
     values = read_metadata(read(metadata.offset, metadata.length), metadata)
     digest = values.pop(DIGEST, None)
     return replace(index, metadata_values=values, digest=digest)
 
 
-def _read_header(read: Callable[[int, int], bytes], size: int) -> Header:
+def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacity | None) -> Header:
     reader, wanted = FrameReader(), _FIRST_READ
     header: Header | None = None
     position = 0
     while position < size:
+        if capacity is not None:
+            capacity.take(min(wanted, size - position))
         chunk = read(position, min(wanted, size - position))
         for frame in reader.feed(chunk):
             if header is None:
                 header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
-            elif frame.kind == sections.MASKS:
-                return headers.parse_masks(header, frame.payload, frame.payload_offset, frame.end)
+            elif frame.kind in (sections.MASKS, sections.KEPT_MASKS):
+                return headers.parse_masks(header, frame)
             else:
                 raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
             if not header.masked:
@@ -113,6 +130,7 @@ def describe(index: Index) -> dict[str, Any]:
         "channels": header.channels,
         "attributes": [kind.name for kind in header.attributes],
         "holes": sum(header.holes),
+        "non_finite": sum(header.kept),
         "dtype": header.dtype.name,
         "extent": header.extent,
         "levels": [

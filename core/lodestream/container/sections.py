@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from ..errors import CorruptStreamError, InputError, UnsupportedVersionError
+from ..errors import CorruptStreamError, UnsupportedVersionError
+from ..metadata import check_length, packed
 from ..predictors import COEFFICIENT_BITS
 from .fields import FieldReader, FieldWriter
 from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Piece, Segment
@@ -20,6 +21,7 @@ __all__ = [
     "FOOTER_LENGTH",
     "HEADER",
     "INDEX",
+    "KEPT_MASKS",
     "LAYER",
     "MAGIC",
     "MASKS",
@@ -43,7 +45,7 @@ __all__ = [
 
 VERSION = 3
 MAGIC = b"\x89LODE\r\n"  # a byte that is no text, the name, a line end that text transfer would damage
-HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS = 1, 2, 3, 4, 5, 6
+HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS = 1, 2, 3, 4, 5, 6, 7
 #: Kinds from here on may be skipped by a reader that does not know them.
 OPTIONAL = 128
 FOOTER_LENGTH = 24
@@ -135,14 +137,12 @@ def _figures(fields: FieldReader) -> tuple[float, float]:
 
 def serialize_metadata(values: dict[str, Any]) -> bytes:
     """A MessagePack map."""
-    try:
-        return bytes(msgpack.packb(values, use_bin_type=True))
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"expected metadata that MessagePack can hold: {error}") from None
+    return packed(values)
 
 
 def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
     """The map of a metadata section."""
+    check_length(len(payload), offset)
     try:
         values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
     except (ValueError, msgpack.UnpackException) as error:
@@ -239,7 +239,9 @@ def parse_index(payload: memoryview, offset: int, index_range: ByteRange, header
     figures = [_figures(fields) for _ in range(header.levels + 1)]
     exactness = fields.varint(_LARGEST_FILE)
     pieces = _parse_places(fields, header, place, exactness) if exactness else ()
+    said = fields.at
     metadata = fields.varint(_LARGEST_FILE)
+    check_length(metadata, said, section=True)
     fields.end()
     filled = place + exactness + metadata == index_range.offset
     if len(layers) != header.layer_count or bool(exactness) != header.corrected or not filled:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 
 from ..arrangement import covers
 from ..errors import CorruptStreamError
+from ..joints import check_runs
 from ..sides import Arrangement, Curve, Part, Side
 from ..surface import Closed
 from .fields import FieldReader, FieldWriter
-from .model import AttributeKind
+from .model import AttributeKind, JointChanges
 
 __all__ = [
     "DTYPES",
     "LARGEST_SURFACE",
     "Blocks",
+    "Extras",
     "parse_arrangement",
     "parse_extras",
     "serialize_arrangement",
@@ -80,9 +82,11 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
         number = fields.varint(4 * LARGEST_SURFACE)
         curves.append(Curve(number >> 2, bool(number & 1), bool(number & 2)))
     parts = [_parse_part(fields, blocks, curves) for _ in range(_count(fields))]
+    own: list[list[Part]] = [[] for _ in blocks]
+    for part in parts:
+        own[part.block].append(part)
     for number, (shape, closed) in enumerate(blocks):
-        own = [part for part in parts if part.block == number]
-        if not covers(shape, closed, own):
+        if not covers(shape, closed, own[number]):
             raise CorruptStreamError(f"expected parts that cover block {number} once, got others", start)
     return tuple(blocks), Arrangement(tuple(parts), tuple(curves))
 
@@ -141,18 +145,30 @@ def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]
     )
 
 
-def serialize_extras(attributes: tuple[AttributeKind, ...], plane: Mapping[str, Any] | None) -> bytes:
+class Extras(NamedTuple):
+    """What few surfaces have, see `Header`."""
+
+    attributes: tuple[AttributeKind, ...] = ()
+    plane: Mapping[str, Any] | None = None
+    joint_changes: JointChanges | None = None
+
+
+def serialize_extras(
+    attributes: tuple[AttributeKind, ...], plane: Mapping[str, Any] | None, changes: JointChanges | None
+) -> bytes:
     """A MessagePack map of what few surfaces have."""
     values: dict[str, Any] = {}
     if attributes:
         values["attributes"] = [[kind.name, DTYPES.index(kind.dtype), kind.components] for kind in attributes]
     if plane is not None:
         values["plane"] = dict(plane)
+    if changes is not None:
+        values["joints"] = changes
     return bytes(msgpack.packb(values)) if values else b""
 
 
-def parse_extras(data: memoryview, offset: int) -> tuple[tuple[AttributeKind, ...], Mapping[str, Any] | None]:
-    """Undo `serialize_extras`."""
+def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
+    """Undo `serialize_extras`, of a surface of so many points."""
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=True)
         kinds = tuple(
@@ -164,6 +180,15 @@ def parse_extras(data: memoryview, offset: int) -> tuple[tuple[AttributeKind, ..
             raise ValueError("another")
         if len({kind.name for kind in kinds}) != len(kinds):
             raise ValueError("two attributes of one name")
+        changes = None
+        if "joints" in values:
+            one, two = (
+                (check_runs(dissolved, 1, points), check_runs(joined, 2, points))
+                for dissolved, joined in values["joints"]
+            )
+            changes = one, two
     except (ValueError, TypeError, IndexError, AttributeError, msgpack.UnpackException) as error:
-        raise CorruptStreamError(f"expected attributes and a plane in MessagePack, got {error}", offset) from None
-    return kinds, plane
+        raise CorruptStreamError(
+            f"expected attributes, a plane and joints in MessagePack, got {error}", offset
+        ) from None
+    return Extras(kinds, plane, changes)

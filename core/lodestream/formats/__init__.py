@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from .. import metadata
 from ..errors import FormatError, InputError, OptionError
 from ..seams import restore
 from ..surface import Closed, Surface
@@ -25,6 +26,7 @@ from . import (
     geotiff,
     glb,
     netcdf,
+    notes,
     npy,
     npz,
     obj,
@@ -42,11 +44,13 @@ from . import (
     vtk_xml,
     vts_writer,
 )
-from .source import DEFAULT_MAX_VERTICES, Source
+from .non_finite import note_infinities
+from .source import DEFAULT_MAX_VERTICES, Source, check_allowed
 
 __all__ = [
     "DEFAULT_MAX_VERTICES",
     "Format",
+    "check_allowed",
     "check_blocks",
     "for_writing",
     "formats",
@@ -81,6 +85,8 @@ class Format:
         Whether several blocks can be written.
     options : mapping of str to str
         Options for reading, each with a line of help.
+    kinds : tuple of str
+        Names of what looks like this format and is read by other rules; each may be allowed or not by itself.
     more : str
         What further files of the same surface are, in words; empty where it takes one file.
     named : callable or None
@@ -88,6 +94,8 @@ class Format:
         tells surfaces apart by their bytes and options counts these as options.
     media_type : str
         For answers over HTTP.
+    process : bool
+        Whether reading starts a process, which is to be allowed and takes memory of its own.
     """
 
     name: str
@@ -97,9 +105,16 @@ class Format:
     write: Callable[[Surface, BinaryIO], None] | None = None
     blocks: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()
     more: str = ""
     named: Callable[[str], Mapping[str, str]] | None = None
     media_type: str = "application/octet-stream"
+    process: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its own name and those of its kinds."""
+        return self.name, *self.kinds
 
 
 _CLOSED: Mapping[str, Closed | None] = {
@@ -122,7 +137,9 @@ _FORMATS = (
         options=geotiff.READ_OPTIONS,
         media_type="image/tiff",
     ),
-    Format("netcdf", (".nc", ".nc4", ".cdf"), netcdf.sniff, netcdf.read, options=netcdf.READ_OPTIONS),
+    Format(
+        "netcdf", (".nc", ".nc4", ".cdf"), netcdf.sniff, netcdf.read, options=netcdf.READ_OPTIONS, kinds=netcdf.KINDS
+    ),
     Format(
         "png",
         (".png",),
@@ -140,10 +157,20 @@ _FORMATS = (
     Format("off", (".off",), off.sniff, off.read),
     Format("obj", (".obj",), obj.sniff, obj.read, obj_writer.write, blocks=True, media_type="model/obj"),
     Format("pcd", (".pcd",), pcd.sniff, pcd.read),
-    Format("vtk", (".vtk",), vtk_legacy.sniff, vtk_legacy.read, options=vtk_legacy.OPTIONS),
-    Format("vts", vtk_xml.SUFFIXES, vtk_xml.sniff, vtk_xml.read, vts_writer.write, True, vtk_xml.OPTIONS, vtk_xml.MORE),
+    Format("vtk", (".vtk",), vtk_legacy.sniff, vtk_legacy.read, options=vtk_legacy.OPTIONS, process=True),
+    Format(
+        "vts",
+        vtk_xml.SUFFIXES,
+        vtk_xml.sniff,
+        vtk_xml.read,
+        vts_writer.write,
+        blocks=True,
+        options=vtk_xml.OPTIONS,
+        more=vtk_xml.MORE,
+        process=True,
+    ),
     Format("glb", (".glb",), glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
-    Format("cgns", (".cgns",), cgns.sniff, cgns.read, options=cgns.OPTIONS),
+    Format("cgns", (".cgns",), cgns.sniff, cgns.read, options=cgns.OPTIONS, process=True),
     Format("bpt", (bezier.SUFFIX,), bezier.sniff, bezier.read, options=bezier.OPTIONS),
     Format("text", text_arrays.SUFFIXES, text_arrays.sniff, text_arrays.read, more=text_arrays.MORE),
     Format("plot3d", plot3d.SUFFIXES, plot3d.sniff, plot3d.read, options=plot3d.READ_OPTIONS, more=plot3d.MORE),
@@ -184,6 +211,7 @@ def read(
     closed: str | Closed = "auto",
     max_vertices: int = DEFAULT_MAX_VERTICES,
     filename: str | None = None,
+    allowed: Collection[str] | None = None,
     **options: Any,
 ) -> Surface:
     """Read a surface from a file, whose content decides about its format.
@@ -202,6 +230,8 @@ def read(
     filename : str, optional
         The name that its owner gave the file, where `path` has another one, as an upload does: it stands in messages
         and in the metadata's ``name``, and its suffix helps where the content is text.
+    allowed : collection of str, optional
+        Names (`Format.names`) of the formats that may be read; all of them unless given.
     **options
         What `Format.options` lists: ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -211,12 +241,16 @@ def read(
         With its own copy of the values, in the file's type (float64 for text). Its metadata are ``name``, ``format``
         and, where the file tells them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a
         number, or the text of one that is not finite), ``unit``, ``scale`` and ``offset`` (of values kept as they are
-        stored), ``scalars`` (single numbers beside the array of an NPZ).
+        stored), ``scalars`` (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that
+        docs/formats.md lists. What the file has and the surface has not is told by a `FormatWarning`; so are the
+        largest entries of metadata beyond `lodestream.metadata.MAX_BYTES`, which are dropped.
 
     Raises
     ------
     FormatError
         When the file is not what it says, is cut short, or holds no structured surface.
+    SwitchedOffError
+        When its format may not be read.
     TooLargeError
         When it promises more vertices than allowed or expands implausibly.
     OptionError
@@ -238,6 +272,7 @@ def read(
         format_ = _sniff(path, name.suffix.lower())
         if format_.read is None:
             raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
+        check_allowed(format_.names, allowed)
         if more and not format_.more:
             raise OptionError(f"expected one file of format {format_.name}, got {1 + len(more)}")
         _check_options(format_, options)
@@ -247,7 +282,11 @@ def read(
         for other in others:
             _check_regular(other)
         size = path.stat().st_size
-        surface = format_.read(Source(path, name.stem, size, max_vertices, options, others, chosen))
+        surface = format_.read(Source(path, name.stem, size, max_vertices, options, others, chosen, allowed))
+        surface.metadata, dropped = metadata.fitted(surface.metadata)
+        if dropped:
+            words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
+            notes.warn(f"metadata may be {metadata.MAX_BYTES:,} bytes long, hence left out: {words}")
         return surface if chosen is None else _closed(surface, chosen)
     except InputError as error:
         raise _named(error, label) from None
@@ -295,7 +334,8 @@ def for_writing(path: str | os.PathLike[str]) -> Format:
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file, whose suffix names the format.
 
-    The file appears whole or not at all: a temporary file beside it takes its name at the end.
+    The file appears whole or not at all: a temporary file beside it takes its name at the end. What the format cannot
+    hold is told by a `FormatWarning`.
 
     Raises
     ------
@@ -348,7 +388,9 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     format_ = written[format_name]
     check_blocks(format_, len(surface.blocks))
     assert format_.write is not None, "it is written"
-    format_.write(restore(surface), file)
+    surface = restore(surface)
+    note_infinities(surface, format_name)
+    format_.write(surface, file)
 
 
 def _sniff(path: Path, suffix: str) -> Format:

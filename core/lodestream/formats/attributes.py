@@ -17,6 +17,8 @@ COLOR, NORMAL, TEXTURE = "color", "normal", "uv"
 _GROUPS = (
     (COLOR, ("red", "green", "blue", "alpha"), "u1"),
     (COLOR, ("red", "green", "blue"), "u1"),
+    (COLOR, ("red", "green", "blue", "alpha"), "f"),
+    (COLOR, ("red", "green", "blue"), "f"),
     (NORMAL, ("nx", "ny", "nz"), "f"),
     (NORMAL, ("normal_x", "normal_y", "normal_z"), "f"),
     (TEXTURE, ("s", "t"), "f"),

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
-from ..errors import FormatError, FormatWarning
+from ..errors import FormatError
 from ..heights import coordinates, to_heights
 from ..surface import Surface
+from .notes import warn
 
-__all__ = ["even_heights", "geotransform", "warn"]
-
-
-def warn(text: str) -> None:
-    """Say what a file leaves out."""
-    warnings.warn(text, FormatWarning, stacklevel=3)
+__all__ = ["even_heights", "geotransform"]
 
 
 def even_heights(surface: Surface, title: str) -> Surface:
@@ -27,6 +22,8 @@ def even_heights(surface: Surface, title: str) -> Surface:
     """
     if surface.points.ndim == 3:
         heights = to_heights(surface)
+        if heights is None and (heights := to_heights(surface, exactly=False)) is not None:
+            warn(f"{title} takes x and y from an even lattice: those of holes that lie elsewhere are left out")
         if heights is None:
             kind = "planar points" if surface.points.shape[2] == 2 else "x, y, z"
             raise FormatError(f"expected heights over an even lattice for {title}, got {kind} that are not")

@@ -5,15 +5,19 @@ from __future__ import annotations
 import shutil
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..heights import coordinates
 from ..surface import Surface
-from . import raster
-from .flat import even_heights, geotransform, warn
+from . import raster, tiff_guard
+from .flat import even_heights, geotransform
+from .notes import listing, metadata_left_out, survives, warn, warn_left_out
+from .raster_tags import describe, missing
 from .source import Source
 
 __all__ = ["READ_OPTIONS", "read", "sniff", "write"]
@@ -22,6 +26,15 @@ READ_OPTIONS = {"band": "number of the band of heights, from 1 (default: 1); the
 
 _MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # both byte orders, classic and BigTIFF
 _TITLE = "GeoTIFF"
+
+#: Metadata that a GeoTIFF holds.
+_HELD = (
+    *("geotransform", "grid", "axes", "crs", "unit", "scale", "offset"),
+    *("area_or_point", "description", "tags", "bands"),
+)
+
+#: How far a coordinate may be from the affine rule that is written, in steps of the grid, before it is worth a note.
+_OFF = 1e-6
 
 #: Sides of the tiles of an image that is at least so large.
 _TILE = 256
@@ -34,11 +47,12 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 def read(source: Source) -> Surface:
     """Read the first band, or the one that the option ``band`` names, as heights and the others as attributes."""
+    tiff_guard.check(source.path)
     return raster.read(source, "GTiff", "geotiff", _TITLE, "data.tif")
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write heights as band 1 and attributes as further bands, with holes, place, CRS, unit and scale.
+    """Write heights as band 1 and attributes as further bands, with holes, place, CRS, unit, scale and tags.
 
     Holes get the value of ``nodata`` in the metadata where their type can hold it and no height has it, else NaN; in
     integers without such a value a mask inside the file says where they are.
@@ -47,10 +61,13 @@ def write(surface: Surface, file: BinaryIO) -> None:
     surface = even_heights(surface, _TITLE)
     if any(surface.closed):
         warn("GeoTIFF cannot say that a surface is closed")
+    warn_left_out(_TITLE, metadata_left_out(surface, _HELD))
     names, bands = _bands(surface)
     nodata = _nodata(surface, bands[0])
     if surface.mask is not None:
-        bands[0] = np.where(surface.mask, bands[0], bands[0].dtype.type(0 if nodata is None else nodata))
+        kept = surface.blocks[0].kept
+        said = surface.mask if kept is None else surface.mask | kept
+        bands[0] = np.where(said, bands[0], bands[0].dtype.type(0 if nodata is None else nodata))
     rows, columns = surface.shape
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -62,6 +79,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
         "compress": "deflate",
         "predictor": 3 if bands[0].dtype.kind == "f" else 2 if bands[0].dtype.itemsize < 8 else 1,  # libtiff before 4.4
         "bigtiff": "if_safer",
+        "photometric": "minisblack",  # or GDAL takes bands of bytes for colours, and the fourth for what is transparent
     }
     if min(rows, columns) >= _TILE:
         profile |= {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE}
@@ -72,13 +90,19 @@ def write(surface: Surface, file: BinaryIO) -> None:
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED="NO"),
             rasterio.open(path, "w", **profile) as dataset,
         ):
-            _describe(dataset, surface, names)
+            crs = _locate(dataset, surface)
+            valid = bands[0] if surface.mask is None else bands[0][surface.mask]
+            describe(dataset, surface.metadata, names, [valid, *bands[1:]])
             for number, band in enumerate(bands, 1):
                 dataset.write(band, number)
             if surface.mask is not None and nodata is None:
                 dataset.write_mask(surface.mask)
+        with rasterio.Env(**raster.ALONE), rasterio.open(path, driver="GTiff") as dataset:
+            lost = missing(dataset, surface.metadata, names)
+            lost += ["all of the CRS"] * (crs is not None and dataset.crs != crs)
         with path.open("rb") as written:
             shutil.copyfileobj(written, file)
+    warn_left_out(_TITLE, lost, "which GDAL does not write")
 
 
 def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
@@ -91,11 +115,7 @@ def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
         bands += [parts[..., part] for part in range(count)]
     common = np.result_type(*bands)
     for name, band in zip(names, bands, strict=True):
-        if (
-            band.dtype.kind in "iu"
-            and common.kind == "f"
-            and not np.array_equal(band.astype(common).astype(band.dtype), band)
-        ):
+        if not survives(band, common):
             warn(f"GeoTIFF has one type for all bands: {name or 'heights'} are rounded to {common}")
     return names, [band.astype(common, copy=False) for band in bands]
 
@@ -115,25 +135,32 @@ def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
     return float("nan") if surface.mask is not None and heights.dtype.kind == "f" else None
 
 
-def _describe(dataset: Any, surface: Surface, names: list[str]) -> None:
+def _locate(dataset: Any, surface: Surface) -> Any:
+    """Write the place and the CRS; give the latter, None where there is none."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
     from rasterio.transform import Affine
 
-    metadata = surface.metadata
     transform = geotransform(surface)
     if transform is not None:
         dataset.transform = Affine.from_gdal(*transform)
-    if metadata.get("crs"):
+        _warn_off(surface, transform)
+    if surface.metadata.get("crs"):
         try:
-            dataset.crs = CRS.from_wkt(str(metadata["crs"]))
+            dataset.crs = CRS.from_wkt(str(surface.metadata["crs"]))
         except CRSError as error:
-            warn(f"the CRS is left out, which GDAL does not know: {error}")
-    for number, name in enumerate(names, 1):
-        if name:
-            dataset.set_band_description(number, name)
-    if metadata.get("unit"):
-        dataset.units = (str(metadata["unit"]), *dataset.units[1:])
-    if "scale" in metadata:
-        dataset.scales = (float(metadata["scale"]), *dataset.scales[1:])
-        dataset.offsets = (float(metadata.get("offset", 0.0)), *dataset.offsets[1:])
+            warn(f"the CRS is left out, which GDAL does not know: {listing([error])}")
+    return dataset.crs
+
+
+def _warn_off(surface: Surface, transform: Sequence[float]) -> None:
+    """Say how far the cells are from where the heights are; those of a level have a note of their own."""
+    metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "nodes")}
+    if "nodes" in surface.metadata or not {"grid", "axes"} & metadata.keys():
+        return
+    exact = coordinates(Surface(surface.points, mask=surface.mask, metadata=metadata))
+    affine = coordinates(Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform}))
+    for name, is_, was, steps in zip("xy", affine, exact, (transform[1:3], transform[4:6]), strict=True):
+        off = float(np.abs(is_ - was).max())
+        if off > _OFF * max(map(abs, steps)):
+            warn(f"GeoTIFF takes rows and columns for evenly spaced: {name} is up to {off:.3g} from what it was")

@@ -9,16 +9,16 @@ from __future__ import annotations
 import json
 import re
 import struct
-import warnings
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, FormatWarning
+from ..errors import FormatError
 from ..surface import Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .mesh_output import Output, check_count, notes, output_of
+from .mesh_output import Output, check_count, output_of, words_of
+from .notes import listing, survives, warn, warn_left_out
 from .source import number
 
 __all__ = ["MEDIA_TYPE", "sniff", "write"]
@@ -64,10 +64,9 @@ def write(surface: Surface, file: BinaryIO) -> None:
     if translation is not None:
         rounded.insert(0, "coordinates")
     if rounded:
-        words = f"GLB is written with float32 in place of {', '.join(rounded)}, which it rounds"
-        warnings.warn(words, FormatWarning, stacklevel=2)
+        warn(f"GLB is written with float32 in place of {listing(rounded)}, which it rounds")
     node = {"mesh": 0} | ({"translation": translation} if translation is not None else {})
-    extras = notes(surface.metadata)
+    extras = words_of("GLB", surface)
     scene = {
         "asset": {"version": "2.0", "generator": "Lodestream"} | ({"extras": extras} if extras else {}),
         "scene": 0,
@@ -136,9 +135,11 @@ def _add_attributes(content: _Content, mesh: Output, attributes: dict[str, int])
             continue
         with np.errstate(over="ignore"):
             floats = values.astype(np.float32)
-        if not np.array_equal(floats.astype(values.dtype), values):
+        if not survives(values, np.float32) or np.isnan(floats).any():
             rounded.append(name)
-        floats = np.nan_to_num(floats)  # no NaN may stand in a file
+        if values.dtype.kind == "f" and np.isinf(values).any():
+            warn_left_out("GLB", [f"the infinities of {name}"], "in whose place it has the largest numbers")
+        floats = np.nan_to_num(floats)  # no NaN or infinity may stand in a file
         if name == NORMAL and width == 3 and (np.abs(np.linalg.norm(floats, axis=1) - 1) < _UNIT).all():
             attributes["NORMAL"] = content.add(floats, _ARRAY)
         elif name == TEXTURE and width == 2:

@@ -18,6 +18,13 @@ __all__ = ["check"]
 
 _MOST_OBJECTS = 2_000
 _HARMLESS_CHUNK = 64 << 20
+
+#: Deflate expands at most so many times.
+_EXPANSION = 1032
+
+#: Chunks of a variable where HDF5 has no way to list them but one by one, each found by counting from the first.
+_MOST_COUNTED = 4_000
+
 _DEFLATE, _SHUFFLE, _FLETCHER = 1, 2, 3
 
 
@@ -83,13 +90,33 @@ def _check_dataset(dataset: Any) -> None:
         _check_chunks(dataset, size + 4)
 
 
+def _large_chunks(dataset: Any) -> list[tuple[int, ...]]:
+    """The offsets of the chunks that could expand to more than is harmless."""
+    found: list[tuple[int, ...]] = []
+
+    def keep(info: Any) -> None:
+        if info.size * _EXPANSION > _HARMLESS_CHUNK:
+            found.append(info.chunk_offset)
+
+    if hasattr(dataset.id, "chunk_iter"):
+        dataset.id.chunk_iter(keep)
+        return found
+    # HDF5 before 1.12.3 counts from the first chunk on to find each one.
+    count = dataset.id.get_num_chunks()
+    if count > _MOST_COUNTED:
+        raise TooLargeError(
+            f"expected at most {number(_MOST_COUNTED)} chunks in a variable, as this version of HDF5 is slow to list "
+            f"them, got {number(count)} in {str(dataset.name)[:60]!r}"
+        )
+    for place in range(count):
+        keep(dataset.id.get_chunk_info(place))
+    return found
+
+
 def _check_chunks(dataset: Any, size: int) -> None:
     """Expand the chunks that could be harmful, and no further than they may."""
-    for place in range(dataset.id.get_num_chunks()):
-        info = dataset.id.get_chunk_info(place)
-        if info.size * 1032 <= _HARMLESS_CHUNK:
-            continue
-        mask, data = dataset.id.read_direct_chunk(info.chunk_offset)
+    for offset in _large_chunks(dataset):
+        mask, data = dataset.id.read_direct_chunk(offset)
         if mask:
             continue  # stored as it is
         expander = zlib.decompressobj()

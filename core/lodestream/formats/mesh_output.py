@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, FormatWarning
+from ..errors import FormatError
 from ..heights import coordinates
 from ..mesh import weld
 from ..surface import Block, Surface
+from .notes import metadata_left_out, warn_left_out
 from .source import number
 
-__all__ = ["Output", "check_count", "exact_float", "notes", "output_of", "warn_left_out", "write_lines"]
+__all__ = ["Output", "check_count", "exact_float", "extra_channels", "output_of", "words_of", "write_lines"]
 
 #: Largest magnitude of integers that each type holds without rounding, in order of preference.
 _EXACT = {"f4": 2**24, "f8": 2**53}
 
 _LINES = 1 << 16
 
-#: With fewer points, the edge that closes a curve would lie on one that is there already.
-_MIN_CLOSED = 3
+#: What a file may say in words, and how long it may be.
+_WORDS = ("name", "unit", "crs")
+_LONGEST_WORDS = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +62,24 @@ def output_of(surface: Surface) -> Output:
     x, y, z = (np.concatenate([place[axis].reshape(-1) for place in places])[welded.source] for axis in range(3))
     attributes: dict[str, NDArray[Any]] = {}
     first = surface.blocks[0]
-    for channel in range(3, first.points.shape[2] if first.points.ndim == 3 else 0):
+    for channel, name in extra_channels(first).items():
         values = [block.points[:, :, channel].reshape(-1) for block in surface.blocks]
-        attributes[f"attribute_{channel - 3}"] = np.concatenate(values)[welded.source]
+        attributes[name] = np.concatenate(values)[welded.source]
     for name, array in first.attributes.items():
         values = [block.attributes[name].reshape(-1, *array.shape[2:]) for block in surface.blocks]
         attributes[name] = np.concatenate(values)[welded.source]
-    edges = _edges(surface.blocks, welded.source)
-    return Output((x, y, z), attributes, welded.quads, welded.triangles, edges, welded.joined)
+    return Output((x, y, z), attributes, welded.quads, welded.triangles, welded.edges, welded.joined)
+
+
+def extra_channels(block: Block) -> dict[int, str]:
+    """The channels of points beyond the third, and what they are called as attributes."""
+    result = {}
+    for channel in range(3, block.points.shape[2] if block.points.ndim == 3 else 0):
+        name = f"attribute_{channel - 3}"
+        while name in block.attributes:
+            name += "_"
+        result[channel] = name
+    return result
 
 
 def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -77,23 +88,6 @@ def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], NDArray[
         return *coordinates(surface), points
     flat = points.shape[2] == 2
     return points[:, :, 0], points[:, :, 1], np.zeros(block.shape, points.dtype) if flat else points[:, :, 2]
-
-
-def _edges(blocks: tuple[Block, ...], source: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Edges of the blocks that are curves, over the vertices, whose points are `source`."""
-    result = [np.empty((0, 2), np.int64)]
-    start = 0
-    for block in blocks:
-        count = block.shape[0] * block.shape[1]
-        if 1 in block.shape:
-            wraps = block.closed[0 if block.shape[1] == 1 else 1] and count >= _MIN_CLOSED
-            one = np.arange(count if wraps else count - 1)
-            ends = np.stack((one, (one + 1) % count), axis=-1)
-            if block.mask is not None:
-                ends = ends[block.mask.reshape(-1)[ends].all(axis=1)]
-            result.append(np.searchsorted(source, ends + start))
-        start += count
-    return np.concatenate(result)
 
 
 def exact_float(values: NDArray[Any], name: str, kind: str) -> NDArray[Any]:
@@ -113,17 +107,22 @@ def exact_float(values: NDArray[Any], name: str, kind: str) -> NDArray[Any]:
     raise FormatError(f"expected integers that a double of {kind} holds (up to 2^53), got {name} from {low} to {high}")
 
 
-def warn_left_out(kind: str, names: Iterable[str], why: str = "for which it has no place") -> None:
-    """Warn of attributes that a file does not have."""
-    listed = ", ".join(names)
-    if listed:
-        warnings.warn(f"{kind} is written without {listed}, {why}", FormatWarning, stacklevel=3)
+def words_of(kind: str, surface: Surface) -> dict[str, str]:
+    """What a file says of a surface in words: name, unit and CRS, each on one line; the rest is left out, with a note.
 
-
-def notes(metadata: Mapping[str, Any]) -> dict[str, str]:
-    """What a file may say about a surface in words: name, unit and CRS, each on one line."""
-    found = {key: metadata[key] for key in ("name", "unit", "crs") if isinstance(metadata.get(key), str)}
-    return {key: " ".join(value.split())[: 1 << 14] for key, value in found.items() if value.strip()}
+    Parameters
+    ----------
+    kind : str
+        What people call the format.
+    surface : Surface
+    """
+    held = {key: surface.metadata[key] for key in _WORDS if isinstance(surface.metadata.get(key), str)}
+    words = {key: " ".join(text.split()) for key, text in held.items() if text.strip()}
+    long = [key for key, text in words.items() if len(text) > _LONGEST_WORDS]
+    warn_left_out(kind, long, f"which is longer than {number(_LONGEST_WORDS)} characters")
+    places = ("geotransform", "grid", "axes")  # the points of a mesh have places of their own
+    warn_left_out(kind, metadata_left_out(surface, (*held, *places, "faces")))
+    return {key: text for key, text in words.items() if key not in long}
 
 
 def check_count(count: int, most: int, kind: str) -> None:

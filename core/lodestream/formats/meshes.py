@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from ..errors import TooLargeError
 from ..mesh import Mesh
 from ..seams import merge
 from ..surface import Surface
+from .notes import warn
 from .source import Source, number
 
 __all__ = ["MOST_FACES", "check_faces", "pad", "surface_of"]
@@ -29,8 +32,16 @@ def check_faces(source: Source, count: int) -> None:
         raise TooLargeError(f"expected at most {number(most)} faces, got {number(count)} or more")
 
 
-def surface_of(source: Source, mesh: Mesh, format_name: str) -> Surface:
-    """Recognise the grids of a mesh, merge what repeats, and say so in the metadata.
+def surface_of(source: Source, mesh: Mesh, format_name: str, words: Mapping[str, str] | None = None) -> Surface:
+    """Recognise the grids of a mesh, merge what repeats, and say so in the metadata; what is left out is a note too.
+
+    Parameters
+    ----------
+    source : Source
+    mesh : Mesh
+    format_name : str
+    words : mapping of str to str, optional
+        What the file says of the surface, as the metadata have it.
 
     Raises
     ------
@@ -40,9 +51,11 @@ def surface_of(source: Source, mesh: Mesh, format_name: str) -> Surface:
     from ..mesh.recognise import recognise  # with compiled loops, which nobody needs before
 
     recognised = recognise(mesh)
+    for text in recognised.left_out:
+        warn(text)
     vertices = sum(block.vertices.size for block in recognised.blocks)
     source.check_vertices(vertices, f"grids of {number(vertices)} nodes")
-    surface = recognised.surface(source.metadata(format_name))
+    surface = recognised.surface(source.metadata(format_name) | dict(words or {}))
     merged = merge(surface, source.closed)
     merged.metadata["recognised"] = recognised.words(merged)
     return merged

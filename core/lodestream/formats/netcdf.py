@@ -11,15 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, OptionError, TooLargeError
+from ..errors import FormatError, InputError, OptionError, TooLargeError, UnavailableError
 from ..seams import merge
 from ..surface import Closed, Surface
 from . import hdf5_guard, vmec
-from .netcdf_choice import Choice, choose
+from .netcdf_choice import Choice, choose, others
+from .notes import listing, warn
 from .placed import Coordinate, place
-from .source import Source
+from .source import Source, check_allowed
 
-__all__ = ["READ_OPTIONS", "read", "sniff"]
+__all__ = ["KINDS", "READ_OPTIONS", "read", "sniff"]
+
+#: What is read by other rules than a NetCDF of heights.
+KINDS = ("vmec",)
 
 READ_OPTIONS = {
     "variable": "name of the variable whose values are the heights (default: the only one there is)",
@@ -30,6 +34,12 @@ READ_OPTIONS = {
     "attributes": "names of variables of the same shape that become attributes, with commas between",
     "resolution": "of a VMEC file: points the short and the long way around, such as 64x256",
 }
+
+#: Attributes that say how values are stored, or which variables belong to them.
+_READ = (
+    *("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned"),
+    *("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms"),
+)
 
 _CLASSIC = (b"CDF\x01", b"CDF\x02")
 _CDF5 = b"CDF\x05"
@@ -45,13 +55,19 @@ def read(source: Source) -> Surface:
     """Read one variable, its coordinates, and those that options make attributes."""
     with _opened(source) as dataset:
         if vmec.is_vmec(dataset) and not {"variable", "x", "y"} & set(source.options):
+            check_allowed(("vmec",), source.allowed)
             return vmec.read(source, dataset)
+        check_allowed(("netcdf",), source.allowed)
         if "resolution" in source.options:
             raise OptionError("expected resolution= for a VMEC file only, got another NetCDF")
         choice = choose(source, dataset)
         source.check_array(choice.shape, np.dtype(np.float64))
         source.check_expansion(choice.nbytes)
-        return _surface(source, dataset, choice)
+        left_out = others(dataset, choice)
+        surface = _surface(source, dataset, choice)
+    if left_out:  # said here, for the libraries' own warnings are not shown while the file is open
+        warn(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
+    return surface
 
 
 @contextmanager
@@ -66,7 +82,7 @@ def _opened(source: Source) -> Iterator[Any]:
         import scipy  # noqa: F401
         import xarray
     except ImportError:
-        raise FormatError(
+        raise UnavailableError(
             "expected xarray, h5netcdf, h5py and scipy for NetCDF, which are not all installed: install "
             "lodestream[formats]"
         ) from None
@@ -92,7 +108,7 @@ def _opened(source: Source) -> Iterator[Any]:
 
 
 def _surface(source: Source, dataset: Any, choice: Choice) -> Surface:
-    metadata = source.metadata("netcdf")
+    metadata = source.metadata("netcdf") | _tags(dataset, choice)
     mask = np.ones(choice.shape, np.bool_)
     axes: list[Coordinate | None] = []
     for found in (choice.x, choice.y):
@@ -133,6 +149,8 @@ def _values(variable: Any, index: Mapping[str, int]) -> tuple[NDArray[Any], NDAr
         for missing in np.atleast_1d(variable.attrs.get(key, [])):
             if isinstance(missing, np.number | int | float):
                 valid &= raw != missing
+                if np.isinf(missing) and raw.dtype.kind == "f":
+                    raw = np.where(valid, raw, raw.dtype.type(np.nan))
     scale, offset = (variable.attrs.get(key) for key in ("scale_factor", "add_offset"))
     if scale is None and offset is None:
         return raw, valid
@@ -151,6 +169,23 @@ def _metadata(dataset: Any, variable: Any) -> dict[str, Any]:
     if isinstance(crs, str) and crs.strip():
         metadata["crs"] = crs
     return metadata
+
+
+def _tags(dataset: Any, choice: Choice) -> dict[str, Any]:
+    """What the file says of itself and of the variables that are read, under the names that GDAL has for it."""
+    tags: dict[str, str] = {}
+    names = [*([choice.heights] if choice.heights else []), *choice.attributes]
+    said = {"NC_GLOBAL": dataset.attrs, **{name: dataset.variables[name].attrs for name in names}}
+    for name, attributes in said.items():
+        for key, value in attributes.items():
+            if key in _READ or (key == "units" and name == choice.heights):
+                continue
+            if isinstance(value, np.ndarray):
+                text = "{" + ",".join(map(str, value.ravel().tolist())) + "}" if value.size != 1 else str(value.item())
+            else:
+                text = str(value)
+            tags[f"{name}#{key}"] = text
+    return {"tags": {"": tags}} if tags else {}
 
 
 def _closed_fields(source: Source, dataset: Any, choice: Choice, surface: Surface) -> Surface:

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import FormatError, OptionError
 from .source import Source
 
-__all__ = ["Choice", "Found", "choose"]
+__all__ = ["Choice", "Found", "choose", "others"]
 
 _REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
 _EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
@@ -100,6 +100,22 @@ def choose(source: Source, dataset: Any) -> Choice:
     return Choice(None if planar else main, dims, shape, index, x, y, tuple(attributes), nbytes)
 
 
+def others(dataset: Any, choice: Choice) -> list[str]:
+    """Variables over the same two dimensions that are not taken, nor belong to those that are."""
+    variables = dataset.variables
+    taken = {choice.heights, *choice.attributes, *(found.name for found in (choice.x, choice.y) if found)}
+    for variable in variables.values():
+        taken |= _referred(variable)
+    return [
+        str(name)
+        for name, variable in variables.items()
+        if str(name) not in taken
+        and _numeric(variable)
+        and set(choice.dims) <= set(map(str, variable.dims))
+        and _letter(str(name), variable.attrs) is None
+    ]
+
+
 def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
     name = str(source.options[key])
     if name not in variables or not _numeric(variables[name]):
@@ -121,8 +137,7 @@ def _only(dataset: Any, coordinates: set[str]) -> str:
     variables = dataset.variables
     beside = {str(name) for name in dataset.sizes} | coordinates
     for variable in variables.values():
-        for key in _REFERENCES:
-            beside |= set(str(variable.attrs.get(key, "")).split())
+        beside |= _referred(variable)
     wide = [
         str(name)
         for name, variable in variables.items()
@@ -135,6 +150,11 @@ def _only(dataset: Any, coordinates: set[str]) -> str:
         raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
     listing = _listing({name: variables[name] for name in chosen or wide})
     raise FormatError(f"expected one variable over a surface, got {listing}: choose with variable=")
+
+
+def _referred(variable: Any) -> set[str]:
+    """Names of variables that belong to one."""
+    return {name for key in _REFERENCES for name in str(variable.attrs.get(key, "")).split()}
 
 
 def _letter(name: str, attributes: Mapping[str, Any]) -> str | None:

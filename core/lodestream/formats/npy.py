@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..surface import Surface
+from .notes import metadata_left_out, warn, warn_left_out
 from .source import Source, number
 
 __all__ = ["MAGIC", "Header", "read", "read_header", "read_values", "sniff", "write"]
@@ -103,12 +104,30 @@ def read(source: Source) -> Surface:
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write the points as they are.
+    """Write the points as they are; holes of floating-point numbers are NaN.
 
     `numpy.save` is not used because it asks a real file for its position, which a pipe has not.
     """
-    points = surface.points
+    closure = ["closure"] * any(surface.closed)
+    warn_left_out("NPY", [*surface.attributes, *closure, *metadata_left_out(surface, ())])
+    points = _with_holes(surface)
     npy_format.write_array_header_1_0(file, npy_format.header_data_from_array_1_0(points))
     values = points.reshape(-1).view(np.uint8).data
     for start in range(0, len(values), _CHUNK):
         file.write(values[start : start + _CHUNK])
+
+
+def _with_holes(surface: Surface) -> NDArray[Any]:
+    points, mask = surface.points, surface.mask
+    if mask is None:
+        return points
+    if points.dtype.kind != "f":
+        warn(f"NPY has whole numbers at all points, also at the {number(surface.blocks[0].holes)} that are holes")
+        return points
+    coordinates = points if points.ndim == 2 else points[..., :3]
+    known = np.isfinite(coordinates) if points.ndim == 2 else np.isfinite(coordinates).all(axis=2)
+    if not (known & ~mask).any():
+        return points
+    points = points.copy()
+    (points if points.ndim == 2 else points[..., :3])[~mask] = np.nan
+    return points

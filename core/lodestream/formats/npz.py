@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
+from .notes import listing, warn
 from .npy import Header, read_header, read_values
 from .placed import Coordinate, place
 from .source import Source, number, refuse_array
@@ -57,8 +58,14 @@ def read(source: Source) -> Surface:
         axes = [contents.coordinate(letter, header.shape[:2], name) for letter in "xy"]
         values = contents.values(name)
         metadata = source.metadata("npz")
-        if contents.scalars():
-            metadata["scalars"] = contents.scalars()
+        scalars = contents.scalars()
+        if scalars:
+            metadata["scalars"] = scalars
+        taken = {name, *scalars}
+        if axes[0] is not None and axes[1] is not None:
+            taken |= {str(contents.coordinate_name(letter, header.shape[:2], name)) for letter in "xy"}
+        if left_out := [other for other in contents.headers if other not in taken]:
+            warn(f"left out arrays of the archive: {listing(left_out)}")
     if axes[0] is not None and axes[1] is not None:
         if values.ndim != 2:
             raise FormatError(f"expected heights of shape (H, W) for coordinates beside them, got shape {values.shape}")
@@ -96,8 +103,16 @@ class _Contents:
         return values
 
     def coordinate(self, letter: str, shape: tuple[int, ...], heights: str) -> Coordinate | None:
-        """The array of x or y: the one that the option names, or one of a usual name and a fitting shape."""
-        shapes = {shape: None, (shape[1 - "xy".index(letter)],): 1 - "xy".index(letter)}
+        """The array of x or y; None where there is none."""
+        name = self.coordinate_name(letter, shape, heights)
+        if name is None:
+            return None
+        degrees = letter == "x" and name.lower() in _DEGREES
+        return Coordinate(self.values(name), _along(letter, shape)[self.headers[name].shape], degrees)
+
+    def coordinate_name(self, letter: str, shape: tuple[int, ...], heights: str) -> str | None:
+        """The name of that array: the one that the option names, or a usual one with a fitting shape."""
+        shapes = _along(letter, shape)
         if letter in self.source.options:
             name = str(self.source.options[letter])
             if name not in self.headers:
@@ -116,8 +131,7 @@ class _Contents:
             name = next(fitting, heights)
             if name == heights:
                 return None
-        degrees = letter == "x" and name.lower() in _DEGREES
-        return Coordinate(self.values(name), shapes[self.headers[name].shape], degrees)
+        return name
 
     def scalars(self) -> dict[str, Any]:
         """The single numbers."""
@@ -126,6 +140,12 @@ class _Contents:
             for name, header in self.headers.items()
             if header.dtype.kind in "iuf" and header.dtype.itemsize <= 8 and set(header.shape) <= {1}
         }
+
+
+def _along(letter: str, shape: tuple[int, ...]) -> dict[tuple[int, ...], int | None]:
+    """The shapes that x or y may have, and the axis that each runs along: None for both."""
+    axis = 1 - "xy".index(letter)
+    return {shape: None, (shape[axis],): axis}
 
 
 @contextmanager

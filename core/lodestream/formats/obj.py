@@ -8,6 +8,7 @@ from ..errors import FormatError
 from ..surface import Surface
 from .connectivity import find_curve
 from .meshes import surface_of
+from .notes import warn
 from .obj_mesh import IGNORED, READ, ObjFile
 from .source import Source, number
 
@@ -34,10 +35,13 @@ def read(source: Source) -> Surface:
     """
     file = ObjFile(source)
     if file.face_count:
-        return surface_of(source, file.mesh(), "obj")
+        return surface_of(source, file.mesh(), "obj", file.words)
     points, attributes = file.points()
     if not file.segments:
         raise FormatError(f"expected faces that join points to a grid, got {number(len(points))} points and no face")
     closed = find_curve(len(points), np.array(file.segments, np.int64), file.segment_lines)
+    for text in file.notes():
+        warn(text)
     columns_of = {name: values[:, None] for name, values in attributes.items()}
-    return Surface(points[:, None], (closed, False), attributes=columns_of, metadata=source.metadata("obj"))
+    metadata = source.metadata("obj") | file.words
+    return Surface(points[:, None], (closed, False), attributes=columns_of, metadata=metadata)

@@ -19,6 +19,7 @@ from ..errors import FormatError, TooLargeError
 from ..mesh import CornerAttribute, Mesh
 from .attributes import COLOR, NORMAL, TEXTURE
 from .meshes import check_faces
+from .notes import keep_words
 from .source import Source, number
 
 __all__ = ["IGNORED", "READ", "ObjFile"]
@@ -26,6 +27,18 @@ __all__ = ["IGNORED", "READ", "ObjFile"]
 #: Statements that say nothing about which points there are and how they are joined.
 IGNORED = frozenset(b"g o s mg usemtl mtllib usemap maplib shadow_obj trace_obj bevel c_interp d_interp lod".split())
 READ = frozenset((b"v", b"vt", b"vn", b"f", b"l"))
+
+#: Of these, what a user would miss, in words, and from how many different ones on: a single name parts nothing.
+_LEFT_OUT = (
+    ((b"g", b"o"), "groups and objects", 2),
+    ((b"s",), "smoothing groups", 2),
+    ((b"usemtl", b"usemap"), "materials", 1),
+    ((b"mg", b"shadow_obj", b"trace_obj", b"bevel", b"c_interp", b"d_interp", b"lod"), "rendering attributes", 1),
+)
+_NOTHING = frozenset((b"", b"off", b"none", b"0", b"default"))
+
+#: How many names of a kind are kept to be counted.
+_ENOUGH = 4
 
 _BLOCK = 1 << 20
 
@@ -59,6 +72,8 @@ class ObjFile:
         self._corners: list[list[NDArray[np.int32] | None]] = [[], [], []]  # of points, textures, normals
         self._faces: list[int] = []  # faces of each run
         self._face_starts: list[tuple[int, int]] = []  # number of the first face of a run and of its line
+        self._others: dict[bytes, set[bytes]] = {}  # what other statements say, a few of each kind
+        self.words: dict[str, str] = {}  # what comments say, as the writer puts it
         for line, run in _runs(source.path):
             self._add(line, run)
 
@@ -111,7 +126,13 @@ class ObjFile:
 
     def _add_line(self, line: int, text: bytes) -> None:
         words = text.split(b"#", 1)[0].split()
-        if not words or words[0] in IGNORED:
+        if not words:
+            self._keep_comment(text)
+            return
+        if words[0] in IGNORED:
+            said = self._others.setdefault(words[0], set())
+            if len(said) < _ENOUGH:
+                said.add(b" ".join(words[1:]).lower())
             return
         if words[0] not in READ:
             raise FormatError(f"line {line}: expected an OBJ statement of points and faces (v, f), got {_shown(text)}")
@@ -179,6 +200,25 @@ class ObjFile:
         if len(self.segments) > self.source.max_vertices:
             raise TooLargeError(f"expected at most {number(self.source.max_vertices)} segments, got more")
 
+    def _keep_comment(self, text: bytes) -> None:
+        key, _, rest = text.strip().removeprefix(b"# ").partition(b" ")
+        if not self._counts[b"v"] and text.startswith(b"# "):
+            keep_words(self.words, key.decode("utf-8", "replace"), rest.decode("utf-8", "replace"))
+
+    def notes(self) -> tuple[str, ...]:
+        """What the file says that a surface does not have, in words."""
+        found = []
+        for kinds, what, least in _LEFT_OUT:
+            said = set().union(*(self._others.get(kind, set()) for kind in kinds))
+            if len(said - _NOTHING) >= least:
+                found.append(f"{what} ({', '.join(kind.decode() for kind in kinds if kind in self._others)}) left out")
+        if self.face_count and self.segments:
+            found.append("lines (l) beside faces left out")
+        for place, what in ((1, "places in a texture (vt)"), (2, "normals (vn)")):
+            if self._counts[_KINDS[place]] and all(run is None for run in self._corners[place]):
+                found.append(f"{what} that no face names left out")
+        return tuple(found)
+
     def points(self) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
         """Points, (V, 3), and their attributes."""
         if not self._values[b"v"]:
@@ -205,7 +245,7 @@ class ObjFile:
                     f"{number(self._counts[_KINDS[place]])}, got {number(int(rows[face].max()) + 1)}"
                 )
             of_corners[name] = CornerAttribute(np.concatenate(values), rows)
-        return Mesh(points, corners, attributes, of_corners, self.face_name)
+        return Mesh(points, corners, attributes, of_corners, self.face_name, self.notes())
 
     def _joined(self, place: int) -> NDArray[np.int32]:
         runs = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -9,12 +10,15 @@ from numpy.typing import NDArray
 
 from ..surface import Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .mesh_output import Output, notes, output_of, warn_left_out, write_lines
+from .mesh_output import Output, extra_channels, output_of, words_of, write_lines
+from .notes import warn_left_out
 
 __all__ = ["write"]
 
 _ROWS = 1 << 16
-_CHANNELS = ("attribute_0", "attribute_1", "attribute_2")
+
+#: Numbers that may follow the coordinates of a point.
+_COLUMNS = 3
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
@@ -22,13 +26,14 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
     Colours follow x, y and z (integers of 8 bits from 0 to 1), as do three channels beyond the third; normals and
     places in a texture are named by the corners of faces, so that a point may have several. Other attributes have no
-    place in OBJ. Name, unit and CRS are comments.
+    place in OBJ, nor have normals and places in a texture of a curve. Name, unit and CRS are comments.
     """
     mesh = output_of(surface)
-    colors, used = _colors(mesh)
-    others = {key: mesh.attributes[key] for key in (TEXTURE, NORMAL) if _is_vector(mesh, key)}
+    colors, used = _colors(mesh, list(extra_channels(surface.blocks[0]).values()))
+    cornered = bool(len(mesh.quads) or len(mesh.triangles))
+    others = {key: mesh.attributes[key] for key in (TEXTURE, NORMAL) if cornered and _is_vector(mesh, key)}
     warn_left_out("OBJ", [name for name in mesh.attributes if name not in used | others.keys()])
-    for key, text in notes(surface.metadata).items():
+    for key, text in words_of("OBJ", surface).items():
         file.write(f"# {key} {text}\n".encode())
     places = np.unique(mesh.joined)
     write_lines(file, "v", [column[places] for column in (*mesh.coordinates, *colors)])
@@ -42,7 +47,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     _write_corners(file, mesh.edges, numbers, "", 0, "l")
 
 
-def _colors(mesh: Output) -> tuple[list[NDArray[Any]], set[str]]:
+def _colors(mesh: Output, channels: Sequence[str]) -> tuple[list[NDArray[Any]], set[str]]:
     """Three columns that follow the coordinates, or none, and the names of the attributes that they hold."""
     color = mesh.attributes.get(COLOR)
     if color is not None and color.ndim == 2 and color.shape[1] in (3, 4):
@@ -52,8 +57,8 @@ def _colors(mesh: Output) -> tuple[list[NDArray[Any]], set[str]]:
         if values.dtype == np.uint8:
             values = (values / 255).astype(np.float32)
         return list(values.T), {COLOR}
-    if all(name in mesh.attributes for name in _CHANNELS) and "attribute_3" not in mesh.attributes:
-        return [mesh.attributes[name] for name in _CHANNELS], set(_CHANNELS)
+    if len(channels) == _COLUMNS:
+        return [mesh.attributes[name] for name in channels], set(channels)
     return [], set()
 
 

@@ -17,6 +17,7 @@ from ..errors import FormatError
 from ..seams import merge
 from ..surface import Surface
 from .attributes import COLOR, group
+from .notes import listing, warn
 from .source import Source, number
 
 __all__ = ["read", "sniff"]
@@ -27,6 +28,9 @@ _TYPES = {"I": "i", "U": "u", "F": "f"}
 _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 _PADDING = "_"
 
+#: Where a sensor stands, and how it is turned, unless the header says otherwise.
+_ORIGIN = ("0", "0", "0", "1", "0", "0", "0")
+
 
 @dataclass(frozen=True, slots=True)
 class _Header:
@@ -36,6 +40,7 @@ class _Header:
     data: str
     end: int
     lines: int
+    viewpoint: tuple[str, ...]
 
     @property
     def points(self) -> int:
@@ -60,6 +65,8 @@ def read(source: Source) -> Surface:
             f"expected an organised cloud, whose HEIGHT is 2 or more, got HEIGHT {header.rows}: points without a grid"
         )
     source.check_vertices(header.points, f"a cloud of {header.columns} x {header.rows}")
+    if not _at_origin(header.viewpoint):
+        warn(f"VIEWPOINT {listing([' '.join(header.viewpoint)])} left out")
     columns = _READERS[header.data](source, header)
     shape = (header.rows, header.columns)
     points = np.stack([columns.pop(axis) for axis in "xyz"], axis=-1).reshape(*shape, 3)
@@ -67,6 +74,13 @@ def read(source: Source) -> Surface:
         name: values.reshape(*shape, *values.shape[1:]) for name, values in group(_with_colors(columns)).items()
     }
     return merge(Surface(points, attributes=attributes, metadata=source.metadata("pcd")), source.closed)
+
+
+def _at_origin(viewpoint: tuple[str, ...]) -> bool:
+    try:
+        return tuple(map(float, viewpoint)) == tuple(map(float, _ORIGIN))
+    except ValueError:
+        return False
 
 
 def _read_header(head: bytes) -> _Header:
@@ -92,7 +106,7 @@ def _read_header(head: bytes) -> _Header:
     data = " ".join(entries["DATA"])
     if data not in _READERS:
         raise FormatError(f"expected DATA {', '.join(_READERS)}, got {data[:40]!r}")
-    return _Header(_record(entries), height, width, data, place, line)
+    return _Header(_record(entries), height, width, data, place, line, tuple(entries.get("VIEWPOINT", _ORIGIN)))
 
 
 def _integer(entries: dict[str, list[str]], key: str) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..coordinate_rules import VALUES, evaluate, fit_axis
 from ..errors import FormatError
+from ..metadata import fitted
 from ..seams import merge, unwrap, wrapped
 from ..surface import Closed, Surface
 from .longitudes import TURN, close_around, encircles
@@ -52,7 +53,8 @@ def place(
     """Put heights over their coordinates.
 
     Where both coordinates are vectors and evenly spaced, the result is heights with a ``geotransform``, and with
-    ``axes`` where that alone does not say every coordinate bit for bit; otherwise x, y, z. Longitudes that jump are
+    ``axes`` where that alone does not say every coordinate bit for bit; otherwise, and where these would be too long
+    for metadata, x, y, z. Longitudes that jump are
     unwrapped; an axis that goes once around the Earth is closed.
 
     Parameters
@@ -68,8 +70,10 @@ def place(
     values = dict(metadata or {})
     if x.axis is not None and y.axis == 1 - x.axis:
         even = [_even(coordinate) for coordinate in (x, y)]
-        if even[0] is not None and even[1] is not None:
-            surface = Surface(heights, **extras, metadata=values | _georeference(x, y, even[0], even[1]))
+        rules = _georeference(x, y, even[0], even[1]) if even[0] is not None and even[1] is not None else None
+        # Rules that are too long for metadata are no way to say where each point lies: x and y themselves are.
+        if rules is not None and not any(name == "axes" for name, _ in fitted(values | rules)[1]):
+            surface = Surface(heights, **extras, metadata=values | rules)
             for coordinate, found in zip((x, y), even, strict=True):
                 if coordinate.degrees and coordinate.axis is not None and found is not None:
                     surface = close_around(surface, (coordinate.axis, found.step), closed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatWarning, OptionError
+from ..errors import OptionError
+from .notes import warn
 from .source import Source
 
 __all__ = ["HELP", "Cut", "cuts"]
@@ -74,11 +74,7 @@ def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[Cut], dict[str, A
     if source.options.get("plane") is not None and not volumes and any(dims[axis] > 1 for dims in blocks):
         raise OptionError(f"expected no plane= for a surface, which {_words(blocks[0])} points are already")
     if source.options.get("plane") is None and volumes:
-        warnings.warn(
-            f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose another with plane=, like j3",
-            FormatWarning,
-            stacklevel=2,
-        )
+        warn(f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose another with plane=, like j3")
     result = [_cut(dims, axis, index) for dims in blocks]
     points = sum(cut.shape[0] * cut.shape[1] for cut in result)
     largest = max(result, key=lambda cut: cut.shape[0] * cut.shape[1])

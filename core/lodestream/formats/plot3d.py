@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import seams
-from ..errors import FormatError
+from ..errors import FormatError, OptionError
 from ..surface import Block, Surface
 from . import planes
 from .list_directed import is_text
+from .notes import warn
 from .planes import Cut
 from .plot3d_layouts import OPTIONS, Layout, Numbers, choices_of, find_layout, open_numbers
 from .source import Source
@@ -73,23 +74,27 @@ def read(source: Source) -> Surface:
     for path in source.more:
         fields = _Fields(path, layout, functions)
         functions += fields.functions
+        if fields.metadata and "scalars" in metadata:
+            raise OptionError(f"expected one Q file, got another: {path.name}")
         metadata |= fields.metadata
         for index, cut, values in zip(indices, taken, attributes, strict=True):
             values |= fields.read(index, cut)
-    blanks = [_iblank(numbers, layout, index, cut) for index, cut in zip(indices, taken, strict=True)]
+    places = layout.places_of_blocks()
+    blanks = [_iblank(numbers, layout, places[index], cut) for index, cut in zip(indices, taken, strict=True)]
     if any(blank is not None and not np.isin(blank, (0, 1)).all() for blank in blanks):
         for blank, values in zip(blanks, attributes, strict=True):
             if blank is not None:
                 values["iblank"] = blank
     blocks = [
-        Block(_points(numbers, layout, index, cut), mask=None if blank is None else blank != 0, attributes=values)
+        Block(
+            _points(numbers, layout, places[index], cut), mask=None if blank is None else blank != 0, attributes=values
+        )
         for index, cut, blank, values in zip(indices, taken, blanks, attributes, strict=True)
     ]
     return seams.merge(Surface(blocks=blocks, metadata=metadata), source.closed)
 
 
-def _points(numbers: Numbers, layout: Layout, index: int, cut: Cut) -> NDArray[Any]:
-    place = layout.places()[1 + layout.multi + index][0]
+def _points(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[Any]:
     count = prod(cut.dims)
     channels = [
         cut.of(numbers.array(place + axis * count * layout.item, count, layout, "f"))
@@ -98,10 +103,9 @@ def _points(numbers: Numbers, layout: Layout, index: int, cut: Cut) -> NDArray[A
     return np.stack(channels, axis=-1)
 
 
-def _iblank(numbers: Numbers, layout: Layout, index: int, cut: Cut) -> NDArray[Any] | None:
+def _iblank(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[Any] | None:
     if not layout.iblank:
         return None
-    place = layout.places()[1 + layout.multi + index][0]
     count = prod(cut.dims)
     return cut.of(numbers.array(place + layout.dimensions * count * layout.item, count, layout, "i"))
 
@@ -119,20 +123,23 @@ class _Fields:
         except FormatError as error:
             raise FormatError(f"{path.name}: {error}") from None
         self._first = functions
+        self._places = self._layout.places_of_blocks()
         q = self._layout.kind == "q"
         self.functions = 0 if q else max(self._layout.variables)
         self.metadata = {"scalars": self._references()} if q else {}
 
     def _references(self) -> dict[str, float]:
-        place = self._layout.places()[1 + self._layout.multi][0]
-        values = self._numbers.array(place, len(_REFERENCES), self._layout, "f")
-        return {name: float(value) for name, value in zip(_REFERENCES, values, strict=True)}
+        """Those of the first block, which all blocks should have."""
+        places = self._layout.places()[1 + self._layout.multi :: 2]
+        values = [self._numbers.array(place, len(_REFERENCES), self._layout, "f") for place, _ in places]
+        if any(other.tobytes() != values[0].tobytes() for other in values[1:]):
+            warn("left out the reference numbers of the blocks of a Q file after the first, which are others")
+        return {name: float(value) for name, value in zip(_REFERENCES, values[0], strict=True)}
 
     def read(self, index: int, cut: Cut) -> dict[str, NDArray[Any]]:
         """Read the fields of one block."""
         layout = self._layout
-        per_block = 2 if layout.kind == "q" else 1
-        place = layout.places()[layout.multi + per_block * (index + 1)][0]
+        place = self._places[index]
         count = prod(cut.dims)
         fields = [
             cut.of(self._numbers.array(place + field * count * layout.item, count, layout, "f"))

@@ -132,6 +132,11 @@ class Layout:
             place += length + _MARKER * self.records
         return result
 
+    def places_of_blocks(self) -> list[int]:
+        """Place where the fields of each block begin."""
+        per_block = 2 if self.kind == "q" else 1  # the reference numbers of a Q file are a record of their own
+        return [place for place, _ in self.places()[self.multi + per_block :: per_block]]
+
     def words(self, names: Sequence[str]) -> str:
         """Write the layout as options."""
         values = [

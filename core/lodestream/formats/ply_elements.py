@@ -234,14 +234,14 @@ def _binary_lists(data: NDArray[np.uint8], place: int, element: Element, order: 
     if uniform is not None:
         return uniform
     # One loop over bytes finds where each list lies; the values are then gathered at once.
-    content = data[place:].tobytes()
+    content = data.data  # not a copy of the rest of the file, of which every element would take one
     starts: dict[str, list[int]] = {it.name: [] for it in element.properties}
     counts: dict[str, list[int]] = {it.name: [] for it in element.properties if it.count}
     steps = [
         (it, np.dtype(it.count).itemsize if it.count else 0, np.dtype(it.dtype).itemsize) for it in element.properties
     ]
     endian: Literal["little", "big"] = "little" if order == "<" else "big"
-    at = 0
+    at = place
     for row in range(element.rows):
         for it, head, item in steps:
             count = 1
@@ -254,13 +254,12 @@ def _binary_lists(data: NDArray[np.uint8], place: int, element: Element, order: 
             at += count * item
             if count < 0 or at > len(content):
                 raise _short(element, row, max(at - len(content), 1))
-    raw = np.frombuffer(content, np.uint8)
     table: dict[str, NDArray[Any] | Lists] = {}
     for it, _, item in steps:
         lengths = np.array(counts.get(it.name, [1] * element.rows), np.int64)
-        values = _gather(raw, np.array(starts[it.name], np.int64), lengths, order + it.dtype, item)
+        values = _gather(data, np.array(starts[it.name], np.int64), lengths, order + it.dtype, item)
         table[it.name] = Lists(lengths, values) if it.count else values
-    return table, place + at
+    return table, at
 
 
 def _uniform_lists(data: NDArray[np.uint8], place: int, element: Element, order: str) -> tuple[Table, int] | None:

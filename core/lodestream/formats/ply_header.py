@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +95,7 @@ def read_header(path: Path) -> Header:
     lines = head[: end.end()].decode("latin-1").splitlines()
     order: str | None = None
     elements: list[Element] = []
+    properties: list[dict[str, Property]] = []  # of each element, by their names
     info: list[str] = []
     for place, line in enumerate(lines, 1):
         words = line.split()
@@ -107,25 +108,27 @@ def read_header(path: Path) -> Header:
                 info.append(line.split(None, 1)[1] if len(words) > 1 else "")
             case ["element", name, rows] if rows.isdecimal() and len(rows) < 20:
                 elements.append(Element(name, int(rows), ()))
+                properties.append({})
             case ["property", "list", count, dtype, name] if {count, dtype} <= _TYPES.keys() and elements:
                 if _TYPES[count][0] == "f":
                     raise FormatError(f"line {place}: expected a list whose length is an integer, got {line.strip()!r}")
-                elements[-1] = _with(elements[-1], Property(name, _TYPES[dtype], _TYPES[count]), place)
+                _add(properties[-1], Property(name, _TYPES[dtype], _TYPES[count]), place)
             case ["property", dtype, name] if dtype in _TYPES and elements:
-                elements[-1] = _with(elements[-1], Property(name, _TYPES[dtype]), place)
+                _add(properties[-1], Property(name, _TYPES[dtype]), place)
             case _:
                 raise FormatError(f"line {place}: expected a line of a PLY 1.0 header, got {line.strip()[:80]!r}")
     if order is None:
         raise FormatError("expected a PLY header with a line of the format, got none")
-    header = Header(order, tuple(elements), tuple(info), end.end(), len(lines))
+    whole = (replace(it, properties=tuple(of.values())) for it, of in zip(elements, properties, strict=True))
+    header = Header(order, tuple(whole), tuple(info), end.end(), len(lines))
     _check_size(header, path.stat().st_size)
     return header
 
 
-def _with(element: Element, added: Property, line: int) -> Element:
-    if any(it.name == added.name for it in element.properties):
+def _add(properties: dict[str, Property], added: Property, line: int) -> None:
+    if added.name in properties:
         raise FormatError(f"line {line}: expected properties of different names, got {added.name!r} twice")
-    return Element(element.name, element.rows, (*element.properties, added))
+    properties[added.name] = added
 
 
 def _check_size(header: Header, size: int) -> None:

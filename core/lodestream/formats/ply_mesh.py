@@ -13,11 +13,12 @@ from ..surface import Surface
 from .attributes import TEXTURE, group
 from .connectivity import find_curve
 from .meshes import check_faces, surface_of
+from .notes import keep_words, warn
 from .ply_elements import Lists, Table, read_elements
 from .ply_header import Header
 from .source import Source, number
 
-__all__ = ["CURVE", "ELEMENT", "read", "read_curve"]
+__all__ = ["CURVE", "ELEMENT", "lists_left_out", "read", "read_curve", "words_of"]
 
 ELEMENT, CURVE = "face", "edge"
 
@@ -53,7 +54,9 @@ def read(source: Source, header: Header) -> Surface:
     notes = [f"{' and '.join(left_out)} of faces left out"] * bool(left_out)
     others = [key for key in tables if key not in ("vertex", ELEMENT) and rows[key]]
     notes += [f"element {' and '.join(others)} left out"] * bool(others)
-    return surface_of(source, Mesh(points, corners, attributes, of_corners, name.face, tuple(notes)), "ply")
+    notes += lists_left_out(header)
+    mesh = Mesh(points, corners, attributes, of_corners, name.face, tuple(notes))
+    return surface_of(source, mesh, "ply", words_of(header))
 
 
 def read_curve(source: Source, header: Header) -> Surface:
@@ -67,7 +70,32 @@ def read_curve(source: Source, header: Header) -> Surface:
     segments = np.stack([np.asarray(edges[end], np.int64) for end in ("vertex1", "vertex2")], axis=-1)
     closed = find_curve(len(points), segments, range(1, len(segments) + 1), "edge")
     columns = {name: values[:, None] for name, values in attributes.items()}
-    return Surface(points[:, None], (closed, False), attributes=columns, metadata=source.metadata("ply"))
+    left_out = [f"{name} of edges" for name in edges if name not in ("vertex1", "vertex2")]
+    left_out += [f"element {element.name}" for element in header.elements if element.rows]
+    left_out = [name for name in left_out if name not in ("element vertex", f"element {CURVE}")]
+    for text in [*lists_left_out(header), *(f"{name} left out" for name in left_out)]:
+        warn(text)
+    metadata = source.metadata("ply") | words_of(header)
+    return Surface(points[:, None], (closed, False), attributes=columns, metadata=metadata)
+
+
+def words_of(header: Header) -> dict[str, str]:
+    """What comments say of unit and CRS."""
+    words: dict[str, str] = {}
+    for line in header.info:
+        keep_words(words, *line.partition(" ")[::2])
+    return words
+
+
+def lists_left_out(header: Header) -> list[str]:
+    """What vertices have that is no number, in words."""
+    return [
+        f"list {it.name} of vertices left out"
+        for element in header.elements
+        if element.name == "vertex"
+        for it in element.properties
+        if it.count
+    ]
 
 
 class _Names:

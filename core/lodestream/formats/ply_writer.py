@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..surface import Surface
-from .attributes import split
-from .mesh_output import check_count, exact_float, notes, output_of, warn_left_out, write_lines
+from .attributes import group, split
+from .mesh_output import check_count, exact_float, output_of, words_of, write_lines
+from .notes import listing, survives, warn, warn_left_out
 
 __all__ = ["write"]
 
@@ -46,7 +47,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     faces = len(mesh.quads) + len(mesh.triangles)
     text = bool(len(mesh.quads) and len(mesh.triangles))
     lines = ["ply", f"format {'ascii' if text else 'binary_little_endian'} 1.0"]
-    lines += [f"comment {key} {_ascii(text, ' -~')}" for key, text in notes(surface.metadata).items()]
+    lines += [f"comment {key} {text}" for key, text in _words(surface).items()]
     lines += [f"element vertex {count}"]
     lines += [f"property {_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()]
     if faces or not len(mesh.edges):
@@ -72,16 +73,33 @@ def _columns(attributes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     rounded = []
     for name, column in split(attributes).items():
         if column.dtype.str[1:] not in _TYPES:
-            doubles = column.astype(np.float64)
-            if not np.array_equal(doubles.astype(column.dtype), column):
+            if not survives(column, np.float64):
                 rounded.append(name)
-            column = doubles
+            column = column.astype(np.float64)
         label = _ascii(name, "!-~")
         while label in result or label in ("x", "y", "z"):
             label += "_"
         result[label] = column
     warn_left_out("PLY", [f"the last bits of {name}" for name in rounded], "whose integers it rounds to doubles")
+    back = group(result)
+    renamed = [name for name, column in attributes.items() if not _same_shape(column, back.get(name))]
+    if renamed:
+        warn(f"PLY is written with {listing(renamed)} under other names: it is read back as {listing(back)}")
     return result
+
+
+def _same_shape(column: NDArray[Any], back: NDArray[Any] | None) -> bool:
+    """Whether an attribute comes back as it is, or without its one component."""
+    return back is not None and back.reshape(len(back), -1).shape == column.reshape(len(column), -1).shape
+
+
+def _words(surface: Surface) -> dict[str, str]:
+    """Name, unit and CRS in the characters that a header may have."""
+    words = words_of("PLY", surface)
+    plain = {key: _ascii(text, " -~") for key, text in words.items()}
+    changed = [key for key, text in words.items() if plain[key] != text]
+    warn_left_out("PLY", [f"some characters of {key}" for key in changed], "which are not ASCII")
+    return plain
 
 
 def _ascii(text: str, allowed: str) -> str:

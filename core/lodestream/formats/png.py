@@ -16,10 +16,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, OptionError
+from ..errors import FormatError, OptionError, UnavailableError
 from ..lattice import Lattice, find_lattice, to_dtype
 from ..surface import Surface
-from .flat import even_heights, warn
+from .flat import even_heights
+from .notes import listing, metadata_left_out, warn
 from .source import Source, number
 
 __all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
@@ -50,6 +51,9 @@ _PIECE = 1 << 20
 #: (origin + step (first + shade)) / scale, in dtype; or with encoding, what its colours stand for.
 _TEXT = "lodestream"
 
+#: Texts that are read, or say nothing but by what the file was written.
+_KNOWN_TEXTS = (_TEXT, "Software")
+
 
 def sniff(head: bytes, suffix: str) -> bool:
     """Whether a file begins like PNG."""
@@ -70,7 +74,7 @@ def require_pillow() -> Any:
     try:
         from PIL import PngImagePlugin
     except ImportError:
-        raise FormatError("expected Pillow for PNG, which is not installed: install lodestream[formats]") from None
+        raise UnavailableError("expected Pillow for PNG, which is not installed: install lodestream[formats]") from None
     return PngImagePlugin
 
 
@@ -88,8 +92,12 @@ def read(source: Source) -> Surface:
             pixels = np.asarray(image)
             text = _text(image.text.get(_TEXT))
             clear = image.info.get("transparency")
+            words = [key for key in image.text if key not in _KNOWN_TEXTS]
     except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
         raise FormatError(f"expected a whole PNG, got one that Pillow cannot read: {error}") from None
+    if words:
+        warn(f"left out texts of the PNG: {listing(words)}")
+    _warn_of_transparency(pixels, kind)
     encoding = _encoding(source, kind, text)
     if encoding == "grey":
         return _grey(source, pixels, depth, clear, text)
@@ -101,6 +109,11 @@ def read(source: Source) -> Surface:
         code = code * 256 + pixels[..., channel]
     heights = (code / 256 - 32768).astype(np.float32) if encoding == "terrarium" else -10000 + 0.1 * code
     return Surface(heights, mask=mask, metadata=source.metadata("png") | {"encoding": encoding})
+
+
+def _warn_of_transparency(pixels: NDArray[Any], kind: int) -> None:
+    if kind in (_GREY_ALPHA, _RGBA) and not np.isin(pixels[..., -1], (0, 255)).all():
+        warn("left out degrees of transparency, of which only 0 makes holes")
 
 
 def _header(source: Source) -> tuple[int, int]:
@@ -209,10 +222,9 @@ def write(surface: Surface, file: BinaryIO) -> None:
     """
     pillow = require_pillow()
     surface = even_heights(surface, "PNG")
-    left_out: list[str] = [key for key in ("geotransform", "grid", "axes", "crs") if key in surface.metadata]
-    left_out += ["closure"] * any(surface.closed) + ["attributes"] * bool(surface.attributes)
+    left_out = [*metadata_left_out(surface, ()), *["closure"] * any(surface.closed), *surface.attributes]
     if left_out:
-        warn(f"PNG holds heights only: {', '.join(left_out)} left out")
+        warn(f"PNG holds heights only: {listing(left_out)} left out")
     shades, rule, clear = _shades(surface)
     info = pillow.PngInfo()
     if rule:

@@ -11,8 +11,10 @@ from ..errors import FormatError
 from ..seams import merge
 from ..surface import Surface
 from .attributes import group
+from .notes import warn
 from .ply_elements import Lists, Table, read_elements
 from .ply_header import Header
+from .ply_mesh import lists_left_out, words_of
 from .source import Source, number
 
 __all__ = ["ELEMENT", "read"]
@@ -44,7 +46,14 @@ def read(source: Source, header: Header) -> Surface:
     grids = {name: _on_grid(column, places, valid, (rows, columns)) for name, column in plain.items()}
     points = np.stack([grids.pop(axis) for axis in "xyz"], axis=-1)
     mask = valid.reshape(rows, columns)
-    surface = Surface(points, mask=mask, attributes=_grouped(grids), metadata=source.metadata("ply"))
+    vertices_left_out = len(np.setdiff1d(np.arange(len(plain["x"])), places[valid]))
+    left_out = [f"{number(vertices_left_out)} vertices without a place"] * (vertices_left_out > 0)
+    known = ("vertex", ELEMENT)
+    left_out += [f"element {element.name}" for element in header.elements if element.rows and element.name not in known]
+    for text in [*lists_left_out(header), *(f"{name} left out" for name in left_out)]:
+        warn(text)
+    metadata = source.metadata("ply") | words_of(header)
+    surface = Surface(points, mask=mask, attributes=_grouped(grids), metadata=metadata)
     return merge(surface, source.closed)
 
 

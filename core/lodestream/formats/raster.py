@@ -19,15 +19,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, TooLargeError
+from ..errors import FormatError, InputError, TooLargeError, UnavailableError
 from ..surface import Surface
 from .longitudes import close_around
+from .notes import listing, warn
+from .raster_tags import read_tags
 from .source import Source, number
 
-__all__ = ["read", "require_rasterio"]
+__all__ = ["ALONE", "read", "require_rasterio"]
 
 #: Nothing is looked for beside the file: no .aux.xml, .ovr, .msk, no world file.
-_ALONE = {
+ALONE = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_GEOREF_SOURCES": "INTERNAL",
@@ -36,13 +38,16 @@ _ALONE = {
 #: A tile is decoded whole, so it may be larger than the surface, but not by any amount.
 _HARMLESS_TILE = 1 << 24
 
+#: Each becomes an attribute, and rasterio and GDAL look through all bands for some of what they say of one.
+_MOST_BANDS = 1 << 12
+
 
 def require_rasterio(format_name: str) -> Any:
     """The module rasterio, imported now."""
     try:
         import rasterio
     except ImportError:
-        raise FormatError(
+        raise UnavailableError(
             f"expected rasterio for {format_name}, which is not installed: install lodestream[formats]"
         ) from None
     return rasterio
@@ -68,9 +73,14 @@ def read(source: Source, driver: str, format_name: str, title: str, file_name: s
         band = _check(source, dataset, title)
         points = dataset.read(band)
         mask = _mask(dataset, band)
-        metadata = source.metadata(format_name) | _metadata(dataset, band)
-        attributes = {name: dataset.read(other) for name, other in _attributes(dataset, band).items()}
+        others = _attributes(dataset, band)
+        metadata = source.metadata(format_name) | _metadata(dataset, band) | read_tags(dataset, band, others)
+        # All at once: rasterio looks at every band of the file whenever it reads.
+        attributes = dict(zip(others, dataset.read([*others.values()]), strict=True)) if others else {}
+        _warn_left_out(dataset)
         geographic = bool(dataset.crs and dataset.crs.is_geographic)
+    if mask is not None and points.dtype.kind == "f":
+        points[np.isinf(points) & ~mask] = np.nan  # nodata that is infinite: no value, as the file says
     surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
     transform = metadata.get("geotransform")
     if geographic and transform and transform[2] == transform[4] == 0:
@@ -87,7 +97,7 @@ def _opened(source: Source, driver: str, title: str, file_name: str, options: di
         path = Path(folder) / file_name
         path.symlink_to(os.path.realpath(source.path))
         try:
-            with rasterio.Env(**_ALONE), rasterio.open(path, driver=driver, **options) as dataset:
+            with rasterio.Env(**ALONE), rasterio.open(path, driver=driver, **options) as dataset:
                 yield dataset
         except InputError:
             raise
@@ -101,6 +111,8 @@ def _check(source: Source, dataset: Any, title: str) -> int:
     """Check by the header alone; return the band to read as heights."""
     if dataset.subdatasets:
         raise FormatError(f"expected a {title} of one image, got {len(dataset.subdatasets)} images")
+    if dataset.count > _MOST_BANDS:
+        raise TooLargeError(f"expected at most {number(_MOST_BANDS)} bands, got {number(dataset.count)}")
     band = (source.integer_option("band", 1, dataset.count) if "band" in source.options else None) or 1
     total = 0
     for kind, (rows, columns) in zip(dataset.dtypes, dataset.block_shapes, strict=True):
@@ -127,13 +139,31 @@ def _mask(dataset: Any, band: int) -> NDArray[np.bool_] | None:
 def _attributes(dataset: Any, heights: int) -> dict[str, int]:
     """Names of the bands beside the heights; one that only says what is transparent is in the mask already."""
     names: dict[str, int] = {}
-    for band in range(1, dataset.count + 1):
-        masking = dataset.colorinterp[band - 1].name == "alpha" and dataset.dtypes[band - 1] == "uint8"
-        if band == heights or masking:
+    alphas = _alphas(dataset)
+    for band, description in enumerate(dataset.descriptions, 1):
+        if band == heights or band in alphas:
             continue
-        name = dataset.descriptions[band - 1] or f"band_{band}"
+        name = description or f"band_{band}"
         names[name if name not in names else f"{name}_{band}"] = band
     return names
+
+
+def _warn_left_out(dataset: Any) -> None:
+    """Say what a file has that a surface has not."""
+    colors = enumerate(dataset.colorinterp, 1)
+    left_out = [f"the colour table of band {band}" for band, color in colors if color.name == "palette"]
+    left_out += [f"{len(dataset.gcps[0])} ground control points"] * bool(dataset.gcps[0])
+    for band in _alphas(dataset):
+        if not np.isin(dataset.read(band), (0, 255)).all():
+            left_out.append(f"degrees of transparency in band {band}")
+    if left_out:
+        warn(f"left out {listing(left_out)}")
+
+
+def _alphas(dataset: Any) -> list[int]:
+    """The bands that only say what is transparent, which GDAL makes a mask of."""
+    kinds = zip(dataset.colorinterp, dataset.dtypes, strict=True)
+    return [band for band, (color, kind) in enumerate(kinds, 1) if color.name == "alpha" and kind == "uint8"]
 
 
 def _metadata(dataset: Any, band: int) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FormatError, OptionError, TooLargeError
+from ..errors import FormatError, OptionError, SwitchedOffError, TooLargeError
 from ..surface import Closed
 
-__all__ = ["DEFAULT_MAX_VERTICES", "Source", "number"]
+__all__ = ["DEFAULT_MAX_VERTICES", "Source", "check_allowed", "number"]
 
 #: What `read` accepts unless told otherwise: 2 GiB of float64 heights.
 DEFAULT_MAX_VERTICES = 1 << 28
@@ -60,6 +60,8 @@ class Source:
         Further files of the same surface, existing regular ones, for the formats that take them.
     closed : (bool, bool) or None
         Which axes wrap, where that was said; None leaves it to the reader.
+    allowed : collection of str or None
+        Names of the formats that may be read; None for all.
     """
 
     path: Path
@@ -69,6 +71,7 @@ class Source:
     options: Mapping[str, Any]
     more: tuple[Path, ...] = ()
     closed: Closed | None = None
+    allowed: Collection[str] | None = None
 
     def check_vertices(self, count: int, shape: str) -> None:
         """Refuse a surface of too many vertices; `shape` says in words where the count comes from."""
@@ -123,6 +126,20 @@ def refuse_array(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str | None:
     if min(shape) < 1 or shape[0] * shape[1] < 2:
         return f"expected a grid of at least two points, got shape {shape}"
     return None
+
+
+def check_allowed(names: Sequence[str], allowed: Collection[str] | None) -> None:
+    """Refuse a file that is of one of these formats when none of them may be read.
+
+    Raises
+    ------
+    SwitchedOffError
+        Naming the first of them.
+    """
+    if allowed is not None and not set(names) & set(allowed):
+        raise SwitchedOffError(
+            f"expected a file of a format that is switched on, got {names[0]}, which is switched off"
+        )
 
 
 def number(value: int) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Mapping
 
-from ..errors import FormatError, FormatWarning, OptionError
+from ..errors import FormatError, OptionError
 from ..surface import Surface
 from . import raster
+from .notes import warn
 from .source import Source, number
 
 __all__ = ["READ_OPTIONS", "named", "read", "sniff"]
@@ -44,9 +44,5 @@ def read(source: Source) -> Surface:
     surface = raster.read(source, "SRTMHGT", "srtm-hgt", "SRTM tile", f"{tile}.hgt")
     if "tile" not in source.options:
         del surface.metadata["geotransform"], surface.metadata["crs"]
-        warnings.warn(
-            "the name of an SRTM tile tells where it lies, and this one does not: say tile=N37W122 or so",
-            FormatWarning,
-            stacklevel=2,
-        )
+        warn("the name of an SRTM tile tells where it lies, and this one does not: say tile=N37W122 or so")
     return surface

@@ -19,8 +19,10 @@ __all__ = ["MORE", "SUFFIXES", "read", "sniff"]
 SUFFIXES = (".dat", ".txt", ".csv")
 MORE = "y, or y and z, each an array of the shape of the first, which is x then"
 
-_NUMBER = rb"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
-_LINE = re.compile(rb"[ \t]*" + _NUMBER + rb"(?:[ \t]*[,;\t ][ \t]*" + _NUMBER + rb")*[ \t,;]*", re.IGNORECASE)
+#: No two ways to match the same text, of which a line of many numbers would have as many as powers of two.
+_NUMBER = rb"[-+]?(?:(?:\d++(?:\.\d*+)?|\.\d++)(?:e[-+]?\d++)?|nan|inf)"
+_BETWEEN = rb"(?:[ \t]*+[,;][ \t]*+|[ \t]++)"
+_LINE = re.compile(rb"[ \t]*+" + _NUMBER + rb"(?:" + _BETWEEN + _NUMBER + rb")*+[ \t,;]*", re.IGNORECASE)
 _HEAD = 4096  # bytes that are looked at to know a format
 _LONGEST_LINE = 64 << 20
 _MOST_FILES = 3

@@ -9,9 +9,9 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,19 +22,29 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, FormatWarning
+from ..errors import FormatError, TooLargeError, UnavailableError
 from ..mesh.cells import pack_cells
 from ..seams import merge
 from ..surface import Block, Surface
 from .attributes import COLOR, NORMAL, TEXTURE
+from .notes import keep_words, listing, warn
 from .planes import Cut, Dims, cuts
 from .source import Source, number
 from .vtk_ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["Reading", "read_grids"]
+__all__ = ["Reading", "check_arrays", "read_grids"]
 
 #: What VTK may take for a small file, beside what it takes for itself.
 _MEMORY = 128 << 20
+
+#: VTK looks through all arrays of a grid to add one.
+_MOST_ARRAYS = 1_000
+
+#: A processor's seconds that VTK may take: for a file of any size, and bytes for each more. It reads text of ten times
+#: as many in a second; what takes longer is made of very many parts that it looks through again and again.
+_SECONDS, _BYTES_A_SECOND = 20, 1 << 20
+
+_LAST_SECONDS = 10.0  # for a process that says nothing any more
 _SCRIPT = Path(__file__).with_name("vtk_process.py")
 _ROLES = {"normals": (NORMAL, (3,), "f"), "texture": (TEXTURE, (2,), "f")}
 
@@ -60,25 +70,42 @@ class Reading:
     dims: Dims | None = None
 
 
+def check_arrays(count: int) -> None:
+    """Refuse a file of so many arrays that VTK would take too long to add them to its grids.
+
+    Raises
+    ------
+    TooLargeError
+    """
+    if count > _MOST_ARRAYS:
+        raise TooLargeError(
+            f"expected at most {number(_MOST_ARRAYS)} arrays in a file of VTK, got {number(count)} or more"
+        )
+
+
 def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Surface:
     """Read all grids of some files as the blocks of a surface, each cut to a plane where it is a volume.
 
     Points and cells that are blanked (``vtkGhostType``) are holes; a hidden cell between valid points is named in the
     metadata's ``faces``. Normals, texture coordinates and colours become "normal", "uv" and "color", other data of the
-    points keep their name. Data of cells are left out, with a warning.
+    points keep their name. Unit and CRS may be strings of field data; other field data, and data of cells, are left
+    out, with a note.
 
     Raises
     ------
+    UnavailableError
+        When VTK is not installed, or the process in which it runs was ended.
     FormatError
-        When VTK is not installed, or cannot read a file as structured grids; with its reason.
+        When it cannot read a file as structured grids; with its reason.
     """
     if importlib.util.find_spec("vtkmodules") is None:
-        raise FormatError(f"reading {format_name} needs VTK: pip install 'lodestream[vtk]'")
+        raise UnavailableError(f"expected VTK for {format_name}, which is not installed: install lodestream[vtk]")
     known = [file.dims for file in files if file.dims is not None]
     taken, metadata = cuts(source, known) if len(known) == len(files) else ([], {})
     blocks: list[Block] = []
     faces: list[dict[str, Any]] = []
     left_out: list[str] = []
+    words: dict[str, str] = {}
     for file in files:
         with _started(file) as (grids, output):
             if not known:
@@ -91,19 +118,23 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
                 blocks.append(block)
                 faces.append(face)
                 left_out += grid["left_out"]
+                for key, text in grid["words"].items():
+                    keep_words(words, key, text)
     if left_out:
-        names = ", ".join(dict.fromkeys(left_out))
-        warnings.warn(f"left out what does not belong to points: {names}", FormatWarning, stacklevel=2)
+        warn(f"left out what does not belong to points: {listing(dict.fromkeys(left_out))}")
     if any(faces):
         metadata["faces"] = faces if len(faces) > 1 else faces[0]
-    return merge(Surface(blocks=blocks, metadata=source.metadata(format_name) | metadata), source.closed)
+    metadata = source.metadata(format_name) | words | metadata
+    return merge(Surface(blocks=blocks, metadata=metadata), source.closed)
 
 
 @contextmanager
 def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
     """Start the process that reads a file; give the description of its grids and the pipe with their arrays."""
     budget = _MEMORY + 4 * file.promised
-    command = [sys.executable, "-P", os.fspath(_SCRIPT), file.kind, os.fspath(file.path.resolve()), str(budget)]
+    seconds = _SECONDS + file.path.stat().st_size // _BYTES_A_SECOND
+    limits = [str(budget), str(seconds)]
+    command = [sys.executable, "-P", os.fspath(_SCRIPT), file.kind, os.fspath(file.path.resolve()), *limits]
     environment = {**os.environ, "VTK_SMP_MAX_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
@@ -112,10 +143,12 @@ def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
             assert process.stdout is not None  # it was asked for
             line = process.stdout.readline()
             answer = json.loads(line) if line.endswith(b"\n") else None
+            if answer is None and _was_ended(process):
+                raise UnavailableError("expected VTK to read the file, got a process that somebody ended")
             if answer is None:
                 raise FormatError(
                     f"expected structured grids that VTK reads, got a file that ended its reader (damaged, or made to "
-                    f"take more than {number(budget >> 20)} MiB)"
+                    f"take more than {number(budget >> 20)} MiB or {number(seconds)} seconds)"
                 )
             if "error" in answer:
                 raise FormatError(f"expected structured grids that VTK reads, got {_printable(answer['error'])}")
@@ -124,6 +157,15 @@ def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
             yield answer["grids"], process.stdout
         finally:
             process.kill()
+
+
+def _was_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether somebody else ended a process, as a machine does that is short of memory, and not what it read."""
+    try:
+        code = process.wait(_LAST_SECONDS)
+    except subprocess.TimeoutExpired:
+        return False
+    return code in (-signal.SIGKILL, -signal.SIGTERM)
 
 
 def _printable(text: str) -> str:
@@ -144,6 +186,8 @@ def _block(grid: Any, cut: Cut, output: IO[bytes]) -> tuple[Block, dict[str, Any
             axes.append(values)
         elif role == "cell_ghost":
             hidden = _hidden_cells(values, cut)
+            if hidden is None and (values & HIDDEN_CELL).any():
+                warn("left out which cells of a volume are hidden")
         elif len(values) != prod(cut.dims):
             raise FormatError(f"expected {number(prod(cut.dims))} values of {name or 'the points'}, got {len(values)}")
         elif role == "points":

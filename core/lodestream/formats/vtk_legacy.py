@@ -9,7 +9,7 @@ from ..errors import FormatError, TooLargeError
 from ..surface import Surface
 from . import planes
 from .source import Source, number
-from .vtk_grids import Reading, read_grids
+from .vtk_grids import Reading, check_arrays, read_grids
 
 __all__ = ["OPTIONS", "read", "sniff"]
 
@@ -21,6 +21,12 @@ _READERS = {"STRUCTURED_GRID": "structured", "RECTILINEAR_GRID": "rectilinear"}
 
 #: Text is at least two bytes a number, of which VTK makes at most eight.
 _EXPANSION = 4
+
+
+#: What begins an array of the points or cells; a field says how many it has.
+_ARRAY = (b"scalars", b"vectors", b"normals", b"tensors", b"texture_coordinates", b"_ids", b"edge_flags")
+_FIELD = re.compile(rb"field\s++\S{1,256}+\s++(\d{1,18})")
+_BLOCK, _LONGEST_FIELD = 1 << 20, 1 << 10
 
 
 def sniff(head: bytes, suffix: str) -> bool:
@@ -42,4 +48,21 @@ def read(source: Source) -> Surface:
             f"expected a VTK file that holds the {number(int(points[1]))} points that it promises, got "
             f"{number(source.size)} bytes"
         )
+    _check_arrays(source)
     return read_grids(source, "vtk", [Reading(_READERS[kind], source.path, _EXPANSION * source.size)])
+
+
+def _check_arrays(source: Source) -> None:
+    """Count the arrays that the words of the file announce, wherever these stand: between them there may be bytes."""
+    count, text = 0, b""
+    with source.path.open("rb") as file:
+        while True:
+            block = file.read(_BLOCK).lower()
+            text += block
+            whole = len(text) - _LONGEST_FIELD if block else len(text)  # a field that is cut comes again
+            count += sum(text.count(word, 0, max(whole, 0)) for word in _ARRAY)
+            count += sum(int(found[1]) for found in _FIELD.finditer(text) if found.start() < whole)
+            check_arrays(count)
+            if not block:
+                return
+            text = text[max(whole, 0) :]

@@ -1,8 +1,9 @@
 """Run by a process of its own: read one file with one reader of VTK and write its grids to standard output.
 
 VTK takes what memory a file asks for, ends the process when it gets none, and CGNS opens the files that a file names.
-Here it may have only so much memory, and may have no second file open beside the one that it reads. This script stands
-alone, so that starting it loads nothing but VTK and NumPy.
+Here it may have only so much memory, may have no second file open beside the one that it reads, and where the kernel
+sees to it (`lodestream.confinement`) may open no other file but libraries, no socket, and start nothing. This script
+stands alone, so that starting it loads nothing but VTK and NumPy.
 
 Output: a line of JSON, {"grids": [{"dims", "arrays"}]} or {"error"}, and then the arrays' bytes in the same order.
 """
@@ -17,6 +18,7 @@ import resource
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,22 +29,32 @@ from vtkmodules.vtkIOCGNSReader import vtkCGNSReader
 from vtkmodules.vtkIOLegacy import vtkRectilinearGridReader, vtkStructuredGridReader
 from vtkmodules.vtkIOXML import vtkXMLStructuredGridReader
 
+sys.path.append(os.fspath(Path(__file__).parents[2]))  # of which the package itself loads nothing else
+from lodestream.confinement import Rights, confine
+
 _READERS: dict[str, Any] = {
     "structured": vtkStructuredGridReader,
     "rectilinear": vtkRectilinearGridReader,
     "xml": vtkXMLStructuredGridReader,
     "cgns": vtkCGNSReader,
 }
+
+#: Strings of field data that say something of the surface.
+_WORDS = ("name", "unit", "crs")
+
+#: Field data that VTK adds to what it reads from CGNS.
+_OWN = "Base/Zone"
+
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _MAX_SECONDS = 600
 
 
-def main(kind: str, path: str, budget: int) -> None:
-    """Read the file `path` with the reader `kind` in at most `budget` bytes beside those of VTK itself."""
+def main(kind: str, path: str, budget: int, seconds: int) -> None:
+    """Read the file `path` with the reader `kind`, in so many bytes beside those of VTK and a processor's seconds."""
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     messages = vtkStringOutputWindow()
     vtkOutputWindow.SetInstance(messages)
-    _limit(budget)
+    _limit(budget, seconds, Path(path))
     errors: list[str] = []
     reader = _READERS[kind]()
     reader.AddObserver("ErrorEvent", lambda *_: errors.append("error"))
@@ -71,6 +83,9 @@ def main(kind: str, path: str, budget: int) -> None:
         described, values = _grid(data)
         grids.append(described)
         arrays.append(values)
+    if kind == "cgns" and grids:
+        grids[0]["left_out"] += [reader.GetCellArrayName(it) for it in range(reader.GetNumberOfCellArrays())]
+        grids[0]["left_out"] += [reader.GetFaceArrayName(it) for it in range(reader.GetNumberOfFaceArrays())]
     _answer({"grids": grids})
     for values in arrays:
         for array in values:
@@ -78,15 +93,17 @@ def main(kind: str, path: str, budget: int) -> None:
     sys.stdout.buffer.flush()
 
 
-def _limit(budget: int) -> None:
-    """Allow so many bytes more, one file more, and no life after the parent's."""
+def _limit(budget: int, seconds: int, path: Path) -> None:
+    """Allow so many bytes and seconds more, one file more, no other than this one, and no life after the parent's."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
         with open("/proc/self/status") as status:
             used = next(int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
         _lower(resource.RLIMIT_DATA, used + budget)
-    _lower(resource.RLIMIT_CPU, _MAX_SECONDS)
+    _lower(resource.RLIMIT_CPU, min(seconds, _MAX_SECONDS))
     _lower(resource.RLIMIT_CORE, 0)
+    _lower(resource.RLIMIT_FSIZE, 0)
+    confine(Rights(read=(path,)))
     free = os.open(os.devnull, os.O_RDONLY)
     os.close(free)
     _lower(resource.RLIMIT_NOFILE, free + 1)
@@ -121,7 +138,16 @@ def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
     else:
         points = data.GetPoints()
         named = [("points", "", vtk_to_numpy(points.GetData()))] if points is not None else []
-    left_out = []
+    left_out, words = [], {}
+    fields = data.GetFieldData()
+    for index in range(fields.GetNumberOfArrays()):
+        array, name = fields.GetAbstractArray(index), fields.GetArrayName(index) or f"field_{index}"
+        if name == _OWN:
+            continue
+        if name in _WORDS and array.IsA("vtkStringArray") and array.GetNumberOfValues() == 1:
+            words[name] = array.GetValue(0)
+        else:
+            left_out.append(name)
     for role, attributes in (("point", data.GetPointData()), ("cell", data.GetCellData())):
         for index in range(attributes.GetNumberOfArrays()):
             array = attributes.GetArray(index)
@@ -135,7 +161,7 @@ def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
     arrays = [
         {"role": role, "name": name, "dtype": values.dtype.str, "shape": values.shape} for role, name, values in named
     ]
-    return {"dims": dims, "arrays": arrays, "left_out": left_out}, [values for _, _, values in named]
+    return {"dims": dims, "arrays": arrays, "left_out": left_out, "words": words}, [values for _, _, values in named]
 
 
 def _role(attributes: Any, array: Any) -> str:
@@ -161,4 +187,4 @@ def _answer(answer: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], int(sys.argv[3]))
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from ..errors import FormatError
+from ..errors import FormatError, TooLargeError
 from ..surface import Surface
 from . import planes
 from .planes import Dims
 from .source import Source, number
-from .vtk_grids import Reading, read_grids
+from .vtk_grids import Reading, check_arrays, read_grids
 
 __all__ = ["MORE", "OPTIONS", "SUFFIXES", "read", "sniff"]
 
@@ -33,6 +33,12 @@ _CHUNK = 1 << 16
 _SIZES = {"Int8": 1, "UInt8": 1, "Int16": 2, "UInt16": 2, "Int32": 4, "UInt32": 4, "Int64": 8, "UInt64": 8}
 _SIZES |= {"Float32": 4, "Float64": 8}
 _SECTIONS = ("PointData", "CellData", "Points")
+
+#: VTK looks through all attributes of an element to add one.
+_MOST_ATTRIBUTES = 100
+
+#: Bytes of a tag or comment. The parser begins it anew with each chunk of the file until it is whole.
+_LONGEST_TAG = 1 << 18
 
 #: Characters of an array that are kept: those of its header in base64.
 _KEPT = 256
@@ -88,6 +94,7 @@ class _Found:
     whole: tuple[int, ...] = ()
     piece: tuple[int, ...] = ()
     pieces: int = 0
+    named: int = 0  # arrays of any kind, of field data too
     section: str = ""
     arrays: list[_Array] = field(default_factory=list)
     open_array: bool = False
@@ -124,6 +131,11 @@ def _parsed(path: Path) -> _Found:
 
     def start(name: str, attributes: dict[str, str]) -> None:
         found.open_array = False
+        found.named += name in ("DataArray", "Array")
+        check_arrays(found.named)
+        if len(attributes) > _MOST_ATTRIBUTES:
+            got = number(len(attributes))
+            raise TooLargeError(f"expected at most {_MOST_ATTRIBUTES} attributes of {name[:40]!r}, got {got}")
         match name:
             case "VTKFile":
                 found.root = attributes
@@ -161,8 +173,14 @@ def _parsed(path: Path) -> _Found:
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     try:
         with path.open("rb") as file:
+            read = 0
             while found.appended is None and (chunk := file.read(_CHUNK)):
                 parser.Parse(chunk)
+                read += len(chunk)
+                if found.appended is None and read - parser.CurrentByteIndex > _LONGEST_TAG:
+                    raise TooLargeError(
+                        f"expected tags and comments of at most {number(_LONGEST_TAG)} bytes, got a longer one"
+                    )
             if found.appended is None:
                 parser.Parse(b"", True)
     except expat.ExpatError as error:

@@ -5,7 +5,6 @@ Source: "VTK XML Formats" of the VTK documentation; blanking as in VTK's vtkStru
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -14,12 +13,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatWarning
 from ..heights import coordinates
 from ..mesh.cells import unpack_cells
 from ..surface import Block, Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .mesh_output import exact_float, notes
+from .mesh_output import exact_float, extra_channels, words_of
+from .notes import warn
 from .vtk_ghosts import HIDDEN_CELL, HIDDEN_POINT
 
 __all__ = ["write"]
@@ -27,6 +26,9 @@ __all__ = ["write"]
 _MIN_CLOSED = 3
 _TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
 _CHUNK = 1 << 20
+
+#: The array that says what is hidden.
+_GHOSTS = "vtkGhostType"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +50,16 @@ def write(surface: Surface, file: BinaryIO) -> None:
     """
     grids = [_grid(surface, number) for number in range(len(surface.blocks))]
     if len(grids) > 1:
-        words = f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them"
-        warnings.warn(words, FormatWarning, stacklevel=2)
+        warn(f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them")
+    _warn_of_faces(surface)
     grid = grids[0] if len(grids) == 1 else _stacked(grids)
     rows, columns = grid.points.shape[:2]
     attributes = dict(grid.attributes)
     if grid.hidden_points.any():
-        attributes["vtkGhostType"] = grid.hidden_points.astype(np.uint8) * HIDDEN_POINT
+        attributes[_GHOSTS] = grid.hidden_points.astype(np.uint8) * HIDDEN_POINT
     cells = {}
     if grid.hidden_cells.any():
-        cells["vtkGhostType"] = grid.hidden_cells.astype(np.uint8) * HIDDEN_CELL
+        cells[_GHOSTS] = grid.hidden_cells.astype(np.uint8) * HIDDEN_CELL
     arrays = [*attributes.items(), *cells.items(), ("Points", grid.points)]
     offsets = np.cumsum([0, *(8 + values.nbytes for _, values in arrays)]).tolist()
     described = [_array(name, values, offset) for (name, values), offset in zip(arrays, offsets, strict=False)]
@@ -97,9 +99,9 @@ def _grid(surface: Surface, number: int) -> _Grid:
     block = surface.blocks[number]
     axes = [exact_float(values, axis, "VTS") for values, axis in zip(_coordinates(surface, block), "xyz", strict=True)]
     points = np.stack(axes, axis=-1)
-    attributes = dict(block.attributes)
-    for channel in range(3, block.points.shape[2] if block.points.ndim == 3 else 0):
-        attributes[f"attribute_{channel - 3}"] = block.points[:, :, channel]
+    attributes = {_GHOSTS + "_" if name == _GHOSTS else name: values for name, values in block.attributes.items()}
+    for channel, name in extra_channels(block).items():
+        attributes[name] = block.points[:, :, channel]
     hidden = np.zeros(block.shape, np.bool_) if block.mask is None else ~block.mask
     if hidden.any():
         points[hidden] = points[~hidden][0]  # inside the box, which VTK takes of all points
@@ -115,6 +117,21 @@ def _grid(surface: Surface, number: int) -> _Grid:
         _padded(hidden, ends, "wrap"),
         np.zeros((rows, columns), np.bool_) if left_out is None else left_out,
     )
+
+
+def _warn_of_faces(surface: Surface) -> None:
+    """Say what a grid of quads does not tell."""
+    faces = surface.metadata.get("faces")
+    maps = [it for it in (faces if isinstance(faces, list) else [faces]) if isinstance(it, dict)]
+    if any("diagonal" in it for it in maps):
+        warn("VTS is written with whole cells in place of the triangles that they were made of")
+    closed = [
+        block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < _MIN_CLOSED
+    ]
+    if closed:
+        warn(f"VTS is written without closure of axes of fewer than {_MIN_CLOSED} points")
+    if _GHOSTS in surface.blocks[0].attributes:
+        warn(f"VTS is written with {_GHOSTS}_ in place of {_GHOSTS}, which says there what is hidden")
 
 
 def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
@@ -176,7 +193,7 @@ def _roles(attributes: dict[str, NDArray[Any]]) -> str:
 
 
 def _field_data(surface: Surface) -> Iterator[str]:
-    words = notes(surface.metadata)
+    words = words_of("VTS", surface)
     if not words:
         return
     yield "<FieldData>"

@@ -16,7 +16,8 @@ Both hold at every level of the surface and both may be missing.
         (r + 1, c + 1), (r + 1, c).
     ``joined`` : bool
         Whether points on the block's open sides that lie at the same place are one vertex. Missing: true when the
-        surface has several blocks.
+        surface has several blocks. What comes out of a container knows those from its header (`Surface.joints`); of
+        other surfaces they are those with the same coordinates.
     ``part`` : int
         Blocks of different parts share no vertex even where they touch. Missing: 0.
     ``left_out`` : map

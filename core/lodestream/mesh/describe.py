@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..surface import Block, Closed
 from .cells import pack_cells
 from .grid import Grid
+from .joining import SIDES, on_border
 from .patchwork import Quads
-from .weld import SIDES, on_border
 
 __all__ = ["RecognisedBlock", "describe_cells", "join_blocks", "poles_of", "shape_words", "with_tips"]
 
@@ -103,11 +103,10 @@ def join_blocks(
     The second result is the number of vertices that will be joined although they only lie at the same place.
     """
     borders = [_border(block, grid) for block, grid in zip(blocks, grids, strict=True)]
-    found, count = np.unique(np.concatenate(borders), return_counts=True)
-    shared = found[count > 1]
+    shared = np.bincount(np.concatenate(borders), minlength=1) > 1
     result, among = [], []
     for block, border in zip(blocks, borders, strict=True):
-        joined = bool(np.isin(border, shared).any())
+        joined = bool(shared[border].any())
         if joined:
             among.append(border)
         if joined != (len(blocks) > 1):

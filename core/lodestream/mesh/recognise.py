@@ -17,12 +17,12 @@ from .describe import RecognisedBlock, describe_cells, join_blocks, poles_of, sh
 from .develop import Development, develop_quads
 from .grid import Grid, make_grid
 from .halfedges import find_pieces, find_umbrellas, join_pieces
+from .joining import SIDES
 from .limits import LEAST_QUADS, SMALL_PIECES, check_pieces, most_blocks
 from .model import Mesh, name_faces
 from .patchwork import Quads, make_quads
 from .polygons import Polygons, prepare
 from .tearing import equal_rows, sort_attributes, tear
-from .weld import SIDES
 
 __all__ = ["Recognised", "RecognisedBlock", "recognise"]
 
@@ -40,12 +40,15 @@ class Recognised:
         Whether quads were made of triangles.
     notes : tuple of str
         What else there is to say about it.
+    left_out : tuple of str
+        Those of the notes that say what the blocks do not have.
     """
 
     mesh: Mesh
     blocks: tuple[RecognisedBlock, ...]
     triangles: bool
     notes: tuple[str, ...]
+    left_out: tuple[str, ...]
 
     def words(self, surface: Surface) -> str:
         """Say what was recognised, such as "torus, 96 x 24, from triangles; 2304 vertices".
@@ -177,7 +180,9 @@ class _Recognition:
         part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
         blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
         blocks, merged = join_blocks(blocks, grids, self.mesh.vertices)
-        return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), tuple(self._notes(blocks, merged)))
+        left_out = self._left_out()
+        notes = (*self._notes(blocks, merged), *left_out)
+        return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), notes, left_out)
 
     def _grids(self) -> list[Grid]:
         laid = develop_quads(self.quads.corners, self.twins)
@@ -324,10 +329,16 @@ class _Recognition:
         turned = self.polygons.turned
         notes += [f"{_counted(turned, 'face')} turned round"] * (turned > 0)
         notes += [f"{_counted(merged, 'vertex', 'vertices')} at the place of others joined to them"] * (merged > 0)
-        notes += [f"{name} left out: {why}" for name, why in self.left_out.items()]
+        return notes
+
+    def _left_out(self) -> tuple[str, ...]:
+        """What of the mesh the blocks do not have, in words."""
+        used = np.zeros(len(self.mesh.vertices), np.bool_)
+        used[self.vertex] = True
         alone = len(used) - int(used.sum())
-        notes += [f"{_counted(alone, 'vertex', 'vertices')} without a face left out"] * (alone > 0)
-        return [*notes, *self.mesh.notes]
+        words = [f"{name} left out: {why}" for name, why in self.left_out.items()]
+        words += [f"{_counted(alone, 'vertex', 'vertices')} without a face left out"] * (alone > 0)
+        return (*words, *self.mesh.notes)
 
 
 def _counted(count: int, one: str, many: str = "") -> str:

@@ -12,19 +12,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..surface import Block, Surface
 from .cells import unpack_cells
+from .joining import Part, join_points, parts_of, poles_of, wraps
 
-__all__ = ["SIDES", "Faces", "Weld", "face_map", "faces_of", "on_border", "weld"]
-
-#: With fewer points, the faces that join the ends of a closed axis would lie on those already there.
-_MIN_CLOSED = 3
-
-#: The sides of a block, as the metadata name them, and the points on each.
-SIDES: dict[str, tuple[slice | int, slice | int]] = {
-    "first_row": (0, slice(None)),
-    "last_row": (-1, slice(None)),
-    "first_column": (slice(None), 0),
-    "last_column": (slice(None), -1),
-}
+__all__ = ["Faces", "Weld", "faces_of", "weld"]
 
 
 class Faces(NamedTuple):
@@ -62,6 +52,8 @@ class Weld:
         0-based vertices of each quad, going round it.
     triangles : int64 array of shape (T, 3)
         0-based vertices of each triangle, going round it.
+    edges : int64 array of shape (E, 2)
+        0-based vertices of each edge of the blocks that are curves.
     joined : int64 array of shape (V,)
         For each vertex, the first vertex at the same place that is the same vertex but for its attributes; itself where
         there is no other. A format whose faces name places and attributes separately, like OBJ, writes the places of
@@ -71,15 +63,17 @@ class Weld:
     source: NDArray[np.int64]
     quads: NDArray[np.int64]
     triangles: NDArray[np.int64]
+    edges: NDArray[np.int64]
     joined: NDArray[np.int64]
 
 
 def faces_of(surface: Surface) -> Faces:
     """Make the mesh of a surface, for the formats whose vertices carry their attributes with them.
 
-    Blocks are welded where vertices on their sides have the same coordinates and attributes, closed axes are joined by
-    faces, a collapsed side is one vertex with a fan of triangles, and cells at holes are left out; see
-    `lodestream.mesh` for what the metadata say about it. Every valid point is a vertex, with a face or without.
+    Blocks are welded where points on their sides are one (by `Surface.joints`, or else by their coordinates and
+    attributes), closed axes are joined by faces, a collapsed side is one vertex with a fan of triangles, and cells at
+    holes are left out; see `lodestream.mesh` for what the metadata say about it. Every valid point is a vertex, with a
+    face or without.
 
     Raises
     ------
@@ -107,158 +101,33 @@ def weld(surface: Surface) -> Weld:
     InputError
         When the metadata's ``faces`` or ``poles`` are not of the form that they should have.
     """
-    poles = _poles(surface)
-    parts, start = [], 0
-    for number, block in enumerate(surface.blocks):
-        parts.append(_Part.of(block, start, face_map(surface.metadata, number, len(surface.blocks))))
-        start += parts[-1].points.size
-    joined = np.arange(start)
-    _join_borders([part for part in parts if part.joins(len(parts))], joined)
-    for number, side, _ in poles:
-        if not parts[number].joins(len(parts)):
-            row = parts[number].points[SIDES[side]]
-            joined[row] = joined[row].min()
-    vertex = _same_vertices(surface.blocks, joined)
+    parts = parts_of(surface)
+    joined, vertex, poles = join_points(surface, parts, poles_of(surface))
     quads, triangles = [], []
     for number, part in enumerate(parts):
-        degenerate = any(pole == number and kind == "degenerate" for pole, _, kind in poles)
+        degenerate = any(pole.block == number and pole.kind == "degenerate" for pole in poles)
         part_quads, part_triangles = _faces(part, joined, degenerate)
         quads.append(part_quads)
         triangles.append(part_triangles)
-    return _compressed(surface.blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles))
+    edges = np.concatenate([_edges(part) for part in parts])
+    edges = edges[joined[edges[:, 0]] != joined[edges[:, 1]]]
+    return _compressed(surface.blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles), edges)
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A block, its points as numbers among those of all blocks, what is said of its faces, and which cells have one."""
-
-    block: Block
-    points: NDArray[np.int64]
-    faces: Mapping[str, Any]
-    cells: NDArray[np.bool_]
-
-    @staticmethod
-    def of(block: Block, start: int, faces: Mapping[str, Any]) -> _Part:
-        height, width = block.shape
-        valid = np.ones(block.shape, np.bool_) if block.mask is None else block.mask
-        cells = valid.copy()
-        for axis in (0, 1):
-            cells &= np.roll(cells, -1, axis)
-            if not _wraps(block, axis):
-                cells = cells[:-1] if axis == 0 else cells[:, :-1]
-        left_out = unpack_cells(faces.get("left_out"), cells.shape)
-        if left_out is not None:
-            cells &= ~left_out
-        return _Part(block, start + np.arange(height * width).reshape(height, width), faces, cells)
-
-    def joins(self, blocks: int) -> bool:
-        """Whether its border is joined to others at the same place; `blocks` is the number of all."""
-        return bool(self.faces.get("joined", blocks > 1))
+def _edges(part: Part) -> NDArray[np.int64]:
+    """The edges of a block that is a curve, over the points of the surface; of others none."""
+    block, count = part.block, part.points.size
+    if 1 not in block.shape:
+        return np.empty((0, 2), np.int64)
+    closed = wraps(block, 0 if block.shape[1] == 1 else 1)
+    one = np.arange(count if closed else count - 1)
+    ends = np.stack((one, (one + 1) % count), axis=-1)
+    if block.mask is not None:
+        ends = ends[block.mask.reshape(-1)[ends].all(axis=1)]
+    return part.points.reshape(-1)[ends]
 
 
-def _wraps(block: Block, axis: int) -> bool:
-    return block.closed[axis] and block.shape[axis] >= _MIN_CLOSED
-
-
-def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which nodes of a grid have fewer than four faces, from the cells that have one; fewer cells on open axes."""
-    full = np.zeros(shape, np.bool_)
-    full[: cells.shape[0], : cells.shape[1]] = cells
-    for axis in (0, 1):
-        full &= np.roll(full, 1, axis)
-    return ~full
-
-
-def face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[str, Any]:
-    """What the metadata's ``faces`` say about a block of so many; empty where they say nothing.
-
-    Raises
-    ------
-    InputError
-        When they are not of the form that `lodestream.mesh` describes.
-    """
-    faces = metadata.get("faces", {})
-    if isinstance(faces, list | tuple) and len(faces) == blocks:
-        faces = faces[block]
-    if not isinstance(faces, Mapping) or faces.get("diagonal") not in (None, "main", "anti"):
-        raise InputError(f"expected a map in the metadata's faces, or one for each of {blocks} blocks, got {faces!r}")
-    return faces
-
-
-def _poles(surface: Surface) -> list[tuple[int, str, str]]:
-    """Block, side and kind of the poles that are one vertex."""
-    result = []
-    entries = surface.metadata.get("poles", [])
-    try:
-        for entry in entries:
-            number, side, kind = int(entry["block"]), str(entry["side"]), str(entry["kind"])
-            if not 0 <= number < len(surface.blocks) or side not in SIDES:
-                raise KeyError(side)
-            if kind in ("fan", "degenerate") and _is_point(surface.blocks[number], side):
-                result.append((number, side, kind))
-    except (TypeError, KeyError, ValueError):
-        raise InputError(f"expected poles with block, side and kind in the metadata, got {entries!r}") from None
-    return result
-
-
-def _is_point(block: Block, side: str) -> bool:
-    """Whether a side lies at one place still, as that of a window of the surface need not."""
-    points = block.points[SIDES[side]]
-    return points.ndim == 2 and bool((points[:, :3] == points[0, :3]).all())
-
-
-def _join_borders(parts: list[_Part], joined: NDArray[np.int64]) -> None:
-    """Let border points at the same place, in blocks of the same part of the surface, stand for the first of them."""
-    together: dict[int, list[tuple[NDArray[np.int64], NDArray[Any]]]] = {}
-    for part in parts:
-        block = part.block
-        if block.points.ndim != 3:
-            continue
-        border = on_border(part.cells, block.shape)
-        if block.mask is not None:
-            border &= block.mask
-        places = block.points[border][:, :3]
-        together.setdefault(int(part.faces.get("part", 0)), []).append((part.points[border], places))
-    for borders in together.values():
-        index = np.concatenate([points for points, _ in borders])
-        joined[index] = index[_first_equal([np.concatenate([places for _, places in borders])])]
-
-
-def _same_vertices(blocks: tuple[Block, ...], joined: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each point, the first of those that it is joined with that has the same attributes."""
-    vertex = np.arange(len(joined))
-    together = np.flatnonzero(joined != vertex)
-    if not together.size:
-        return vertex
-    together = np.union1d(together, joined[together])
-    start, keys = 0, []
-    for block in blocks:
-        count = block.points.shape[0] * block.points.shape[1]
-        inside = together[(together >= start) & (together < start + count)] - start
-        arrays = [block.points, *block.attributes.values()]
-        keys.append([array.reshape(count, -1)[inside] for array in arrays])
-        start += count
-    columns = [np.concatenate(column) for column in zip(*keys, strict=True)]
-    vertex[together] = together[_first_equal([joined[together], *columns])]
-    return vertex
-
-
-def _first_equal(columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-    """For each row of arrays side by side, the first row that is equal to it, bit for bit but for the sign of zero."""
-    rows = [
-        np.ascontiguousarray(column + 0 if column.dtype.kind == "f" else column)
-        .reshape(len(column), -1)
-        .view(np.uint8)
-        .reshape(len(column), -1)
-        for column in columns
-    ]
-    packed = np.concatenate(rows, axis=1)
-    keys = packed.view(np.dtype((np.void, packed.shape[1]))).reshape(-1)
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    return first[inverse.reshape(-1)]
-
-
-def _faces(part: _Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _faces(part: Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Quads and triangles of a block in the order of its cells, over the points of the surface."""
     rows, width = part.block.shape
     r, c = np.nonzero(part.cells)
@@ -312,9 +181,10 @@ def _compressed(
     joined: NDArray[np.int64],
     quads: NDArray[np.int64],
     triangles: NDArray[np.int64],
+    edges: NDArray[np.int64],
 ) -> Weld:
     """Number the vertices without gaps: those in faces, and the other valid points that stand for themselves."""
-    quads, triangles = vertex[quads], vertex[triangles]
+    quads, triangles, edges = vertex[quads], vertex[triangles], vertex[edges]
     used: NDArray[np.bool_] = np.equal(joined, np.arange(len(joined)))
     start = 0
     for block in blocks:
@@ -324,11 +194,12 @@ def _compressed(
         start += count
     used[quads.reshape(-1)] = True
     used[triangles.reshape(-1)] = True
+    used[edges.reshape(-1)] = True
     source = np.flatnonzero(used)
     if len(source) == len(used):
-        return Weld(source, quads, triangles, joined)
+        return Weld(source, quads, triangles, edges, joined)
     numbers = np.cumsum(used) - 1
-    return Weld(source, numbers[quads], numbers[triangles], numbers[joined[source]])
+    return Weld(source, numbers[quads], numbers[triangles], numbers[edges], numbers[joined[source]])
 
 
 def _coordinates(block: Block, metadata: Mapping[str, Any]) -> NDArray[Any]:

@@ -1,0 +1,225 @@
+"""What a server answers over HTTP, before anything in it is believed: read within bounds, and its JSON checked.
+
+No answer is decompressed: none was asked for compressed, and a few bytes of it could become any number.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import RemoteProtocolError
+
+from . import addresses
+
+if TYPE_CHECKING:
+    import httpx
+
+__all__ = ["LONGEST_ANSWER", "LONGEST_PROBLEM", "Answer", "Incoming", "check_figures", "parse", "withheld"]
+
+#: The most bytes of an answer that are read, where it is no part of a container; and of one that says what is wrong.
+LONGEST_ANSWER = 16 * 1024 * 1024
+LONGEST_PROBLEM = 64 * 1024
+
+# Lists in lists: more than any description has, and far less than what a program can print or write again.
+_DEEPEST = 32
+
+_LARGEST_NUMBER = 2**63
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer, read as far as it is wanted.
+
+    Attributes
+    ----------
+    status, reason : int, str
+        Its first line.
+    headers : mapping
+        By names in lower case.
+    content : bytes
+        The body, as it was sent.
+    withheld : str
+        What to say where the token was not sent along a redirect; empty otherwise.
+    """
+
+    status: int
+    reason: str
+    headers: Mapping[str, str]
+    content: bytes = field(default=b"", repr=False)
+    withheld: str = ""
+
+
+class Incoming:
+    """An answer whose body is still to be read.
+
+    Parameters
+    ----------
+    response : httpx.Response
+        As far as its headers.
+    most : int
+        Bytes that are read of a body that is none of a problem.
+    asked, given : str
+        The address asked, and the one that the user gave.
+    token : str or None
+        What was sent to the server at `given`.
+
+    Raises
+    ------
+    RemoteProtocolError
+        When it is encoded, which was not asked for, or longer than `most`.
+    """
+
+    def __init__(self, response: httpx.Response, most: int, asked: str, given: str, token: str | None) -> None:
+        self._response = response
+        self._asked = asked
+        self._fine = 200 <= response.status_code < 300
+        self._most = most if self._fine else LONGEST_PROBLEM
+        self._withheld = withheld(token, given, asked, str(response.url))
+        self._body = bytearray()
+        coding = str(response.headers.get("content-encoding", "identity"))
+        self._read = coding == "identity"
+        if self._fine and not self._read:
+            raise RemoteProtocolError(
+                f"expected an answer of {asked} as it is, got it encoded with {coding}, which was not asked for"
+            )
+
+    def take(self, piece: bytes) -> bool:
+        """Take a piece of the body; whether more is wanted."""
+        if self._read:
+            self._body += piece
+        if len(self._body) <= self._most:
+            return self._read
+        if self._fine:
+            raise RemoteProtocolError(f"expected at most {self._most} bytes of {self._asked}, got more")
+        del self._body[self._most :]
+        return False
+
+    def answer(self) -> Answer:
+        """All of it."""
+        response = self._response
+        headers = dict(response.headers)
+        return Answer(response.status_code, response.reason_phrase, headers, bytes(self._body), self._withheld)
+
+
+def withheld(token: str | None, given: str, asked: str, landed: str) -> str:
+    """What to say of a token that was not sent where a redirect led; empty where it was.
+
+    Parameters
+    ----------
+    token : str or None
+        What the server at `given` is shown.
+    given, asked, landed : str
+        The address that the user gave, the one asked, and the one that answered.
+    """
+    if token is None or addresses.same_origin(given, landed):
+        return ""
+    return (
+        f"; the token was not sent to {addresses.origin(landed)}, to which {addresses.origin(given)} redirects: "
+        f"if it is meant for both, use {addresses.counterpart(given, asked, landed)}"
+    )
+
+
+def parse(data: bytes) -> Mapping[str, Any]:
+    """The JSON object that is all of these bytes.
+
+    Raises
+    ------
+    ValueError
+        When it is none, has numbers that are not finite, or lists and objects in each other beyond all use.
+    """
+    try:
+        found = json.loads(data, parse_float=_finite, parse_constant=_finite)
+    except RecursionError:
+        raise ValueError("lists and objects in each other") from None
+    if not isinstance(found, dict):
+        raise ValueError("no object")
+    within: list[Any] = [found]
+    for _ in range(_DEEPEST):
+        within = [
+            item
+            for holder in within
+            for item in (holder.values() if isinstance(holder, dict) else holder)
+            if isinstance(item, dict | list)
+        ]
+        if not within:
+            return found
+    raise ValueError("lists and objects in each other")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(text)
+    return number
+
+
+def check_figures(document: Mapping[str, Any], url: str) -> None:
+    """Refuse a surface's description whose figures are of another kind than they should; any of them may be missing.
+
+    Raises
+    ------
+    RemoteProtocolError
+    """
+    for name, fits in _FIGURES.items():
+        value = document.get(name)
+        if value is not None and not fits(value):
+            raise RemoteProtocolError(f"expected the figures of a surface from {url}, got {name} {value!a:.80}")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _LARGEST_NUMBER
+
+
+def _is_number(value: Any) -> bool:
+    return _is_count(value) or isinstance(value, float)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _list_of(fits: Callable[[Any], bool], length: int | None = None) -> Callable[[Any], bool]:
+    def check(value: Any) -> bool:
+        return isinstance(value, list) and (length is None or len(value) == length) and all(map(fits, value))
+
+    return check
+
+
+def _map_of(needed: Mapping[str, Callable[[Any], bool]], **others: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    def check(value: Any) -> bool:
+        return (
+            isinstance(value, dict)
+            and all(fits(value.get(name)) for name, fits in needed.items())
+            and all(value.get(name) is None or fits(value[name]) for name, fits in others.items())
+        )
+
+    return check
+
+
+_PAIR = _list_of(_is_count, 2)
+_STATE = _map_of({"bytes": _is_count, "level": _is_count}, shape=_PAIR, rms=_is_number, max=_is_number)
+
+_FIGURES: Mapping[str, Callable[[Any], bool]] = {
+    "name": _is_text,
+    "reason": _is_text,
+    "dtype": _is_text,
+    "progress": _is_number,
+    "bytes": _is_count,
+    "holes": _is_count,
+    "non_finite": _is_count,
+    "shape": _PAIR,
+    "closed": _list_of(_is_flag, 2),
+    "blocks": _list_of(_map_of({"shape": _PAIR, "closed": _list_of(_is_flag, 2)})),
+    "attributes": _list_of(_is_text),
+    "levels": _list_of(_STATE),
+    "layers": _list_of(_STATE),
+    "metadata": _map_of({}, notes=_list_of(_is_text)),
+}

@@ -1,0 +1,185 @@
+"""What ``pull`` keeps on disk of what comes, so that ``pull --resume`` goes on from there."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from lodestream.errors import (
+    CorruptStreamError,
+    FormatError,
+    LodestreamError,
+    OptionError,
+    RemoteError,
+    TooLargeError,
+)
+
+from .output import human_size, note
+
+if TYPE_CHECKING:
+    from ..cache import Part
+    from ..requests import Identity
+    from ..sync import Stream
+
+__all__ = ["Kept"]
+
+# Of what is free on the disk, the share that a container may take which nobody asked to keep: OUT wants more.
+_SHARE = 0.25
+
+
+class Kept:
+    """What is kept of one container while it comes; a context manager, which says so when it is left with an error.
+
+    With `asked`, what is there from before is used, and everything stays until the whole surface has been written.
+    Without, what comes is written as it comes, and removed when the command has done what it was to do: it stays when
+    the command is interrupted, loses its server or is killed. That it cannot be kept is then no error.
+
+    Parameters
+    ----------
+    asked : bool
+        Whether the command line says ``--resume``.
+
+    Attributes
+    ----------
+    store : Part or None
+        What a stream is to use and to write, if that was asked for.
+    identity : Identity or None
+        Of the container in `store`.
+    """
+
+    def __init__(self, asked: bool) -> None:
+        self.store: Part | None = None
+        self.identity: Identity | None = None
+        self._asked = asked
+        self._part: Part | None = None
+        self._stream: Stream | None = None
+        self._fresh = True  # nothing was there before
+        self._full = False
+        self._why_not = ""
+
+    def __enter__(self) -> Kept:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if error is not None:
+                self.failed(error)
+            if isinstance(error, LodestreamError | OSError | KeyboardInterrupt) and self._total:
+                note(self.words)
+        finally:
+            if self._part is not None:
+                self._part.close()
+
+    @property
+    def _total(self) -> int:
+        """Bytes that will be there when this is left."""
+        return self._part.ranges.total if self._part is not None and not self._part.discarded else 0
+
+    @property
+    def words(self) -> str:
+        """How much is kept and what for, or why nothing is; for the user."""
+        if self._total:
+            return f"{human_size(self._total)} are kept; pull --resume goes on from there"
+        return f"nothing is kept: {self._why_not}" if self._why_not else ""
+
+    def use(self, identity: Identity) -> None:
+        """Go on from what is kept of this container.
+
+        Raises
+        ------
+        LodestreamError
+            When another program has it open.
+        OSError
+            When the folder cannot be written.
+        """
+        if identity.name is None or identity.size is None:
+            self._why_not = "the server does not tell one version of the file from another"
+            note(self.words)
+            return
+        try:
+            self.store = self._part = _opened(identity.name, identity.size)
+        except LodestreamError as error:
+            raise LodestreamError(f"{error}; wait for it, or do without --resume") from None
+        self.identity = identity
+        if self._total:
+            note(f"{human_size(self._total)} are here from before")
+
+    def follow(self, stream: Stream) -> None:
+        """Take what `write` gets for the container of this stream."""
+        self._stream = stream
+
+    def write(self, offset: int, data: bytes) -> None:
+        """Keep bytes of the container, as far as that is possible."""
+        if self._part is None and not self._why_not:
+            self._begin()
+        if self._part is None or self._full:
+            return
+        try:
+            for start, length in list(self._part.ranges.missing(offset, len(data))):
+                self._part.write(start, data[start - offset : start - offset + length])
+        except OSError as error:
+            self._full = True
+            note(f"no more is kept for pull --resume: {_reason(error)}")
+
+    def read(self, offset: int, length: int) -> bytes | None:
+        """Bytes of the container; None where they are not kept."""
+        if self._part is None or not self._part.ranges.covers(offset, length):
+            return None
+        return self._part.read(offset, length)
+
+    def failed(self, error: BaseException) -> None:
+        """Tell why the command does not do what it was to do; what can be of no use after that is not kept."""
+        if self._part is None:
+            return
+        changed = isinstance(error, RemoteError) and error.code == "other-container"
+        refused = isinstance(error, FormatError | OptionError | TooLargeError) and self._fresh and not self._asked
+        # Damage is not to be met again next time.
+        self._part.discarded |= changed or refused or isinstance(error, CorruptStreamError)
+
+    def done(self, whole: bool) -> None:
+        """Tell that OUT has been written, and whether it has the whole surface.
+
+        What is kept then stays where more of it may be asked for: by whoever said ``--resume`` and took a part, and by
+        another command that left it here.
+        """
+        if self._part is not None:
+            self._part.discarded |= whole if self._asked else self._fresh
+
+    def _begin(self) -> None:
+        identity = self._stream.identity if self._stream is not None else None
+        if identity is None or identity.name is None or identity.size is None:
+            self._why_not = "the server does not tell one version of the file from another"
+            return
+        try:
+            part = _opened(identity.name, identity.size)
+        except LodestreamError as error:
+            # Nothing to speak of unless the command fails: the other program keeps the same bytes.
+            self._why_not = str(error)
+            return
+        except OSError as error:
+            self._why_not = _reason(error)
+            note(f"what comes is not kept for pull --resume: {self._why_not}")
+            return
+        self._part, self._fresh = part, not part.ranges.total
+        folder = part.folder
+        if identity.size - part.ranges.total > _SHARE * shutil.disk_usage(folder).free:
+            self._full = True
+            self._why_not = _reason(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)))
+
+
+def _opened(name: str, size: int) -> Part:
+    from ..cache import Part, cache_folder, forget_old
+
+    folder: Path = cache_folder()
+    forget_old(folder)
+    return Part(folder, name, size)
+
+
+def _reason(error: OSError) -> str:
+    return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)

@@ -1,0 +1,45 @@
+"""``lodestream retry``: have a surface built that waits."""
+
+from __future__ import annotations
+
+import argparse
+
+from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_surface, token_of
+from .output import note_details, print_json, progress_bar, say
+
+__all__ = ["register", "run"]
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-command."""
+    parser = add_command(
+        subparsers,
+        "retry",
+        run,
+        "have a server build a surface again that waits, failed or is missing",
+        "Waits until the surface is ready; the last line of standard output is its address.",
+    )
+    parser.add_argument("url", type=parse_surface, metavar="URL", help="the surface's address")
+    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has taken it up")
+    add_token_option(parser)
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask, wait, print the address."""
+    from .. import sync
+
+    with progress_bar() as bar:
+        task = bar.add_task("building", total=1.0, figures="")
+        surface = sync.retry(
+            args.url,
+            wait=not args.no_wait,
+            progress=lambda stage, fraction: bar.update(task, description=stage, completed=fraction),
+            token=token_of(args),
+        )
+    note_details(surface.details)
+    if args.json:
+        print_json({**surface.details, "url": surface.url})
+    else:
+        say(surface.url)
+    return 0

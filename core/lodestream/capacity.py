@@ -1,0 +1,166 @@
+"""How much memory a container may have its reader take, told from its header before any is taken.
+
+A header of a few hundred bytes can promise a surface of billions of points, so what it promises is counted first:
+
+- of each block, point by point: what the coder keeps of a coefficient (7 bytes, and more in blocks of few rows or
+  columns, whose bands have edges), two integers of a picture and its successor (16 bytes), and the value twice, for
+  every channel, attributes included; 4 bytes where there are masks;
+- for each tile of each channel, and for each block: 2 KiB.
+
+What is read is counted as it comes: every byte, and what stands in tables as many times as it grows when it is read.
+Of either there may be as much as the capacity. Surfaces and views that the caller keeps are not counted, nor is what a
+format needs to write them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from .errors import TooLargeError
+
+__all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
+
+#: What a vertex of a capacity stands for: three coordinates in float64 take somewhat less.
+BYTES_PER_VERTEX = 128
+
+# In any case: headers, metadata, the tables of small surfaces.
+_LEAST = 16 * 1024 * 1024
+
+# Of the memory that this process can have: the surface takes as much, and what is read of its container as well.
+_SHARE = 0.4
+
+_COEFFICIENT, _PICTURE, _MASKS, _TABLE = 7, 16, 4, 2048
+_EDGE = 12  # rows or columns
+
+#: Rows and columns of a grid, and the bytes of a number in each of its channels.
+Extent = tuple[tuple[int, int], Iterable[int]]
+
+
+class Capacity:
+    """What a container may take; it counts what has been read.
+
+    Parameters
+    ----------
+    max_vertices : int or None
+        At most this many vertices, and `BYTES_PER_VERTEX` for each, whatever they are of, with 16 MiB in any case.
+        None: as many as take two fifths of the memory that this process can have, see `memory_limit`.
+
+    Attributes
+    ----------
+    bytes : int
+        For the surface, and again for what is read.
+    """
+
+    def __init__(self, max_vertices: int | None = None) -> None:
+        self.max_vertices = max_vertices
+        if max_vertices is None:
+            self.bytes = max(int(memory_limit() * _SHARE), _LEAST)
+        else:
+            self.bytes = _LEAST + max_vertices * BYTES_PER_VERTEX
+        self._read = 0
+
+    def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
+        """Refuse a surface that takes more than this.
+
+        Parameters
+        ----------
+        vertices : int
+            Of what is decoded.
+        grids : iterable of ((rows, columns), bytes of a number in each channel)
+            What is decoded.
+        masked : int
+            Points of which masks are kept.
+        tables : int
+            Tiles of all channels, and blocks.
+
+        Raises
+        ------
+        TooLargeError
+        """
+        if self.max_vertices is not None and vertices > self.max_vertices:
+            raise TooLargeError(f"expected at most {self.max_vertices:,} vertices (max_vertices), got {vertices:,}")
+        needed = masked * _MASKS + tables * _TABLE
+        for (rows, columns), sizes in grids:
+            edges = (1 + _EDGE / rows) * (1 + _EDGE / columns)
+            each = sum(_PICTURE + 2 * size + _COEFFICIENT * edges for size in sizes)
+            needed += int(rows * columns * each)
+        if needed > self.bytes:
+            enough = -(-(needed - _LEAST) // BYTES_PER_VERTEX)
+            raise TooLargeError(
+                f"expected a surface that takes at most {_size(self.bytes)} to decode "
+                f"({self._words}), got one of {vertices:,} vertices that takes {_size(needed)}; "
+                f"max_vertices={max(enough, vertices)} allows it"
+            )
+
+    def take(self, count: int) -> None:
+        """Count bytes that are read and kept, or what they become.
+
+        Raises
+        ------
+        TooLargeError
+            When there are more than a surface of this size has.
+        """
+        self._read += count
+        if self._read > self.bytes:
+            raise TooLargeError(
+                f"expected a container of which at most {_size(self.bytes)} are kept ({self._words}), got more"
+            )
+
+    @property
+    def _words(self) -> str:
+        if self.max_vertices is not None:
+            return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
+        return f"{_SHARE:.0%} of the memory there is"
+
+
+def memory_limit() -> int:
+    """Bytes of memory that this process can have: the machine's, its control group's or its own limit."""
+    return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
+
+
+def _physical() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError):
+        return 0
+
+
+def _own_limits() -> Iterator[int]:
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA):
+        limit = resource.getrlimit(kind)[0]
+        if limit != resource.RLIM_INFINITY:
+            yield limit
+
+
+def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
+    """The limits of the control group that this process is in, and of those above it."""
+    try:
+        lines = proc.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            folder, name = root, "memory.max"
+        elif "memory" in controllers.split(","):
+            folder, name = root / "memory", "memory.limit_in_bytes"
+        else:
+            continue
+        within = Path(path.lstrip("/"))
+        for group in (within, *within.parents):
+            try:
+                text = (folder / group / name).read_text().strip()
+            except OSError:
+                continue
+            if text.isdecimal():
+                yield int(text)
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:,.0f} MiB"

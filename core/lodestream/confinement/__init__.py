@@ -1,0 +1,76 @@
+"""A process that reads a stranger's file gives up, for good, everything that reading it does not need.
+
+On Linux the kernel sees to it: Landlock to paths, seccomp to system calls. Only the standard library is imported here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import landlock, seccomp
+from .places import library_places
+
+__all__ = ["Rights", "confine"]
+
+_NO_NEW_PRIVILEGES = 38  # PR_SET_NO_NEW_PRIVS
+_CAPABILITY_VERSION = 0x20080522  # _LINUX_CAPABILITY_VERSION_3
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What a process keeps, beside Python, libraries and their data, which it may read.
+
+    Attributes
+    ----------
+    read : tuple of Path
+        Files, and folders with all that is in them.
+    write : tuple of Path
+        Folders in which it may do anything with files and folders, and single files.
+    processes : bool
+        Whether it may start processes, which have the same rights.
+    """
+
+    read: tuple[Path, ...] = ()
+    write: tuple[Path, ...] = ()
+    processes: bool = False
+
+
+def confine(rights: Rights) -> tuple[str, ...]:
+    """Give up everything else, for this process and all that it starts.
+
+    No sockets are opened, no other process is looked into or sent a signal, nothing is executed, no mode, owner or
+    time of a file is changed. What is open stays open. The process should have one thread: Landlock holds the thread
+    that calls this, and those that it starts.
+
+    Returns
+    -------
+    tuple of str
+        What holds from now on, out of "landlock" and "seccomp"; the kernel may have neither.
+    """
+    if sys.platform != "linux":
+        return ()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0):
+        return ()
+    held = []
+    # A folder with more than libraries in it, such as that of a script, must not open the folder of the uploads.
+    own = {above for path in (*rights.read, *rights.write) for above in (path.absolute(), *path.absolute().parents)}
+    libraries = tuple(path for path in library_places(processes=rights.processes) if path not in own)
+    write = (*rights.write, Path(os.devnull))
+    if landlock.restrict(libc, (*libraries, *rights.read), write, libraries if rights.processes else ()):
+        held.append("landlock")
+    _drop_capabilities(libc)
+    if seccomp.restrict(libc, os.getpid(), processes=rights.processes):
+        held.append("seccomp")
+    return tuple(held)
+
+
+def _drop_capabilities(libc: ctypes.CDLL) -> None:
+    """Be no more than its user, even if that is root; nothing to do where there are none."""
+    header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
+    nothing = (ctypes.c_uint32 * 6)()
+    libc.capset(header, nothing)

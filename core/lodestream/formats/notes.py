@@ -1,0 +1,101 @@
+"""What readers and writers say of what did not come in or go out: one line for each loss."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..digest import DIGEST
+from ..errors import FormatWarning
+from ..surface import Surface
+from .source import number
+
+__all__ = ["keep_words", "listing", "metadata_left_out", "survives", "warn", "warn_left_out"]
+
+#: Names in one note, and characters of each.
+_MOST_NAMES = 12
+_LONGEST_NAME = 60
+
+#: Metadata that are no loss where a format cannot hold them: how a file was read and how its values were stored there.
+_OF_THE_FILE = frozenset(
+    "name format nodata seam turn angles dtype nodes plane volumes density variable encoding notes recognised poles "
+    f"area_or_point {DIGEST}".split()
+)
+
+#: Where heights lie; of points that have x and y, leftovers.
+_PLACE = ("geotransform", "grid", "axes")
+
+#: How a CRS begins in WKT 1 and 2.
+_WKT = re.compile(r"[A-Z][A-Z0-9_]*\[")
+
+#: Of ``faces``, what a grid of quads does not tell.
+_CUT = ("diagonal", "crossed", "left_out")
+
+
+def warn(text: str) -> None:
+    """Give a note, of one line whatever names it holds."""
+    line = "".join(character if character.isprintable() else " " for character in text)
+    warnings.warn(" ".join(line.split()), FormatWarning, stacklevel=3)
+
+
+def listing(names: Iterable[Any]) -> str:
+    """Some names, shortened, and how many more there are."""
+    texts = [str(name) for name in names]
+    shown = [text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..." for text in texts[:_MOST_NAMES]]
+    return ", ".join(shown) + (f" and {number(len(texts) - _MOST_NAMES)} more" if len(texts) > _MOST_NAMES else "")
+
+
+def warn_left_out(kind: str, names: Collection[str], why: str = "for which it has no place") -> None:
+    """Say what a file does not have, if there is anything."""
+    if names:
+        warn(f"{kind} is written without {listing(names)}, {why}")
+
+
+def keep_words(words: dict[str, str], key: str, text: str) -> None:
+    """Keep what a comment says of unit and CRS, as our writers of meshes put it; the first counts."""
+    text = text.strip()
+    if key in words or not text or (key == "crs" and not _WKT.match(text)) or key not in ("unit", "crs"):
+        return
+    words[key] = text
+
+
+def metadata_left_out(surface: Surface, held: Collection[str]) -> list[str]:
+    """The keys of metadata that a user would miss in a file that holds but some of them.
+
+    Parameters
+    ----------
+    surface : Surface
+    held : collection of str
+        The keys that the file holds, in whatever form.
+    """
+    heights = surface.blocks[0].points.ndim == 2
+    names = []
+    for key, value in surface.metadata.items():
+        if key in held or key in _OF_THE_FILE or value is None or value in ({}, [], ""):
+            continue
+        if key in _PLACE and not heights:
+            continue
+        if key == "faces" and not any(part in it for it in _maps(value) for part in _CUT):
+            continue
+        names.append(str(key))
+    return names
+
+
+def _maps(value: Any) -> list[dict[str, Any]]:
+    return [it for it in (value if isinstance(value, list) else [value]) if isinstance(it, dict)]
+
+
+def survives(values: NDArray[Any], dtype: Any) -> bool:
+    """Whether every value is the same number in another type; NaN are."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        other = values.astype(dtype)
+        back = other.astype(values.dtype)
+    whole = np.dtype(dtype).kind == "f" and values.dtype.kind in "iu"
+    # The largest integers are rounded up to a power of two, which comes back as another number, or as the same by luck.
+    beyond = whole and bool((other >= 2.0 ** (np.iinfo(values.dtype).bits - (values.dtype.kind == "i"))).any())
+    return not beyond and np.array_equal(back, values, equal_nan=values.dtype.kind == "f")

@@ -1,0 +1,327 @@
+"""A container of which nothing is believed: every section, the index, every value, and the errors that it tells."""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .container import headers, sections
+from .container.frames import Frame, section_extent, whole_section
+from .container.model import ByteRange, Header, Index, LayerRecord, Piece, Segment
+from .container.pieces import windows
+from .decoder import Decoder
+from .errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
+from .heights import to_xyz
+from .measure import extent_of
+from .picture import coordinate_distances, originals_of
+from .reconstruction import Reconstruction, initial_state
+from .seams import restore
+from .surface import Surface
+
+__all__ = ["Inspection", "inspect"]
+
+#: By how much, of itself, a recorded error may differ from the one found. Values are the same bit for bit wherever they
+#: are decoded; but who adds up as many squares as a surface may have points in another order finds another last digit.
+_TOLERANCE = 1e-9
+#: Values for each vertex allowed, so that few vertices of many channels are no way around the limit.
+_MOST_CHANNELS = 64
+#: The kind and length of a section take at most so many bytes.
+_FRAME_HEAD = 10
+
+#: How much is done when all sections are read, and when the complete surface is decoded.
+_READ, _DECODED = 0.2, 0.4
+
+#: What the functions that put a surface back where its metadata say may raise when these say something else.
+_UNUSABLE = (InputError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found of a container that is sound.
+
+    Attributes
+    ----------
+    index : Index
+    errors_checked : bool
+        The errors that it records are those of its layers and levels. Only the values that were encoded can tell, and
+        only an exact container has them; of others the errors are what its maker says.
+    """
+
+    index: Index
+    errors_checked: bool
+
+
+@dataclass
+class _Found:
+    """What stands in a container, in the words of its index."""
+
+    layers: list[LayerRecord] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
+    pieces: list[Piece] = field(default_factory=list)
+    exactness: ByteRange | None = None
+    figures: tuple[float, float] | None = None
+    metadata: ByteRange | None = None
+    tops: dict[tuple[int, int], int] = field(default_factory=dict)  # of tiles and channels that have been named
+
+
+def inspect(
+    file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None] = lambda fraction: None
+) -> Inspection:
+    """Look a whole container through, and decode it once.
+
+    Nothing is decoded before the header has said how many vertices there are. Of an exact container each layer and
+    level is drawn and compared with the complete surface, about as much work as its encoder had with them.
+
+    Parameters
+    ----------
+    file : binary file
+        The container and nothing else; seekable.
+    max_vertices : int
+        Larger surfaces are refused.
+    progress : callable
+        Called now and then with the fraction done, 0 to 1.
+
+    Raises
+    ------
+    CorruptStreamError
+        When it is damaged, does not say the same of itself everywhere, or more follows after its end; with the offset.
+    TruncatedStreamError
+        When it is cut short; the message names the offset.
+    UnsupportedVersionError
+        When it has a version that this program does not read.
+    TooLargeError
+        When it has more vertices than allowed.
+    """
+    size = file.seek(0, os.SEEK_END)
+    # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.
+    decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
+    decoder.feed(_start(file, size))
+    for frame, data in _sections(file, size):
+        if frame.kind == sections.HEADER and decoder.header is None:
+            _check_size(headers.parse_header(frame.payload, frame.payload_offset, frame.end), max_vertices)
+        decoder.feed(data)
+        assert decoder.header is not None  # the decoder takes nothing else first
+        _note(found, frame, decoder.header)
+        progress(_READ * frame.end / size)
+    decoder.finish()
+    assert decoder.index is not None  # the last section
+    _take_footer(file, size, decoder)
+    _compare(decoder.index, found)
+    surface = decoder.surface()
+    _check_values(decoder.index, surface)
+    progress(_DECODED)
+    _check_metadata(decoder, decoder.index, surface)
+    if decoder.index.header.exact:
+        _check_errors(decoder, decoder.index, surface, progress)
+    progress(1.0)
+    return Inspection(decoder.index, decoder.index.header.exact)
+
+
+def _read(file: BinaryIO, offset: int, length: int) -> bytes:
+    file.seek(offset)
+    return file.read(length)
+
+
+def _start(file: BinaryIO, size: int) -> bytes:
+    """Magic and version."""
+    start = _read(file, 0, len(sections.MAGIC) + 1)
+    if start[:-1] == sections.MAGIC[: len(start) - 1] and len(start) <= len(sections.MAGIC):
+        raise TruncatedStreamError(f"expected a container, got the first {size} bytes of one (at byte {size})")
+    return start
+
+
+def _sections(file: BinaryIO, size: int) -> Iterator[tuple[Frame, bytes]]:
+    """Each section, its CRC checked, up to the index."""
+    offset, kind = len(sections.MAGIC) + 1, -1
+    while kind != sections.INDEX:
+        head = _read(file, offset, _FRAME_HEAD)
+        extent = section_extent(head, offset)
+        if extent is None or offset + extent[1] > size:
+            wanted = "another section" if extent is None else f"a section of {extent[1]} bytes"
+            raise TruncatedStreamError(
+                f"expected {wanted}, got {size - offset} bytes: the container is cut short (at byte {offset})"
+            )
+        data, kind = _read(file, offset, extent[1]), head[0]
+        yield whole_section(data, offset, kind), data
+        offset += extent[1]
+
+
+def _check_size(header: Header, most: int) -> None:
+    points = sum(rows * columns for (rows, columns), _ in header.blocks)
+    if points > most:
+        raise TooLargeError(f"expected at most {most:,} vertices, got {points:,}")
+    if points * header.channels > most * _MOST_CHANNELS:
+        raise TooLargeError(
+            f"expected at most {_MOST_CHANNELS} values for each vertex allowed, got {header.channels} channels of "
+            f"{points:,} vertices"
+        )
+
+
+def _note(found: _Found, frame: Frame, header: Header) -> None:
+    """Add what a section is to what the index should say."""
+    place = ByteRange(frame.offset, frame.end - frame.offset)
+    if frame.kind == sections.LAYER:
+        _note_layer(found, frame, header)
+    elif frame.kind == sections.EXACTNESS:
+        count = sum(1 for _ in windows(header))
+        found.figures, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, count)
+        found.exactness = place
+        found.pieces = [Piece(ByteRange(at, len(data)), zlib.crc32(data) if data else 0) for data, at in pieces]
+    elif frame.kind == sections.METADATA:
+        found.metadata = place
+
+
+def _note_layer(found: _Found, frame: Frame, header: Header) -> None:
+    rms, worst, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+    number = len(found.layers)
+    level = found.layers[-1].level if found.layers else 0
+    for entry in entries:
+        # The decoder has made sure that it is told at the first segment of each.
+        top = found.tops.setdefault((entry.tile, entry.channel), entry.top)
+        place = ByteRange(frame.payload_offset + start, entry.length)
+        crc = zlib.crc32(frame.payload[start : start + entry.length])
+        found.segments.append(Segment(number, entry.tile, entry.channel, top, entry.passes, place, crc))
+        start += entry.length
+        level = max(level, header.layout.tiles[entry.tile].level)
+    if found.layers and rms > found.layers[-1].rms:
+        raise CorruptStreamError(
+            f"expected an RMS error of at most {found.layers[-1].rms}, that of the layer before, got {rms}",
+            frame.offset,
+        )
+    found.layers.append(LayerRecord(number, frame.offset, frame.end, level, rms, worst))
+
+
+def _take_footer(file: BinaryIO, size: int, decoder: Decoder) -> None:
+    """Feed the footer, after which nothing may stand."""
+    assert decoder.index is not None  # it has just come
+    end = decoder.index.index.end
+    footer = _read(file, end, sections.FOOTER_LENGTH)
+    if len(footer) < sections.FOOTER_LENGTH:
+        raise TruncatedStreamError(
+            f"expected a footer of {sections.FOOTER_LENGTH} bytes, got {len(footer)}: the container is cut short "
+            f"(at byte {end})"
+        )
+    decoder.feed(footer)
+    if sections.parse_footer(footer, end) != decoder.index.index:
+        raise CorruptStreamError("expected a footer that points at the index, got another place", end)
+    if decoder.index.size != size:
+        raise CorruptStreamError(
+            f"expected the end of the container, got {size - decoder.index.size} bytes more", decoder.index.size
+        )
+
+
+def _compare(index: Index, found: _Found) -> None:
+    """Refuse an index that says anything else than the sections."""
+    offset = index.index.offset
+    pairs: tuple[tuple[str, Sequence[object], Sequence[object]], ...] = (
+        ("layer", index.layers, found.layers),
+        ("segment", index.segments, found.segments),
+        ("piece", index.pieces, found.pieces),
+        ("section", (index.exactness, index.metadata), (found.exactness, found.metadata)),
+    )
+    for word, told, real in pairs:
+        wrong = [k for k, (a, b) in enumerate(zip(told, real, strict=False)) if a != b]
+        if wrong or len(told) != len(real):
+            number = wrong[0] if wrong else min(len(told), len(real))
+            raise CorruptStreamError(
+                f"expected an index of what stands in the file, got another {word} {number}", offset
+            )
+    last = found.figures or (found.layers[-1].rms, found.layers[-1].max_error)
+    if (index.levels[-1].rms, index.levels[-1].max_error) != last:
+        raise CorruptStreamError(f"expected errors {last} of the complete surface in the index, got others", offset)
+
+
+def _check_values(index: Index, surface: Surface) -> None:
+    """Refuse holes or an extent that are not the surface's. The digest was checked when it was decoded."""
+    header = index.header
+    if header.exact != (index.digest is not None):
+        wanted = "the SHA-256 of the values" if header.exact else "no SHA-256 of values that are not exact"
+        raise CorruptStreamError(f"expected {wanted}, got {index.digest!a:.80}", index.metadata.offset)
+    holes = tuple(block.holes for block in surface.blocks)
+    if holes != (header.holes or (0,) * len(holes)):
+        raise CorruptStreamError(f"expected {header.holes} holes in the blocks, got {holes}", 0)
+    if header.exact:
+        found = _extent(surface)
+        if not math.isclose(found, header.extent, rel_tol=_TOLERANCE):
+            raise CorruptStreamError(f"expected the extent of the surface, {found}, got {header.extent}", 0)
+
+
+def _extent(surface: Surface) -> float:
+    """Range of the heights, or diagonal of the box, of the valid points."""
+    corners: list[NDArray[Any]] = []
+    for block in surface.blocks:
+        points = block.points if block.points.ndim == 3 else block.points[..., np.newaxis]
+        flat = points.reshape(-1, points.shape[2]) if block.mask is None else points[block.mask]
+        corners += [flat.min(axis=0), flat.max(axis=0)]
+    box = np.stack(corners)[:, np.newaxis]
+    return extent_of(box[..., 0] if surface.blocks[0].points.ndim == 2 else box, min(box.shape[2], 3))
+
+
+def _check_metadata(decoder: Decoder, index: Index, complete: Surface) -> None:
+    """Refuse metadata that would upset whoever writes a level of the surface into a file."""
+    finest = index.header.levels
+    for level in range(finest + 1):
+        try:
+            surface = restore(decoder.surface(level) if level < finest else complete)
+            if level < finest:
+                to_xyz(surface)
+        except _UNUSABLE as error:
+            problem = f"{type(error).__name__}: {error}"
+            raise CorruptStreamError(
+                f"expected metadata that say how level {level} is restored, got others ({problem:.200})",
+                index.metadata.offset,
+            ) from None
+
+
+def _check_errors(decoder: Decoder, index: Index, surface: Surface, progress: Callable[[float], None]) -> None:
+    """Draw each layer and level, and refuse errors that are not theirs."""
+    ruler = _Ruler(index.header, decoder.view()._reconstruction, surface)
+    last, count = len(index.layers) - 1, len(index.layers) + index.header.levels
+    for record, view in zip(index.layers, decoder.layers, strict=False):
+        # What the last layer does not name has no coefficient but 0.
+        state = view._state if record.number < last else np.zeros_like(view._state)
+        _agree((record.rms, record.max_error), ruler.errors(state), f"layer {record.number}", record.offset)
+        progress(_DECODED + (1 - _DECODED) * (record.number + 1) / count)
+    for known in index.levels[:-1]:
+        state = initial_state(index.header)
+        state[: index.header.layout.tiles_of(known.level).stop] = 0
+        _agree((known.rms, known.max_error), ruler.errors(state), f"level {known.level}", index.index.offset)
+        progress(_DECODED + (1 - _DECODED) * (last + 1 + known.level + 1) / count)
+    _agree((index.levels[-1].rms, index.levels[-1].max_error), (0.0, 0.0), "the exact surface", index.index.offset)
+
+
+def _agree(told: tuple[float, float], found: tuple[float, float], what: str, offset: int) -> None:
+    if not all(math.isclose(a, b, rel_tol=_TOLERANCE) for a, b in zip(told, found, strict=True)):
+        raise CorruptStreamError(
+            f"expected the RMS and maximum error of {what}, {found[0]} and {found[1]}, got {told[0]} and {told[1]}",
+            offset,
+        )
+
+
+class _Ruler:
+    """Measures pictures as the encoder does: on lattice coordinates, each vertex once, holes left out."""
+
+    def __init__(self, header: Header, reconstruction: Reconstruction, surface: Surface) -> None:
+        self._header, self._reconstruction = header, reconstruction
+        points = []
+        for block in surface.blocks:
+            heights = block.points[..., 2] if header.plane is not None else block.points
+            points.append(np.ascontiguousarray(heights if heights.ndim == 3 else heights[..., np.newaxis]))
+        self._originals = originals_of(header.arrangement, points, [block.mask for block in surface.blocks])
+        self._chosen = np.arange(header.channels) < header.geometric
+
+    def errors(self, state: NDArray[np.int8]) -> tuple[float, float]:
+        """RMS and maximum error of the full-resolution picture of a state, exactness aside."""
+        header, known = self._header, self._reconstruction
+        pictures = known.pictures(known.length, state, header.levels, self._chosen)[: header.geometric]
+        curves = len(header.layout.grids) - len(header.parts)
+        coordinates = [np.stack([grids[curves + k] for grids, _ in pictures]) for k in range(len(header.parts))]
+        lattices, fractions = header.lattices[: header.geometric], [fraction for _, fraction in pictures]
+        return coordinate_distances(self._originals, lattices, coordinates, fractions)

@@ -1,0 +1,107 @@
+"""The bytes of requests, counted as h11 reads them: how much of a body is to come, and what its chunks cost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h11
+
+from .cuts import Allowance
+
+__all__ = ["MOST_REST", "CountedConnection"]
+
+#: How many bytes of a request are read after it was answered.
+MOST_REST = 64 * 1024
+
+# How long the head of a request may be.
+_MOST_HEAD = 16 * 1024
+
+# Chunks at once, and a second; beyond that each is to have, on the whole, this many bytes. A chunk costs as much as
+# 2 KiB that come in a large one.
+_CHUNKS = (500.0, 20.0)
+_LEAST_CHUNK = 16
+
+# What stands around chunks, extensions and trailers included, may be as much as what is in them, and this.
+_FRAMING = 256 * 1024
+
+
+class CountedConnection(h11.Connection):
+    """The server's side of HTTP/1.1, which counts the bytes and chunks of each request.
+
+    Attributes
+    ----------
+    chunks : int
+        Chunks that have begun, of all requests.
+    offence : str or None
+        What was wrong with the chunks of a body, once it was; `next_event` raises then.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(h11.SERVER, _MOST_HEAD)
+        self.chunks = 0
+        self._whole = False
+        self.offence: str | None = None
+        self._allowed = Allowance(*_CHUNKS)
+        self._promised = 0
+        self._came = 0
+        self._taken = 0
+
+    @property
+    def remaining(self) -> int:
+        """Bytes of the body that are to come, where it says how long it is."""
+        return self._promised - self._taken if self._whole else 0
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes."""
+        self._came += len(data)
+        super().receive_data(data)
+
+    def next_event(self) -> Any:
+        """As h11 does it.
+
+        Raises
+        ------
+        h11.RemoteProtocolError
+            Also when the chunks of a body are too small.
+        """
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            self._begin(event)
+        elif isinstance(event, h11.Data):
+            self._take(event)
+        return event
+
+    def send(self, event: h11.Event) -> Any:
+        """As h11 does it; an answer to a request of which much is to come says that it is the last one."""
+        if type(event) is h11.Response and self.their_state is h11.SEND_BODY and not self._ends_soon():
+            headers = [header for header in event.headers if header[0] != b"connection"] + [(b"connection", b"close")]
+            event = h11.Response(status_code=event.status_code, headers=headers, reason=event.reason)
+        return super().send(event)
+
+    def _ends_soon(self) -> bool:
+        return self._whole and self.remaining <= MOST_REST
+
+    def _begin(self, request: h11.Request) -> None:
+        headers = dict(request.headers)
+        self._whole = b"transfer-encoding" not in headers
+        self._promised = int(headers.get(b"content-length", b"0"))
+        self._came = self._taken = 0
+
+    def _take(self, event: h11.Data) -> None:
+        size = len(event.data)
+        self._taken += size
+        if self._whole:
+            return
+        self._allowed.earn(size / _LEAST_CHUNK)
+        if event.chunk_start:
+            self.chunks += 1
+            if not self._allowed.take():
+                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on the whole, got smaller ones")
+            if self._came > 2 * self._taken + _FRAMING:
+                self._refuse(
+                    f"less around chunks than in them, got {self._came} bytes with {self._taken} bytes of body"
+                )
+
+    def _refuse(self, words: str) -> None:
+        self.offence = f"expected {words}; send larger chunks, or the length of the body with it"
+        raise h11.RemoteProtocolError(self.offence)

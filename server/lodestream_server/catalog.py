@@ -1,0 +1,186 @@
+"""The records of all surfaces in memory, found by what they have in common."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+from .records import Record
+
+__all__ = ["Catalog", "Position"]
+
+_T = TypeVar("_T")
+
+# Ids by what they have in common, in the order in which they came.
+_Index = defaultdict[str, dict[str, None]]
+
+#: When a surface was made, in seconds since 1970, and its id: the order of a listing.
+Position = tuple[float, str]
+
+
+@dataclass
+class _Thing:
+    """An upload or a container on the disk that is one owner's, and how many of the owner's surfaces have it."""
+
+    size: int
+    users: int = 0
+
+
+def _on_disk(record: Record) -> Iterator[tuple[str, int]]:
+    if not record.upload_lost:
+        yield f"uploads/{record.folder}", record.upload_bytes
+    size = (record.info or {}).get("bytes")
+    if record.container is not None and isinstance(size, int):
+        yield f"containers/{record.container}", size
+
+
+class Catalog:
+    """Records by id, by upload, by container, and in the order in which they were made.
+
+    Changes want a lock; reading does not: each look is one step of the interpreter.
+
+    Parameters
+    ----------
+    records : iterable of Record
+    """
+
+    def __init__(self, records: Iterable[Record] = ()) -> None:
+        self._records: dict[str, Record] = {}
+        self._order: list[Position] = []
+        self._uploads: _Index = defaultdict(dict)
+        self._digests: _Index = defaultdict(dict)
+        self._containers: _Index = defaultdict(dict)
+        self._served = Counter[str]()
+        self._sizes = Counter[int]()
+        self._bytes: Counter[str | None] = Counter()  # by owner
+        self._things: dict[tuple[str | None, str], _Thing] = {}  # by owner and name
+        # In their order: each is appended to it.
+        for record in sorted(records, key=lambda record: (record.created, record.id)):
+            self.put(record)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def find(self, surface: str) -> Record | None:
+        """The record of a surface, if there is one."""
+        return self._records.get(surface)
+
+    def put(self, record: Record) -> None:
+        """Add a record, or replace that of the same surface, which is known all the while."""
+        before = self._records.get(record.id)
+        self._records[record.id] = record
+        self._count(record, 1)
+        if before is None or before.created != record.created:
+            insort(self._order, (record.created, record.id))
+        for index, key in self._keys(record):
+            index[key][record.id] = None
+        self._charge(record)
+        if before is not None:
+            self._discharge(before)
+            self._forget(before, record)
+
+    def drop(self, surface: str) -> None:
+        """Forget a surface, if it is known."""
+        record = self._records.pop(surface, None)
+        if record is not None:
+            self._discharge(record)
+            self._forget(record)
+
+    def kept(self, owner: str | None) -> int:
+        """Bytes of the uploads and containers of an owner's surfaces; those that several of them share count once."""
+        return self._bytes.get(owner, 0)
+
+    def _charge(self, record: Record) -> None:
+        for name, size in _on_disk(record):
+            thing = self._things.setdefault((record.owner, name), _Thing(size))
+            if not thing.users:
+                self._bytes[record.owner] += thing.size
+            thing.users += 1
+
+    def _discharge(self, record: Record) -> None:
+        for name, _ in _on_disk(record):
+            thing = self._things[record.owner, name]
+            thing.users -= 1
+            if not thing.users:
+                self._bytes[record.owner] -= thing.size
+                del self._things[record.owner, name]
+
+    def _forget(self, before: Record, after: Record | None = None) -> None:
+        """Take out what only the earlier record of a surface said."""
+        self._count(before, -1)
+        if after is None or before.created != after.created:
+            del self._order[bisect_left(self._order, (before.created, before.id))]
+        kept = () if after is None else self._keys(after)
+        for index, key in self._keys(before):
+            if not any(index is other and key == same for other, same in kept):
+                index[key].pop(before.id, None)
+                if not index[key]:
+                    del index[key]
+
+    def _count(self, record: Record, change: int) -> None:
+        if record.state == "ready" and record.container is not None:
+            _add(self._served, record.container, change)
+        if record.state != "failed":
+            _add(self._sizes, record.upload_bytes, change)
+
+    def _keys(self, record: Record) -> list[tuple[_Index, str]]:
+        keys = (
+            (self._uploads, record.folder),
+            (self._digests, record.upload_sha256),
+            (self._containers, record.container),
+        )
+        return [(index, key) for index, key in keys if key is not None]
+
+    def all(self) -> list[Record]:
+        """Every record, oldest first."""
+        return self._known(self._order[:])
+
+    def after(self, position: Position, most: int) -> list[Record]:
+        """At most so many records that come after a place in the order."""
+        start = bisect_right(self._order, position)
+        return self._known(self._order[start : start + most])
+
+    def of_digest(self, sha256: str) -> Iterator[Record]:
+        """The surfaces that were made of files with this hash."""
+        return self._chosen(self._digests, sha256)
+
+    def has_upload(self, folder: str) -> bool:
+        """Whether there is a surface whose uploaded files lie in a folder of this name."""
+        return folder in self._uploads
+
+    def has_container(self, sha256: str) -> bool:
+        """Whether there is a surface that has a container, or had it before it was lost."""
+        return sha256 in self._containers
+
+    def one_of_container(self, sha256: str) -> Record | None:
+        """One of the surfaces that have a container, or had it before it was lost; they say the same of it."""
+        surface = next(iter(tuple(self._containers.get(sha256, ()))), None)
+        return None if surface is None else self._records.get(surface)
+
+    def serves(self, sha256: str) -> bool:
+        """Whether a surface that is ready has a container."""
+        return sha256 in self._served
+
+    def has_size(self, size: int | None, *, form: bool) -> bool:
+        """Whether there may be an upload of a size that did not fail; a form is larger than what is in it.
+
+        It does not look at each: a form that is smaller than all uploads passes as well.
+        """
+        return bool(self._sizes) if size is None or form else size in self._sizes
+
+    def _chosen(self, index: _Index, key: str) -> Iterator[Record]:
+        found = (self._records.get(surface) for surface in tuple(index.get(key, ())))
+        return (record for record in found if record is not None)
+
+    def _known(self, positions: list[Position]) -> list[Record]:
+        found = (self._records.get(surface) for _, surface in positions)
+        return [record for record in found if record is not None]
+
+
+def _add(counter: Counter[_T], key: _T, change: int) -> None:
+    counter[key] += change
+    if not counter[key]:
+        del counter[key]

@@ -1,0 +1,72 @@
+"""What a connection may cost before it is cut, and what is written down of those that were."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from .logs import event
+from .metrics import Metrics
+
+__all__ = ["REASONS", "Allowance", "Cuts"]
+
+_log = logging.getLogger(__name__)
+
+#: Why a connection is cut; each is a ``kind`` of ``lodestream_errors_total``.
+REASONS = ("bad-request", "control-data", "fragments", "frames", "refused-body", "small-chunks")
+
+
+class Allowance:
+    """How many of something may come: so many at once, so many more each second, and what is earned.
+
+    Parameters
+    ----------
+    most : float
+        How many may come at once.
+    rate : float
+        How many more may come for each second.
+    """
+
+    __slots__ = ("_left", "_most", "_rate", "_seen")
+
+    def __init__(self, most: float, rate: float) -> None:
+        self._most = most
+        self._rate = rate
+        self._left = most
+        self._seen = time.monotonic()
+
+    def take(self) -> bool:
+        """Count one; whether it was still allowed."""
+        now = time.monotonic()
+        self._left = min(self._most, self._left + (now - self._seen) * self._rate) - 1
+        self._seen = now
+        return self._left >= 0
+
+    def earn(self, number: float) -> None:
+        """Allow more, but never more at once than at the beginning."""
+        self._left = min(self._most, self._left + number)
+
+
+class Cuts:
+    """The connections of a server that were cut: each is counted, and the log has a line for each reason (`repeats`).
+
+    Parameters
+    ----------
+    metrics : Metrics
+    """
+
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
+
+    def note(self, reason: str, client: tuple[str, int] | None) -> None:
+        """Write down that a connection was cut.
+
+        Parameters
+        ----------
+        reason : str
+            One of `REASONS`.
+        client : (host, port) or None
+            Whose connection it was.
+        """
+        self._metrics.failed(reason)
+        event(_log, f"connection cut: {reason}", logging.WARNING, client=client[0] if client else None)

@@ -1,0 +1,388 @@
+"""The process from which the processes of calls are forked: it has loaded everything, and reads nothing of strangers.
+
+It has one thread, so that forking is safe. Each call has a process to itself, which gives up what the call does not
+need before the call begins (`lodestream.confinement`) and ends with it: whatever a file did to its reader is gone
+before the next one is read.
+
+Over one socket come calls: a connection of their own, and the pipe for the answer. Over its connection comes what is
+to be called; back go a line when its process is there and one when it has ended, and when the other side closes it the
+process is killed. What the process itself says goes over the pipe, as JSON, and nobody here listens to it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import importlib
+import json
+import logging
+import math
+import os
+import resource
+import selectors
+import signal
+import socket
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from inspect import signature
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NoReturn, get_type_hints
+
+from pydantic import TypeAdapter
+from pydantic_core import to_json
+
+from lodestream.confinement import Rights, confine
+
+__all__ = ["Allowed", "main", "receive_exactly", "resolve"]
+
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+_INHERIT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
+_MOST_FILES = 256
+_MOST_SECONDS = 2.0**31
+
+_Warmed = tuple[str | None, str | None]
+_TRACEBACK = 20_000
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What the process of a call may touch and take.
+
+    Attributes
+    ----------
+    read : tuple of Path
+        Files and folders, beside Python and its libraries.
+    write : Path or None
+        A folder, in which its temporary files lie too.
+    processes : bool
+        Whether it may start processes, which have the same limits each.
+    memory : int or None
+        Bytes that it can write to and shares with nobody: neither code nor files that are mapped for reading. Beyond
+        them it gets MemoryError, or ends.
+    seconds : float or None
+        Of processor time.
+    file_bytes : int or None
+        Of each file that it writes.
+    """
+
+    read: tuple[Path, ...] = ()
+    write: Path | None = None
+    processes: bool = False
+    memory: int | None = None
+    seconds: float | None = None
+    file_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class _Request:
+    function: str
+    args: list[Any]
+    allowed: Allowed
+
+
+def main() -> None:
+    """Fork for each call that comes over the socket whose number is the first argument, until it is closed."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    # Ctrl-C, and the end of a service, reach every process: this one is its parent's to end.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    if sys.platform == "linux":  # or nobody would know when what a call has left behind has ended
+        ctypes.CDLL(None).prctl(_INHERIT_ORPHANS, 1)
+    parent = os.getppid()
+    confinement = _try_confinement()
+    _say(control, {"confinement": confinement})
+    with _ending_with(parent):
+        problem, note = _warm(sys.argv[2]) if sys.argv[2] else (None, None)
+    _say(control, {"problem": problem, "note": note})
+    gc.collect()
+    gc.freeze()  # or the first collection in each process would copy every page
+    _Server(control).run()
+
+
+class _Server:
+    """The calls that are under way, each with its connection and its process."""
+
+    def __init__(self, control: socket.socket) -> None:
+        self._control = control
+        self._calls: dict[int, socket.socket] = {}
+        self._selector = selectors.DefaultSelector()
+        self._ended, self._wake = os.pipe()
+
+    def run(self) -> None:
+        """Serve until the other side is gone; then nothing that was started is left."""
+        for end in (self._ended, self._wake):
+            os.set_blocking(end, False)
+        signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        self._selector.register(self._control, selectors.EVENT_READ)
+        self._selector.register(self._ended, selectors.EVENT_READ)
+        while True:
+            for key, _ in self._selector.select():
+                if key.fileobj is self._control:
+                    if not self._accept():
+                        for process in self._calls:
+                            _kill(process)
+                        return
+                elif key.fileobj == self._ended:
+                    os.read(self._ended, 4096)
+                    self._reap()
+                elif self._calls.get(key.data) is key.fileobj:
+                    # Whatever comes, the other side has no more to say than that it waits no longer.
+                    _kill(key.data)
+                    self._selector.unregister(key.fileobj)
+
+    def _accept(self) -> bool:
+        try:
+            message, handles, _, _ = socket.recv_fds(self._control, 1, 2)
+        except ConnectionError:
+            return False
+        if not message:
+            return False
+        connection = socket.socket(fileno=handles[0])
+        try:
+            length = int.from_bytes(receive_exactly(connection, 8), "big")
+            request = receive_exactly(connection, length)
+            self._start(request, connection, handles[1])
+        except (OSError, EOFError):
+            connection.close()
+        finally:
+            os.close(handles[1])
+        return True
+
+    def _start(self, request: bytes, connection: socket.socket, answer: int) -> None:
+        parent = os.getpid()
+        try:
+            process = os.fork()
+        except OSError as error:
+            _tell(connection, {"failed": error.errno or 0})
+            raise
+        if not process:
+            try:
+                # Of what stands open here only the way of the answer goes along.
+                connection.close()
+                self._close()
+                _become_a_call(parent, answer)
+                _answer(answer, request)
+            finally:
+                os._exit(1)
+        with suppress(OSError):
+            os.setpgid(process, process)  # whoever comes first
+        self._calls[process] = connection
+        self._selector.register(connection, selectors.EVENT_READ, process)
+        _tell(connection, {"begun": process})
+
+    def _close(self) -> None:
+        signal.set_wakeup_fd(-1)
+        self._selector.close()
+        for connection in (self._control, *self._calls.values()):
+            connection.close()
+        for end in (self._ended, self._wake):
+            os.close(end)
+
+    def _reap(self) -> None:
+        for process, connection in list(self._calls.items()):
+            options = os.WEXITED | os.WNOHANG | os.WNOWAIT
+            if os.waitid(os.P_PID, process, options) is None:
+                continue
+            _kill(process)  # what it has left behind, as long as its number is its own
+            status = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+            _wait_for_group(process)
+            del self._calls[process]
+            with suppress(KeyError):
+                self._selector.unregister(connection)
+            _tell(connection, {"ended": status})
+            connection.close()
+
+
+def _kill(process: int) -> None:
+    """Kill a process with all that it has started: none of them can leave its group."""
+    for kill in (os.killpg, os.kill):  # before it is in a group of its own there is nobody else
+        with suppress(ProcessLookupError):
+            kill(process, signal.SIGKILL)
+
+
+def _wait_for_group(group: int) -> None:
+    """Wait for the end of all that is left of a group that was killed: until then one might still be writing."""
+    with suppress(ChildProcessError):
+        while True:
+            os.waitpid(-group, 0)
+
+
+def _become_a_call(parent: int, answer: int) -> None:
+    os.setpgid(0, 0)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD):
+        signal.signal(number, signal.SIG_DFL)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for standard in (0, 1, 2):  # the log is not its to write
+        os.dup2(nothing, standard)
+    most = os.sysconf("SC_OPEN_MAX")
+    os.closerange(3, answer)
+    os.closerange(answer + 1, most if most > 0 else 1 << 16)
+
+
+def _answer(answer: int, text: bytes) -> NoReturn:
+    with os.fdopen(answer, "wb", 0) as pipe:
+        pipe.write(_call(text))
+    os._exit(0)
+
+
+def _call(text: bytes) -> bytes:
+    # Not every exception survives the way between processes: its name and its text do.
+    try:
+        request = TypeAdapter(_Request).validate_json(text)
+        function = resolve(request.function)
+        args = _arguments(function, request.args)
+        _limit(request.allowed)
+        return to_json({"returned": function(*args)})
+    except MemoryError as error:
+        return json.dumps({"memory": str(error)[:1000]}).encode()
+    except Exception as error:
+        number = getattr(error, "errno", None)
+        raised = {
+            "kind": type(error).__name__,
+            "errno": number if isinstance(number, int) else None,
+            "traceback": traceback.format_exc()[-_TRACEBACK:],
+        }
+        return json.dumps({"raised": raised}).encode()
+
+
+def _arguments(function: Callable[..., Any], values: list[Any]) -> list[Any]:
+    """What a function takes, of JSON's values."""
+    hints = get_type_hints(function)
+    kinds = [hints.get(name, Any) for name in signature(function).parameters]
+    return [TypeAdapter(kind).validate_python(value) for kind, value in zip(kinds, values, strict=False)]
+
+
+def _limit(allowed: Allowed) -> None:
+    if allowed.write is not None:
+        tempfile.tempdir = os.environ["TMPDIR"] = os.fspath(allowed.write)
+    limits = {
+        resource.RLIMIT_DATA: allowed.memory,
+        resource.RLIMIT_FSIZE: allowed.file_bytes,
+        resource.RLIMIT_NOFILE: _MOST_FILES,
+        resource.RLIMIT_CORE: 0,
+    }
+    for kind, most in limits.items():
+        if most is not None:
+            hard = resource.getrlimit(kind)[1]
+            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(kind, (most, most))
+    if allowed.seconds is not None:
+        most = math.ceil(min(time.process_time() + allowed.seconds, _MOST_SECONDS))
+        # Told so by SIGXCPU; who does not listen is killed.
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
+    kernels = sys.modules.get("lodestream.kernels")
+    folders = () if kernels is None else kernels.cache_folders()
+    if kernels is not None:
+        kernels.keep_no_more()
+    write = () if allowed.write is None else (allowed.write,)
+    confine(Rights((*allowed.read, *folders), write, allowed.processes))
+
+
+def resolve(name: str) -> Callable[..., Any]:
+    """The function of this name, ``module:qualified.name``."""
+    module, _, qualified = name.partition(":")
+    function: Callable[..., Any] = attrgetter(qualified)(importlib.import_module(module))
+    return function
+
+
+def receive_exactly(connection: socket.socket, length: int) -> bytes:
+    """So many bytes.
+
+    Raises
+    ------
+    EOFError
+        When fewer come.
+    """
+    data = bytearray()
+    while len(data) < length:
+        piece = connection.recv(length - len(data))
+        if not piece:
+            raise EOFError
+        data += piece
+    return bytes(data)
+
+
+def _say(control: socket.socket, message: dict[str, Any]) -> None:
+    # The other side may have gone; what is read next then says so.
+    with suppress(OSError):
+        control.send(json.dumps(message).encode())
+
+
+def _tell(connection: socket.socket, message: dict[str, int]) -> None:
+    with suppress(OSError):
+        connection.send(json.dumps(message).encode() + b"\n")
+
+
+def _try_confinement() -> list[str]:
+    """What the kernel holds a process to, found out by one that confines itself."""
+    return _in_a_fork(lambda: list(confine(Rights()))) or []
+
+
+def _warm(name: str) -> _Warmed:
+    """Call a function once in a process that ends then, and once here."""
+    # Whoever is the parent says it, once.
+    logging.getLogger("lodestream.kernels").disabled = True
+    try:
+        warm = resolve(name)
+    except Exception:
+        return traceback.format_exc()[-_TRACEBACK:], None
+    # What compiling takes in memory is gone with it; here what it has kept is loaded.
+    first = _in_a_fork(lambda: _attempt(warm))
+    return first if first is not None and first[0] is not None else _attempt(warm)
+
+
+def _attempt(function: Callable[[], object]) -> _Warmed:
+    """What went wrong, and what the function has to say."""
+    try:
+        note = function()
+    except Exception:
+        return traceback.format_exc()[-_TRACEBACK:], None
+    return None, note if isinstance(note, str) else None
+
+
+def _in_a_fork(function: Callable[[], Any]) -> Any:
+    """What a function returns, called in a process of its own, as JSON has it; None when it died."""
+    ours, theirs = os.pipe()
+    parent = os.getpid()
+    process = os.fork()
+    if not process:
+        try:
+            os.close(ours)
+            _become_a_call(parent, theirs)
+            with os.fdopen(theirs, "w") as pipe:
+                pipe.write(json.dumps(function()))
+        finally:
+            os._exit(0)
+    os.close(theirs)
+    with os.fdopen(ours, "rb") as pipe:
+        text = pipe.read()
+    os.waitpid(process, 0)
+    return json.loads(text) if text else None
+
+
+@contextmanager
+def _ending_with(process: int) -> Iterator[None]:
+    """While the ``with`` block lasts, end when this process has another parent than that one."""
+
+    def look(*_: object) -> None:
+        if os.getppid() != process:
+            os._exit(1)
+
+    signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, 0.5, 0.5)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -1,0 +1,149 @@
+"""WebSocket connections with bounds on what a client may send that is no message, and on what it does not take.
+
+uvicorn answers each ping at once, whether or not the pongs are taken, and looks at every frame of what has come before
+anything else has its turn. Here what comes is looked at in small pieces, each frame is counted, and so are the bytes of
+pongs that are not sent yet. Beyond a bound the connection is cut: who does such things reads no close frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
+
+from .cuts import Allowance, Cuts
+
+__all__ = ["stream_connections"]
+
+# How many bytes are looked at before the bounds are: at most 170 frames, which take some 3 ms.
+_PIECE = 1024
+
+# Before the handshake is answered nothing should come; a client that hurries is not refused for it.
+_MOST_EARLY = 64 * 1024
+
+_MOST_CONTROL_BYTES = 64 * 1024
+
+# The longest message in fragments of 260 bytes.
+_MOST_FRAGMENTS = 256
+
+# Frames of any kind: at once, and a second. Somebody who drags a picture about sends a `focus` for each of up to 144
+# pictures a second, and a link that was held up delivers several seconds of them together.
+_FRAMES = (2000.0, 500.0)
+
+# Of these, frames that are no message: pings, pongs, fragments.
+_OTHER_FRAMES = (200.0, 50.0)
+
+# What comes in answer to what the server has sent comes at the pace of the server: a grant, in fragments even.
+_EARNED = 4.0
+
+
+def stream_connections(cuts: Cuts) -> type[WebSocketsSansIOProtocol]:
+    """The class of a server's WebSocket connections; uvicorn makes one for each."""
+
+    class Chosen(_Connection):
+        pass
+
+    Chosen.cuts = cuts
+    return Chosen
+
+
+class _Connection(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket connection, with the bounds that it does not have.
+
+    Attributes
+    ----------
+    cuts : Cuts
+        Where it is written down when the connection is cut.
+    """
+
+    cuts: Cuts
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._held = bytearray()
+        self._asked = False
+        self._is_cut = False
+        self._frames = Allowance(*_FRAMES)
+        self._other_frames = Allowance(*_OTHER_FRAMES)
+        self._fragments = 0
+        self._control_bytes = 0
+
+    def data_received(self, data: bytes) -> None:
+        if not self._asked:
+            # The request, which the HTTP connection passes on.
+            self._asked = True
+            super().data_received(data)
+            return
+        self._held += data
+        self._feed()
+        if not self.handshake_complete and len(self._held) > _MOST_EARLY:
+            self._cut("frames")
+
+    async def receive(self) -> Any:
+        message = await super().receive()
+        self._feed()
+        return message
+
+    async def send(self, message: Any) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.send":
+            self._frames.earn(_EARNED)
+            self._other_frames.earn(_EARNED)
+        elif self._held:
+            # The handshake is answered, or the close frame is sent and its answer is waited for.
+            self._feed()
+
+    def _feed(self) -> None:
+        # After each message it is the application's turn: what is behind it waits, and no more is read meanwhile.
+        while self._held and self.handshake_complete and not self.read_paused and not self.transport.is_closing():
+            piece = bytes(self._held[:_PIECE])
+            del self._held[:_PIECE]
+            super().data_received(piece)
+        if self.transport.is_closing():
+            self._held.clear()
+
+    def handle_ping(self) -> None:
+        if self._is_cut:
+            return
+        before = self.transport.get_write_buffer_size()
+        super().handle_ping()
+        unsent = self.transport.get_write_buffer_size()
+        # Of what waits, this much at the most are pongs: nobody knows what has left of a buffer that was never empty.
+        self._control_bytes = (self._control_bytes if before else 0) + unsent - before
+        if min(self._control_bytes, unsent) > _MOST_CONTROL_BYTES:
+            self._cut("control-data")
+        self._count(message=False)
+
+    def handle_pong(self, event: Frame) -> None:
+        super().handle_pong(event)
+        self._count(message=False)
+
+    def handle_text(self, event: Frame) -> None:
+        self._fragments = 1
+        super().handle_text(event)
+        self._count(message=event.fin)
+
+    def handle_bytes(self, event: Frame) -> None:
+        self._fragments = 1
+        super().handle_bytes(event)
+        self._count(message=event.fin)
+
+    def handle_cont(self, event: Frame) -> None:
+        self._fragments += 1
+        super().handle_cont(event)
+        if self._fragments > _MOST_FRAGMENTS:
+            self._cut("fragments")
+        self._count(message=event.fin)
+
+    def _count(self, *, message: bool) -> None:
+        if not self._frames.take() or not (message or self._other_frames.take()):
+            self._cut("frames")
+
+    def _cut(self, reason: str) -> None:
+        if self._is_cut:
+            return
+        self._is_cut = True
+        self._held.clear()
+        self.cuts.note(reason, self.client)
+        self.transport.abort()

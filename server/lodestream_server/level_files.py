@@ -1,0 +1,158 @@
+"""The files of levels that were made: as many as there is room for, those asked for last."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from .durable import remove
+
+__all__ = ["Key", "Lease", "LevelFiles"]
+
+
+class Key(NamedTuple):
+    """What a file holds."""
+
+    container: str
+    level: int
+    format_name: str
+
+
+@dataclass
+class _File:
+    path: Path
+    size: int
+    readers: int = 0
+    forgotten: bool = False
+
+
+class Lease:
+    """A file that stays as long as somebody reads it.
+
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    """
+
+    def __init__(self, files: LevelFiles, file: _File) -> None:
+        self.path = file.path
+        self.size = file.size
+        self._files: LevelFiles | None = files
+        self._file = file
+        file.readers += 1
+
+    def again(self) -> Lease:
+        """Another one of the same file."""
+        assert self._files is not None, "it was not given back"
+        return Lease(self._files, self._file)
+
+    def release(self) -> None:
+        """Give it back; once is enough."""
+        files, self._files = self._files, None
+        if files is not None:
+            self._file.readers -= 1
+            files.released(self._file)
+
+
+class LevelFiles:
+    """Files in a folder of their own, which is made with the first of them.
+
+    All of them together, and what is written while one is made, take no more than ``most`` bytes of the disk: before
+    one is made, those that nobody reads go until half of that is free. Everything but the disk's own work happens in
+    the event loop, so nothing needs a lock.
+
+    Parameters
+    ----------
+    folder : Path
+    most : int
+        Bytes.
+    free : callable
+        How many bytes of the disk may be taken at all, now.
+    """
+
+    def __init__(self, folder: Path, most: int, free: Callable[[], Awaitable[int]]) -> None:
+        self.folder = folder
+        self.most = most
+        self._free = free
+        self._files: OrderedDict[Key, _File] = OrderedDict()
+        self._numbers = itertools.count()
+        self._lent = 0
+
+    def close(self) -> None:
+        """Remove them all."""
+        remove(self.folder)
+
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest file that can be made: a library may write one more on the way to it."""
+        return self.most // 4
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files, those included that are forgotten and still read."""
+        return self._lent + sum(file.size for file in self._files.values() if not file.readers)
+
+    def lend(self, key: Key) -> Lease | None:
+        """A file, if it is there."""
+        file = self._files.get(key)
+        if file is None:
+            return None
+        self._files.move_to_end(key)
+        return self._lease(file)
+
+    def _lease(self, file: _File) -> Lease:
+        if not file.readers:
+            self._lent += file.size
+        return Lease(self, file)
+
+    def released(self, file: _File) -> None:
+        """A reader has gone; a `Lease` says so."""
+        if not file.readers:
+            self._lent -= file.size
+            if file.forgotten:
+                remove(file.path)
+
+    async def make_room(self) -> int:
+        """Remove what is in the way of another file; bytes that one may have, 0 if there is no room."""
+        await self._shrink(self.most // 2)
+        free = await self._free()
+        if free < 2 * self.longest:
+            await self._shrink(0)
+            free = await self._free()
+        return max(min(self.longest, (self.most - self.size) // 2, free // 2), 0)
+
+    async def _shrink(self, most: int) -> None:
+        for key, file in list(self._files.items()):
+            if self.size <= most:
+                return
+            if not file.readers:
+                del self._files[key]
+                await asyncio.to_thread(remove, file.path)
+
+    def new_folder(self, key: Key) -> Path:
+        """The path of a folder for making a file."""
+        return self.folder / f"{key.container}-{key.level}-{key.format_name}.{next(self._numbers)}"
+
+    def add(self, key: Key, path: Path, size: int, *, kept: bool) -> Lease:
+        """Take a file that was made in a folder of `new_folder`; one that is not kept goes with its reader."""
+        place = path.parent.with_name(f"{path.parent.name}.level")
+        path.rename(place)
+        file = _File(place, size, forgotten=not kept)
+        if kept:
+            self._files[key] = file
+        return self._lease(file)
+
+    def forget(self, container: str) -> None:
+        """Remove the files of a container; those that are read, when they have been."""
+        for key in [key for key in self._files if key.container == container]:
+            file = self._files.pop(key)
+            file.forgotten = True
+            if not file.readers:
+                remove(file.path)

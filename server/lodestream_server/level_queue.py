@@ -1,0 +1,412 @@
+"""Levels as files: made one at a time in a process of its own, under limits, for as long as somebody waits for them.
+
+What becomes of a request:
+
+======================================  ================================================================================
+the file is there                       it is lent at once
+the same level is being made            it waits for that
+otherwise                               it waits its turn: callers take turns, whatever each of them asks for
+the client goes                         it leaves the queue; when nobody else waits, the process is killed
+the level is too large, its file too    413
+long, or it takes too long
+one caller asks for too much            429
+too many wait, slow readers hold all    503
+the room, or the process dies
+the disk has no room                    507
+======================================  ================================================================================
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from starlette.requests import ClientDisconnect
+
+from lodestream.errors import LodestreamError, TooLargeError
+
+from .durable import make_folder, remove
+from .folders import is_file
+from .level_files import Key, Lease, LevelFiles
+from .levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from .problems import BusyError, FullError, RestartingError, TooManyError
+from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError, WrongAnswerError
+from .settings import Settings
+from .storage import Storage
+
+__all__ = ["LevelQueue", "Loan"]
+
+_log = logging.getLogger(__name__)
+
+# Less room than this is none.
+_LEAST_ROOM = 4 << 10
+
+_DEATHS = 2
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+
+class _Job:
+    """A level that somebody waits for.
+
+    Attributes
+    ----------
+    waiting : int
+        How many do.
+    done : future
+        Whether it was made, or why not.
+    lease : Lease or None
+        Of the file, for as long as somebody still has to take it over.
+    kept : bool
+        The container is still there, so that others may ask for the file.
+    """
+
+    def __init__(self, key: Key, caller: str) -> None:
+        self.key = key
+        self.caller = caller
+        self.waiting = 0
+        self.done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.lease: Lease | None = None
+        self.kept = True
+
+
+class Loan:
+    """A file that is lent to a caller, who is counted until it is given back.
+
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    """
+
+    def __init__(self, lease: Lease, gave_back: Callable[[], None]) -> None:
+        self.path = lease.path
+        self.size = lease.size
+        self._lease = lease
+        self._gave_back: Callable[[], None] | None = gave_back
+
+    def release(self) -> None:
+        """Give it back; once is enough."""
+        gave_back, self._gave_back = self._gave_back, None
+        if gave_back is not None:
+            self._lease.release()
+            gave_back()
+
+
+class LevelQueue:
+    """Who waits for which level, and the process that makes them.
+
+    Parameters
+    ----------
+    settings : Settings
+    storage : Storage
+    files : LevelFiles
+    fork_server : ForkServer
+    """
+
+    def __init__(self, settings: Settings, storage: Storage, files: LevelFiles, fork_server: ForkServer) -> None:
+        self._settings = settings
+        self._storage = storage
+        self._files = files
+        self._pool = Pool(1, fork_server)
+        self._jobs: dict[Key, _Job] = {}
+        self._turns: OrderedDict[str, deque[_Job]] = OrderedDict()
+        self._working: tuple[_Job, asyncio.Task[None]] | None = None
+        self._waiting = 0
+        self._callers: Counter[str] = Counter()
+        self._lent: Counter[str] = Counter()
+        self._closing = False
+
+    async def borrow(self, request: Request, key: Key, caller: str) -> Loan:
+        """A file, made if it is not there, unless the client goes meanwhile.
+
+        Parameters
+        ----------
+        request : Request
+            Whose body was not read.
+        key : Key
+            A level and a format that there are.
+        caller : str
+            Key of whoever asks.
+
+        Raises
+        ------
+        TooManyError
+            When this caller asks for as many as one may, or holds too many bytes.
+        BusyError
+            When too many wait, or the room is held by readers.
+        FullError
+            When the disk has no room.
+        TooLargeError
+            When the level needs more memory, bytes or time than one may have.
+        ClientDisconnect
+            When the client has gone.
+        LodestreamError
+            As decoding and writing do.
+        """
+        return await _while_there(request, self.take(key, caller))
+
+    async def take(self, key: Key, caller: str) -> Loan:
+        """The same for somebody who stays."""
+        self._check_caller(caller)
+        self._callers[caller] += 1
+        try:
+            lease = self._files.lend(key)
+            if lease is None:
+                lease = await self._wait(key, caller)
+            try:
+                self._check_bytes(caller)
+            except TooManyError:
+                lease.release()
+                raise
+        except BaseException:
+            self._leave(caller)
+            raise
+        self._lent[caller] += lease.size
+        return Loan(lease, partial(self._gave_back, caller, lease.size))
+
+    async def close(self) -> None:
+        """Kill what is under way, and remove the files."""
+        self._closing = True
+        if self._working is not None:
+            task = self._working[1]
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+        for job in self._jobs.values():
+            if not job.done.done():
+                job.done.set_exception(RestartingError("expected a level before the server ended; ask again"))
+                job.done.exception()
+        await asyncio.to_thread(self._pool.close)
+        await asyncio.to_thread(self._files.close)
+
+    def forget(self, container: str) -> None:
+        """Remove the files of a container that is gone."""
+        self._files.forget(container)
+        for key, job in self._jobs.items():
+            if key.container == container:
+                job.kept = False
+
+    def _check_caller(self, caller: str) -> None:
+        most = self._settings.max_client_level_requests
+        if self._callers[caller] >= most:
+            raise TooManyError(
+                f"expected at most {most} requests for levels of one client at the same time, those included of which "
+                "the answer is on the way; come back when some are done"
+            )
+        self._check_bytes(caller)
+
+    def _check_bytes(self, caller: str) -> None:
+        # So that one client that reads slowly leaves room for the others.
+        if self._lent[caller] >= self._files.most // 4:
+            raise TooManyError(
+                f"expected less than {self._files.most // 4} bytes of levels on the way to one client, got "
+                f"{self._lent[caller]}; read them first"
+            )
+
+    def _leave(self, caller: str) -> None:
+        self._callers[caller] -= 1
+        if not self._callers[caller]:
+            del self._callers[caller]
+            self._lent.pop(caller, None)
+
+    def _gave_back(self, caller: str, size: int) -> None:
+        self._lent[caller] -= size
+        self._leave(caller)
+
+    async def _wait(self, key: Key, caller: str) -> Lease:
+        most = self._settings.max_level_requests
+        if self._waiting >= most:
+            raise BusyError(f"expected at most {most} requests for levels at the same time; come back soon")
+        job = self._jobs.get(key) or self._submit(key, caller)
+        job.waiting += 1
+        self._waiting += 1
+        try:
+            await asyncio.shield(job.done)
+            assert job.lease is not None, "it was made"
+            return job.lease.again()
+        finally:
+            job.waiting -= 1
+            self._waiting -= 1
+            if not job.waiting:
+                self._abandon(job)
+
+    def _submit(self, key: Key, caller: str) -> _Job:
+        job = self._jobs[key] = _Job(key, caller)
+        self._turns.setdefault(caller, deque()).append(job)
+        # In the next step of the loop: whoever asks has not begun to wait yet.
+        asyncio.get_running_loop().call_soon(self._go_on)
+        return job
+
+    def _abandon(self, job: _Job) -> None:
+        """Nobody waits for it any more."""
+        if job.lease is not None:
+            job.lease.release()
+        if job.done.done():
+            return
+        job.done.cancel()
+        self._drop(job)
+        if self._working is not None and self._working[0] is job:
+            self._working[1].cancel()
+            return
+        turns = self._turns[job.caller]
+        turns.remove(job)
+        if not turns:
+            del self._turns[job.caller]
+
+    def _drop(self, job: _Job) -> None:
+        if self._jobs.get(job.key) is job:
+            del self._jobs[job.key]
+
+    def _go_on(self) -> None:
+        if self._working is not None or self._closing:
+            return
+        loop = asyncio.get_running_loop()
+        if not self._turns:
+            return
+        caller, turns = self._turns.popitem(last=False)
+        job = turns.popleft()
+        if turns:
+            self._turns[caller] = turns
+        task = loop.create_task(self._work(job))
+        self._working = job, task
+        task.add_done_callback(self._worked)
+
+    def _worked(self, task: asyncio.Task[None]) -> None:
+        self._working = None
+        if not task.cancelled() and task.exception() is not None:
+            _log.error("a level could not be made for a reason that nobody foresaw", exc_info=task.exception())
+        self._go_on()
+
+    async def _work(self, job: _Job) -> None:
+        try:
+            lease = await self._make(job)
+        except Exception as error:
+            self._drop(job)
+            if not job.done.done():
+                job.done.set_exception(error)
+                job.done.exception()  # each that waits is told; where nobody does any more, nobody has to be
+            return
+        self._drop(job)
+        if job.done.done():  # nobody waits any more
+            lease.release()
+        else:
+            job.lease = lease
+            job.done.set_result(None)
+
+    async def _make(self, job: _Job) -> Lease:
+        container = await asyncio.to_thread(self._storage.container, job.key.container)
+        most = await self._files.make_room()
+        if most < _LEAST_ROOM:
+            raise self._no_room(most)
+        folder = self._files.new_folder(job.key)
+        wanted = LevelJob(container, job.key.level, job.key.format_name, folder, most)
+        try:
+            await asyncio.to_thread(_make_folders, folder)
+            size = await self._insist(wanted, job.key)
+            return self._files.add(job.key, wanted.path, size, kept=job.kept)
+        finally:
+            await asyncio.to_thread(remove, folder)
+
+    async def _insist(self, wanted: LevelJob, key: Key) -> int:
+        for _ in range(_DEATHS):
+            try:
+                return await self._run(wanted, key)
+            except ProcessDiedError as error:
+                _log.warning("level %d of %s: %s", key.level, key.container, error)
+                await asyncio.to_thread(_empty, wanted.folder)
+        raise BusyError("the process that made the level was ended; come back soon")
+
+    async def _run(self, wanted: LevelJob, key: Key) -> int:
+        advice = "ask for a coarser level, or stream the surface"
+        seconds = self._settings.level_seconds
+        try:
+            call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings.level_memory))
+            made: MadeLevel | RefusedLevel = await self._pool.run(call)
+        except TimeoutError:
+            raise TooLargeError(f"expected a level that is made within {seconds:g} s; {advice}") from None
+        except MemoryError:
+            most = self._settings.level_memory >> 20
+            raise TooLargeError(f"expected a level that needs at most {most} MiB of memory; {advice}") from None
+        except UnforeseenError as error:
+            if error.kind == "FileNotFoundError":
+                raise self._storage.gone(key.container) from None
+            if error.errno in _NO_ROOM:
+                raise self._no_room(0) from None
+            _log.error("a level could not be made for a reason that nobody foresaw: %s", error.traceback)
+            raise
+        except OSError as error:
+            # No process could be started.
+            raise BusyError(f"the server's system lacks what a process needs: {error.strerror}") from error
+        if isinstance(made, MadeLevel):
+            return await asyncio.to_thread(_checked_size, wanted, made)
+        if made.kind == TooLargeError.__name__:
+            if wanted.most_bytes < self._files.longest:
+                raise self._no_room(wanted.most_bytes)
+            raise TooLargeError(f"expected a level whose file has less than {wanted.most_bytes} bytes; {advice}")
+        raise made.error()
+
+    def _no_room(self, most: int) -> LodestreamError:
+        # What readers hold will be free again; what else is on the disk will not by itself.
+        if 2 * most + self._files.size + _LEAST_ROOM >= self._files.most:
+            return BusyError(f"expected room for a level, got {most} bytes beside those that others read; come back")
+        return FullError(
+            f"expected room on the disk for a level, got {most} bytes; remove surfaces or enlarge the disk"
+        )
+
+
+def _allowed(wanted: LevelJob, memory: int) -> Allowed:
+    """What the process that makes a level may touch and take: a stranger may have written the container."""
+    return Allowed((wanted.container,), wanted.folder, memory=memory, file_bytes=wanted.most_bytes)
+
+
+def _checked_size(wanted: LevelJob, made: MadeLevel) -> int:
+    """Bytes of the file that was made, if there is one and it is no link to another."""
+    if not is_file(wanted.path):
+        raise WrongAnswerError("expected a level in a file of its own")
+    found = wanted.path.lstat()
+    if found.st_nlink != 1 or found.st_size != made.size or made.size > wanted.most_bytes:
+        raise WrongAnswerError(f"expected a level of {made.size} bytes in a file of its own, got {found.st_size}")
+    return made.size
+
+
+def _make_folders(folder: Path) -> None:
+    folder.parent.mkdir(exist_ok=True)
+    make_folder(folder)
+
+
+def _empty(folder: Path) -> None:
+    remove(folder)
+    make_folder(folder)
+
+
+async def _while_there(request: Request, work: Coroutine[Any, Any, Loan]) -> Loan:
+    """What is lent once it is; the work is cancelled when the client goes."""
+    working, watching = asyncio.ensure_future(work), asyncio.ensure_future(_gone(request))
+    try:
+        await asyncio.wait((working, watching), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+        raise ClientDisconnect
+    except asyncio.CancelledError:
+        if working.done() and not working.cancelled() and working.exception() is None:
+            working.result().release()
+        raise
+    finally:
+        working.cancel()
+        watching.cancel()
+        await asyncio.gather(working, watching, return_exceptions=True)
+
+
+async def _gone(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -1,0 +1,59 @@
+"""How many files this process may have open, and how many connections that is enough for."""
+
+from __future__ import annotations
+
+import logging
+import resource
+
+from .settings import Settings
+
+__all__ = ["most_connections", "raise_file_limit"]
+
+_log = logging.getLogger(__name__)
+
+# Where the settings say nothing and files are no concern.
+_MOST = 5000
+
+# A connection, and the file that is sent or received over it.
+_FILES_EACH = 2
+
+# The pipe of a process, and what there is beside it while it starts; the one that makes levels counts too.
+_FILES_OF_PROCESS = 4
+
+# The log, the lock, sockets that listen, the event loop's own, and what threads open for a moment.
+_OTHER_FILES = 40
+
+
+def raise_file_limit(settings: Settings) -> None:
+    """Let this process open as many files as it may need, or as many as the system lets it."""
+    wanted = _MOST if settings.max_connections is None else settings.max_connections
+    needed = _FILES_EACH * wanted + _others(settings)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    if allowed < needed:
+        _log.warning(
+            "%d connections may need %d open files and this process may open %d, enough for %d: raise the limit "
+            "(ulimit -n) or set LODESTREAM_MAX_CONNECTIONS",
+            wanted,
+            needed,
+            allowed,
+            _enough_for(allowed, settings),
+        )
+
+
+def most_connections(settings: Settings) -> int:
+    """How many connections there may be: what the settings say, or what the open files are enough for."""
+    if settings.max_connections is not None:
+        return settings.max_connections
+    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return _MOST if soft == resource.RLIM_INFINITY else _enough_for(soft, settings)
+
+
+def _enough_for(files: int, settings: Settings) -> int:
+    return min(max((files - _others(settings)) // _FILES_EACH, 1), _MOST)
+
+
+def _others(settings: Settings) -> int:
+    return _OTHER_FILES + _FILES_OF_PROCESS * (settings.workers + 1)

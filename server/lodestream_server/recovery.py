@@ -1,0 +1,255 @@
+"""What a start does with the folder that it finds: nothing that was acknowledged is removed.
+
+============================================  ==========================================================================
+what is found                                 what becomes of it
+============================================  ==========================================================================
+a delete that was under way                   it is finished: somebody asked for it
+an upload with its own record, but none in    the record is written again: the surface is adopted
+``records/``
+a record that cannot be used                  set aside, and the one beside the upload takes its place; without
+                                              that one it stays, and its surface is missing
+an upload without any record                  set aside
+a container that no record speaks of          set aside, unless it may be that of a surface that has none yet
+a record without its container                it is built again from its upload
+a record without its container and upload     it is missing, until they are back or it is deleted
+uploads and builds under way, files half      removed: nobody was told that they are there, or they can be made again
+written, levels that were fetched
+============================================  ==========================================================================
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from .aside import set_aside
+from .durable import remove, sync_folder, write_file
+from .folders import Folders, is_file
+from .records import Record, read_record, serialize
+
+__all__ = ["finish_delete", "has_upload", "present", "recover", "stray_containers"]
+
+_log = logging.getLogger(__name__)
+
+
+def recover(at: Folders) -> list[Record]:
+    """Put a folder in order that no server works in; its records, each with the state in which it is now.
+
+    Raises
+    ------
+    OSError
+        When something cannot be read, so that it is not known what is there.
+    """
+    for folder in (at.incoming, at.work):
+        folder.mkdir(exist_ok=True)
+    for path in at.unfinished():
+        remove(path)
+    records, unusable = _load(at)
+    # Before any delete is finished: it may share its upload with a surface that only its record there tells of.
+    _adopt(at, records, unusable)
+    for path in list(at.tombstones()):
+        _finish(at, path, records, unusable)
+    for surface, problem in unusable.items():
+        if surface not in records:
+            records[surface] = _stand_in(at, surface, problem)
+    _count_attempts(at, records)
+    _take_from_twins(at, records)
+    found = {surface: present(at, record) for surface, record in records.items()}
+    _set_strays_aside(at, found)
+    for folder in (at.incoming, at.work):
+        for path in folder.iterdir():
+            remove(path)
+    remove(at.levels)
+    return list(found.values())
+
+
+def present(at: Folders, record: Record) -> Record:
+    """A record as what lies on the disk shows it: ready, to be built, or missing.
+
+    Raises
+    ------
+    OSError
+        When it cannot be seen what is there.
+    """
+    if record.state == "failed":
+        return record
+    if _has_container(at, record):
+        return replace(record, state="ready", reason=None)
+    if has_upload(at, record):
+        return record if record.state == "waiting" else replace(record, state="queued", reason=None)
+    if record.state == "missing":  # its record cannot be used, which is the reason
+        return record
+    reason = "neither its upload nor its container is on the server's disk"
+    _log.warning("%s is missing: %s", record.id, reason)
+    return replace(record, state="missing", reason=reason)
+
+
+def _has_container(at: Folders, record: Record) -> bool:
+    return record.container is not None and is_file(at.container(record.container))
+
+
+def has_upload(at: Folders, record: Record) -> bool:
+    """Whether every uploaded file of a surface is there."""
+    return bool(record.filenames) and all(is_file(path) for path in at.files(record))
+
+
+def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_container: bool) -> None:
+    """Remove what a surface had, once its record has been made a tombstone; the tombstone goes last.
+
+    Parameters
+    ----------
+    at : Folders
+    record : Record
+    last_upload, last_container : bool
+        No other surface has the same. An upload stays all the same if another record lies beside it.
+
+    Raises
+    ------
+    OSError
+        When something cannot be removed; the next start tries again.
+    """
+    if last_container and record.container is not None:
+        remove(at.container(record.container))
+        sync_folder(at.containers)
+    upload = at.upload(record)
+    own = at.copies_of(record)
+    if last_upload and all(path in own for path in at.copies(upload)):
+        remove(upload)
+        if upload.exists():
+            raise OSError(f"expected to remove {upload}, which is still there")
+        sync_folder(at.uploads)
+    elif upload.exists():
+        for copy in own:
+            remove(copy)
+        sync_folder(upload)
+    remove(at.tombstone(record.id))
+    sync_folder(at.records)
+
+
+def stray_containers(at: Folders, records: Collection[Record]) -> list[Path]:
+    """Containers that no record speaks of, unless one of them may be that of a surface that has none yet."""
+    if any(record.container is None and record.state != "failed" for record in records):
+        return []
+    known = {record.container for record in records}
+    return [path for path in at.all_containers() if path.stem not in known]
+
+
+def _load(at: Folders) -> tuple[dict[str, Record], dict[str, str]]:
+    """The records by surface, and what is wrong with those that cannot be used."""
+    records, unusable = {}, {}
+    for path in at.all_records():
+        try:
+            record = read_record(path)
+        except ValueError as error:
+            unusable[path.stem] = str(error)
+        else:
+            records[record.id] = record
+    return records, unusable
+
+
+def _finish(at: Folders, tombstone: Path, records: dict[str, Record], unusable: dict[str, str]) -> None:
+    try:
+        record = read_record(tombstone)
+    except ValueError as error:
+        _log.warning("%s was being deleted, but its record cannot be used: %s", tombstone.stem, error)
+        set_aside(at, tombstone)
+        return
+    if is_file(at.record(record.id)):  # uploaded again since
+        remove(tombstone)
+        return
+    others = list(records.values())
+    try:
+        finish_delete(
+            at,
+            record,
+            last_upload=all(other.folder != record.folder for other in others),
+            # Who knows which container a record speaks of that cannot be used?
+            last_container=not (unusable.keys() - records.keys())
+            and all(other.container != record.container for other in others),
+        )
+    except OSError as error:
+        _log.warning("what is left of %s, which was deleted, could not be removed: %s", record.id, error)
+
+
+def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) -> None:
+    deleted = {path.stem for path in at.tombstones()}
+    for upload in at.all_uploads():
+        for path in at.copies(upload):
+            try:
+                record = read_record(path)
+            except ValueError as error:
+                _log.warning("%s is no record and is left alone: %s", path, error)
+                continue
+            if record.folder != upload.name or record.id in records or record.id in deleted:
+                continue
+            if record.id in unusable:
+                where = set_aside(at, at.record(record.id))
+                _log.warning(
+                    "the record of %s cannot be used (%s) and is now %s", record.id, unusable[record.id], where
+                )
+            write_file(at.record(record.id), serialize(record))
+            _log.warning("%s had no record and has that which lies beside its upload, %s", record.id, path)
+            records[record.id] = record
+
+
+def _take_from_twins(at: Folders, records: dict[str, Record]) -> None:
+    # A record from beside an upload does not know its container; that of a surface that was made alike may.
+    made = {key: record for record in records.values() if (key := _recipe(record)) and _has_container(at, record)}
+    for surface, record in records.items():
+        twin = made.get(_recipe(record) or ()) if record.container is None and record.state != "failed" else None
+        if twin is not None:
+            records[surface] = replace(record, state="ready", container=twin.container, info=twin.info)
+            with suppress(OSError):  # a full disk: it is found again at the next start
+                write_file(at.record(surface), serialize(records[surface]))
+
+
+def _recipe(record: Record) -> tuple[object, ...] | None:
+    if record.upload_sha256 is None:
+        return None
+    return record.upload_sha256, record.name, record.filenames, tuple(sorted(record.options.items()))
+
+
+def _stand_in(at: Folders, surface: str, problem: str) -> Record:
+    _log.warning("the record of %s cannot be used and stays as it is; see lodestream fsck: %s", surface, problem)
+    created = 0.0
+    with suppress(OSError):
+        created = at.record(surface).stat().st_mtime
+    return Record(surface, None, created, (), 0, {}, state="missing", reason="its record on the server is damaged")
+
+
+def _count_attempts(at: Folders, records: dict[str, Record]) -> None:
+    for surface in {path.name.partition(".")[0] for path in at.work.iterdir()}:
+        begun = records.get(surface)
+        # One that has its container was built: only its folder was still to be removed.
+        if begun is not None and begun.state in ("queued", "ready") and not _has_container(at, begun):
+            records[surface] = replace(begun, attempts=begun.attempts + 1)
+            with suppress(OSError):  # a full disk: it is counted again after the next end
+                write_file(at.record(surface), serialize(records[surface]))
+
+
+def _set_strays_aside(at: Folders, records: dict[str, Record]) -> None:
+    everything = {record.folder for record in records.values()}
+    everything |= {_folder_of(path) for path in at.tombstones()}
+    for upload in at.all_uploads():
+        if upload.name not in everything and all(record.filenames for record in records.values()):
+            _try_aside(at, upload, "no record speaks of it, and it has none of its own")
+    if any(not record.filenames for record in records.values()):
+        return  # it may be that of a record that cannot be used
+    for container in stray_containers(at, records.values()):
+        _try_aside(at, container, "no record speaks of it")
+
+
+def _folder_of(tombstone: Path) -> str:
+    with suppress(ValueError):
+        return read_record(tombstone).folder
+    return tombstone.stem
+
+
+def _try_aside(at: Folders, path: Path, reason: str) -> None:
+    try:
+        _log.warning("%s is set aside as %s: %s", path, set_aside(at, path), reason)
+    except OSError as error:
+        _log.warning("%s could not be set aside (%s) and stays: %s", path, reason, error)

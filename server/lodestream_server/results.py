@@ -1,0 +1,88 @@
+"""What a build says that it has made, and what the server believes of it: the bytes of the container, once looked at.
+
+A file may have taken its reader over. So the process of a build has no word in what the server tells or keeps, but
+whether it has built, why not, and whose word the errors of an uploaded container are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import CorruptStreamError, InputError, StreamError
+
+from . import finished
+from .processes import WrongAnswerError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from .worker import Built
+
+__all__ = ["check", "reason_of"]
+
+# An index holds a record per segment, a few megabytes for the largest surfaces; masks take a bit a vertex at most.
+_MOST_AT_ONCE = 256 << 20
+
+_LONGEST_REASON = 2000
+
+
+def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
+    """What is told of the container that a build has made, by the container alone.
+
+    Nobody writes to it any more: the process has ended, with all that it had started.
+
+    Parameters
+    ----------
+    path : Path
+        Where the container has to be.
+    built : Built
+        The word of the process.
+    files : sequence of Path
+        The upload.
+
+    Returns
+    -------
+    dict
+        What ``lodestream info --json`` prints.
+
+    Raises
+    ------
+    WrongAnswerError
+        When there is no such file, it has not the bytes that it should have, or is no container.
+    OSError
+        When it cannot be read.
+    """
+    from lodestream.container import read_index
+
+    # A link could lead to what belongs to somebody else, and a pipe would be waited for. Nobody changes it any more.
+    found = path.lstat() if os.path.lexists(path) else None
+    if found is None or not stat.S_ISREG(found.st_mode) or found.st_nlink != 1:
+        raise WrongAnswerError("expected a container in a file of its own")
+    with path.open("rb") as file:
+        handle = file.fileno()
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        if sha256 != built.sha256:
+            raise WrongAnswerError(f"expected a container with the SHA-256 {built.sha256}, got {sha256}")
+
+        def read(offset: int, length: int) -> bytes:
+            if length > _MOST_AT_ONCE:
+                raise CorruptStreamError(f"expected at most {_MOST_AT_ONCE} bytes at once, got {length}", offset)
+            return os.pread(handle, length, offset)
+
+        try:
+            index = read_index(read, found.st_size)
+            errors = built.errors if finished.is_container(files[0]) else None
+            info = finished.figures_of(index, {finished.ERRORS: errors}, files)
+            return finished.checked(index, info)
+        except (InputError, StreamError) as error:
+            raise WrongAnswerError(reason_of(str(error))) from None
+
+
+def reason_of(text: str) -> str:
+    """A reason that a process gives, in one line that upsets no terminal, and no longer than people read."""
+    words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
+    return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

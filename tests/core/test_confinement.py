@@ -1,0 +1,258 @@
+"""What a process keeps that has given everything else up, and what it can do no more."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lodestream.confinement import landlock, places, seccomp
+
+_LIBC = ctypes.CDLL(None)
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has them")
+has_landlock = pytest.mark.skipif(
+    sys.platform != "linux" or not landlock.version(_LIBC), reason="this kernel has no Landlock"
+)
+has_seccomp = pytest.mark.skipif(
+    sys.platform != "linux" or platform.machine() not in ("x86_64", "aarch64"), reason="no filter for this machine"
+)
+
+# Runs expressions in a process that confines itself, and prints what came of each.
+_PROGRAM = """
+import json, os, socket, subprocess, sys, mmap, threading
+from pathlib import Path
+from lodestream.confinement import Rights, confine
+asked = json.loads(sys.argv[1])
+held = confine(Rights(tuple(map(Path, asked["read"])), tuple(map(Path, asked["write"])), asked["processes"]))
+found = []
+for text in asked["tried"]:
+    try:
+        found.append(repr(eval(text)))
+    except Exception as error:
+        found.append(type(error).__name__ + " " + str(getattr(error, "errno", "")))
+print(json.dumps({"held": held, "found": found}))
+"""
+
+
+def confined(tried: list[str], **rights: Any) -> dict[str, Any]:
+    """What comes of some expressions in a confined process."""
+    asked = {"read": [], "write": [], "processes": False, **rights, "tried": tried}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, json.dumps(asked)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    told: dict[str, Any] = json.loads(done.stdout)
+    return told
+
+
+@has_landlock
+def test_only_its_own_paths_are_open(tmp_path: Path) -> None:
+    mine, other, room = tmp_path / "mine", tmp_path / "other", tmp_path / "room"
+    mine.write_text("my own")
+    other.write_text("another's")
+    room.mkdir()
+    told = confined(
+        [
+            f"open({str(mine)!r}).read()",
+            f"open({str(mine)!r}, 'a')",
+            f"open({str(other)!r}).read()",
+            f"os.listdir({str(tmp_path)!r})",
+            f"open({str(room / 'new')!r}, 'w').write('12')",
+            f"os.rename({str(room / 'new')!r}, {str(room / 'newer')!r})",
+            f"os.rename({str(room / 'newer')!r}, {str(tmp_path / 'out')!r})",
+            f"os.symlink({str(other)!r}, {str(room / 'link')!r})",
+            f"open({str(room / 'link')!r}).read()",
+            "len(os.listdir('/proc/self/fd')) > 2",
+            "len(os.urandom(4)), len(open('/dev/urandom', 'rb').read(4))",
+            "open(os.devnull, 'w').write('x')",
+            "__import__('sqlite3').sqlite_version > ''",
+        ],
+        read=[str(mine)],
+        write=[str(room)],
+    )
+    assert "landlock" in told["held"]
+    assert told["found"] == [
+        "'my own'",
+        "PermissionError 13",
+        "PermissionError 13",
+        "PermissionError 13",
+        "2",
+        "None",
+        "PermissionError 13",
+        "None",
+        "PermissionError 13",
+        "True",
+        "(4, 4)",
+        "1",
+        "True",
+    ]
+    assert other.read_text() == "another's"
+
+
+@has_landlock
+def test_a_folder_of_scripts_around_it_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine, other = tmp_path / "data" / "mine", tmp_path / "data" / "other"
+    mine.parent.mkdir()
+    for path in (mine, other):
+        path.write_text("x")
+    monkeypatch.syspath_prepend(tmp_path)
+    told = confined([f"open({str(path)!r}).read()" for path in (mine, other)], read=[str(mine)])
+    assert told["found"] == ["'x'", "PermissionError 13"]
+
+
+@has_seccomp
+def test_calls_that_no_reader_needs_are_refused(tmp_path: Path) -> None:
+    told = confined(
+        [
+            "socket.socket()",
+            "socket.socketpair()",
+            "os.fork()",
+            "threading.Thread(target=int).start()",
+            "subprocess.run([sys.executable, '-c', ''])",
+            "os.kill(os.getppid(), 0)",
+            "os.kill(os.getpid(), 0)",
+            "os.setsid()",
+            "mmap.mmap(-1, 4096)",
+            "mmap.mmap(-1, 4096, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()",
+            "os.memfd_create('x')",
+            f"os.chmod({str(tmp_path)!r}, 0o700)",
+            f"os.utime({str(tmp_path)!r})",
+            f"os.truncate({str(tmp_path)!r}, 0)",
+            f"os.open({str(Path(__file__))!r}, os.O_RDONLY | os.O_TRUNC)",
+            "len([line for line in open('/proc/self/status') if line.startswith('CapEff:\\t0000000000000000')])",
+        ],
+        read=[str(Path(__file__))],
+        write=[str(tmp_path)],
+    )
+    assert "seccomp" in told["held"]
+    refused = "PermissionError 1"
+    assert told["found"] == [
+        *(refused, refused, refused),
+        "RuntimeError ",
+        *(refused, refused),
+        *("None", refused, refused, "None", refused, refused, refused, refused, refused, "1"),
+    ]
+
+
+@has_seccomp
+@has_landlock
+def test_processes_have_the_same_rights(tmp_path: Path) -> None:
+    (tmp_path / "other").write_text("x")
+    program = f"print(open('/proc/self/stat').read(1) != '', open({str(tmp_path / 'other')!r}).read())"
+    told = confined(
+        [
+            f"subprocess.run([sys.executable, '-c', {program!r}], capture_output=True, text=True).stderr",
+            "subprocess.run(['/bin/sh', '-c', ''])",
+            "socket.socket()",
+            "os.kill(os.getppid(), 0)",
+            "os.setsid()",
+        ],
+        processes=True,
+    )
+    assert "Permission denied" in told["found"][0]
+    assert told["found"][1:3] == ["PermissionError 13", "PermissionError 1"]
+    # Before the sixth version of Landlock nobody tells those of the same rights from others.
+    assert told["found"][3] == ("PermissionError 1" if landlock.version(_LIBC) >= 6 else "None")
+    assert told["found"][4] == "PermissionError 1"
+
+
+@pytest.mark.parametrize("machine", seccomp._MACHINES)
+def test_what_the_filter_does_call_by_call(machine: str) -> None:
+    # The kernel's machine for it has few instructions: here the filters of both architectures run on it.
+    architecture, calls = seccomp._MACHINES[machine]
+    filters = {
+        processes: b"".join(seccomp._program(architecture, calls, 77, processes=processes))
+        for processes in (False, True)
+    }
+
+    def verdict(name: str | int, *arguments: int, processes: bool = False, other: int = 0) -> str:
+        number = calls[name] if isinstance(name, str) else name
+        return _run(filters[processes], number, other or architecture, arguments)
+
+    assert verdict("socket") == "error 1"
+    assert verdict("socket", other=0x40000003) == "kill"
+    assert verdict(0x40000000 | 41) == "error 38"
+    assert [verdict(number) for number in (425, 435, 437, 500, 439, 446)] == ["error 38"] * 4 + ["allow"] * 2
+    assert [verdict("clone", 17), verdict("clone", 17, processes=True)] == ["error 1", "allow"]
+    assert verdict("clone", 0x10000000 | 17, processes=True) == "error 1"
+    assert [verdict("execve"), verdict("execve", processes=True)] == ["error 1", "allow"]
+    for name in ("kill", "tgkill", "tkill"):
+        assert [verdict(name, 77), verdict(name, 78)] == ["allow", "error 1"]
+    assert verdict("kill", 78, processes=True) == "allow"
+    assert [verdict("tgkill", pid, processes=True) for pid in (77, 78)] == ["allow", "error 1"]
+    flags = [os.O_RDONLY, os.O_RDONLY | os.O_TRUNC, os.O_WRONLY | os.O_TRUNC, os.O_RDWR | os.O_TRUNC]
+    assert [verdict("openat", 0, 0, flag) for flag in flags] == ["allow", "error 1", "allow", "allow"]
+    assert [verdict("mmap", 0, 0, 0, flag) for flag in (0x01, 0x21, 0x23, 0x22)] == [
+        *("allow", "error 1", "error 1", "allow")
+    ]
+    assert [verdict("prctl", 1, 9), verdict("prctl", 1, 0), verdict("prctl", 15, 0)] == [*("allow", "error 1", "allow")]
+    for name in {*seccomp._DENIED.split()} & calls.keys():
+        assert verdict(name) == verdict(name, processes=True) == "error 1", name
+    known = {*calls.values()}
+    assert all(verdict(number) == "allow" for number in range(424) if number not in known)
+
+
+def _run(program: bytes, number: int, architecture: int, arguments: tuple[int, ...]) -> str:
+    """What a filter says of a call."""
+    words = [number, architecture, 0, 0]
+    for argument in (*arguments, 0, 0, 0, 0, 0, 0)[:6]:
+        words += [argument & 0xFFFFFFFF, argument >> 32]
+    place = value = 0
+    while True:
+        code = int.from_bytes(program[8 * place : 8 * place + 2], sys.byteorder)
+        if_true, if_false = program[8 * place + 2], program[8 * place + 3]
+        k = int.from_bytes(program[8 * place + 4 : 8 * place + 8], sys.byteorder)
+        place += 1
+        if code == 0x20:
+            value = words[k // 4]
+        elif code == 0x54:
+            value &= k
+        elif code == 0x06:
+            return {0x7FFF0000: "allow", 0x80000000: "kill"}.get(k, f"error {k & 0xFFFF}")
+        else:
+            met = {0x15: value == k, 0x35: value >= k, 0x45: bool(value & k)}[code]
+            place += if_true if met else if_false
+
+
+@linux
+def test_the_numbers_are_the_kernels() -> None:
+    heads = {
+        "x86_64": Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h"),
+        "aarch64": Path("/usr/include/asm-generic/unistd.h"),
+    }
+    there = {machine: path for machine, path in heads.items() if path.is_file()}
+    if not there:
+        pytest.skip("the kernel's headers are not installed")
+    for machine, path in there.items():
+        text = path.read_text()
+        told = {name: int(number) for name, number in re.findall(r"#define __NR(?:3264)?_(\w+)\s+(\d+)\b", text)}
+        calls = seccomp._MACHINES[machine][1]
+        wrong = {name: number for name, number in calls.items() if told.get(name, number) != number}
+        assert wrong == {}
+        assert len(calls.keys() & told.keys()) > 100
+        # Every name that is refused is one of some machine.
+        for name in (*seccomp._DENIED.split(), *seccomp._START, *seccomp._SIGNALS):
+            assert name in calls or name not in told, (machine, name)
+
+
+def test_places_are_absolute_and_hold_python() -> None:
+    found = places.library_places()
+    assert all(path.is_absolute() for path in found)
+    assert Path(json.__file__).resolve().is_relative_to(next(p for p in found if p == Path(sys.base_prefix) / "lib"))
+    assert Path("/") not in found
+    assert Path("/proc") not in found
+    assert Path("/proc") in places.library_places(processes=True)

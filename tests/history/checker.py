@@ -1,0 +1,240 @@
+"""Says of a history what in it must not be: pure, so that it can be tried with histories made by hand.
+
+What one answer shows by itself is looked at first, then what holds for all time (which id a surface has, which bytes
+an id has), then the order (`order`): each surface by itself, since a history in which each register can be explained
+can be explained as a whole.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeVar
+
+from .events import Answer, Finding, History, Operation, Seen, Subject
+from .order import ABSENT, PRESENT, Step, Unexplained, unexplained
+
+__all__ = ["check"]
+
+# 429 and 503 come from a server that has too much to do or ends; 503 of bytes also says that they are missing.
+_BUSY = {429, 503}
+_FILES = {200, 404, 409, 424} | _BUSY
+_ALLOWED = {
+    "upload": {200, 202, 507} | _BUSY,
+    "delete": {204, 404} | _BUSY,
+    "retry": {200, 202, 404, 409, 424, 507} | _BUSY,
+    "look": {200, 404} | _BUSY,
+    "list": {200} | _BUSY,
+    "fetch": _FILES,
+    "values": _FILES | {507},  # there has to be room for the file of a level
+}
+# Codes of a 503 that say nothing of the surface.
+_ABOUT_THE_SERVER = {"busy", "restarting"}
+
+# What says that something was done, and what says nothing of it: such a one has until its server ends.
+_DONE = {"upload": {200, 202}, "delete": {204}, "retry": {200, 202}}
+_UNKNOWN = {500, 502, 503, 504}
+
+# The states of a surface whose bytes are answered so.
+_BYTES = {200: {"ready"}, 404: {ABSENT}, 409: {"queued", "building", "waiting"}, 424: {"failed", "waiting"}}
+_NO_BYTES = frozenset({"missing", "waiting"})
+
+_SHOWN = 12
+
+T = TypeVar("T")
+
+
+def check(history: History) -> list[Finding]:
+    """Everything that is wrong in a history; of the order, the first answer about each surface that cannot be.
+
+    Raises
+    ------
+    ValueError
+        When something is restored of which there is no backup.
+    """
+    surfaces = _Surfaces(history.operations)
+    return [
+        *history.findings,
+        *_answers(history, surfaces),
+        *surfaces.findings(),
+        *_orders(history, surfaces),
+    ]
+
+
+def _answers(history: History, surfaces: _Surfaces) -> list[Finding]:
+    found: dict[tuple[str, str], Finding] = {}
+    for operation in history.operations:
+        for rule, text in _wrong(operation, history.admins, surfaces):
+            # A server that is wrong is wrong again and again: the first time tells it.
+            found.setdefault((rule, text), Finding(rule, text, (operation,)))
+    return list(found.values())
+
+
+def _wrong(operation: Operation, admins: frozenset[str], surfaces: _Surfaces) -> Iterator[tuple[str, str]]:
+    """What one answer shows by itself: which rule, and what was expected of what."""
+    answer, about = operation.answer, operation.subject or operation.kind
+    if answer is None:
+        return
+    allowed = _ALLOWED[operation.kind]
+    if operation.kind in ("delete", "retry") and not _may_change(operation, admins):
+        allowed = {403, 404} | _BUSY
+    if answer.status not in allowed:
+        expected = f"{operation.kind}: expected one of {', '.join(map(str, sorted(allowed)))}"
+        rule = "not theirs" if 403 in allowed or answer.status == 403 else "answer"
+        yield rule, f"{about}: {expected}, got {answer.status} {answer.code or ''}".rstrip()
+    for seen in answer.seen:
+        if operation.surface not in (None, seen.id):
+            yield "another surface", f"{about}: expected {operation.surface}, got {seen.id}"
+        subject = operation.subject or surfaces.only(seen.id)
+        if subject is not None:
+            yield from _wrong_figures(seen, subject)
+    if operation.kind == "fetch" and answer.sha256 != answer.named:
+        yield "wrong bytes", f"{about}: expected the bytes of {answer.named}, got those of {answer.sha256}"
+    if operation.kind == "values" and operation.subject and answer.sha256 not in (None, operation.subject.sha256):
+        yield "wrong bytes", f"{about}: expected the values that were uploaded, got others"
+
+
+def _may_change(operation: Operation, admins: frozenset[str]) -> bool:
+    return operation.subject is None or operation.caller == operation.subject.owner or operation.caller in admins
+
+
+def _wrong_figures(seen: Seen, subject: Subject) -> Iterator[tuple[str, str]]:
+    if seen.name != subject.name:
+        yield "name", f"{subject}: expected the name {subject.name}, got {seen.name}"
+    if seen.state not in PRESENT:
+        yield "state", f"{subject}: expected one of {', '.join(sorted(PRESENT))}, got {seen.state}"
+    if seen.state == "ready" and seen.container is None:
+        yield "state", f"{subject}: expected the container of a surface that is ready, got none"
+    if seen.state == "failed" and subject.sound:
+        yield "refused", f"{subject}: expected what can be read to be built, got failed"
+    if seen.state == "ready" and not subject.sound:
+        yield "wrong bytes", f"{subject}: expected what cannot be read to fail, got ready"
+
+
+class _Surfaces:
+    """Which surface has which id and which containers, for all that the answers tell."""
+
+    def __init__(self, operations: Iterable[Operation]) -> None:
+        self.ids: dict[Subject, dict[str, Operation]] = defaultdict(dict)
+        self.subjects: dict[str, dict[Subject, Operation]] = defaultdict(dict)
+        self._containers: dict[Subject, dict[str, Operation]] = defaultdict(dict)
+        self._listed: dict[str, Operation] = {}
+        operations = list(operations)
+        for operation in operations:
+            if operation.kind == "upload" and operation.subject is not None:
+                for seen in operation.answer.seen if operation.answer is not None else ():
+                    self.ids[operation.subject].setdefault(seen.id, operation)
+                    self.subjects[seen.id].setdefault(operation.subject, operation)
+        # Uploaded, but with what id nobody was told: a list may show it.
+        self._unknown = any(
+            operation.kind == "upload" and operation.subject is not None and operation.subject not in self.ids
+            for operation in operations
+        )
+        for operation in operations:
+            if operation.answer is not None:
+                self._note(operation, operation.answer)
+
+    def only(self, surface: str) -> Subject | None:
+        """The subject with this id, if it is known and one."""
+        subjects = self.subjects.get(surface, {})
+        return next(iter(subjects)) if len(subjects) == 1 else None
+
+    def _note(self, operation: Operation, answer: Answer) -> None:
+        for seen in answer.seen:
+            self._listed.setdefault(seen.id, operation)
+            subject = operation.subject or self.only(seen.id)
+            if subject is not None and seen.state == "ready" and seen.container is not None:
+                self._containers[subject].setdefault(seen.container, operation)
+        if operation.kind == "fetch" and operation.subject is not None and answer.status == 200:
+            for sha256 in (answer.sha256, answer.named):
+                if sha256 is not None:
+                    self._containers[operation.subject].setdefault(sha256, operation)
+
+    def findings(self) -> Iterator[Finding]:
+        """Ids and containers that belong to more than one."""
+        for subject, ids in self.ids.items():
+            yield from _more_than_one("id", f"{subject}: expected one id for ever", ids)
+        for surface, subjects in self.subjects.items():
+            yield from _more_than_one("mixed", f"{surface}: expected the surface of one owner under one name", subjects)
+        for subject, containers in self._containers.items():
+            yield from _more_than_one("other bytes", f"{subject}: expected one container for ever", containers)
+        contents: dict[str, dict[str, Operation]] = defaultdict(dict)
+        for subject, containers in self._containers.items():
+            for container, operation in containers.items():
+                contents[container].setdefault(subject.sha256, operation)
+        for container, of in contents.items():
+            yield from _more_than_one("other bytes", f"container {container}: expected one upload's", of)
+        for surface, operation in self._listed.items():
+            if surface not in self.subjects and not self._unknown:
+                yield Finding("nobody's", f"{surface}: expected a surface that somebody has uploaded", (operation,))
+
+
+def _more_than_one(rule: str, expected: str, found: Mapping[T, Operation]) -> Iterator[Finding]:
+    if len(found) > 1:
+        names = ", ".join(str(item) for item in found)
+        yield Finding(rule, f"{expected}, got {names}", tuple(found.values()))
+
+
+def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
+    steps: dict[Subject, list[Step]] = {subject: [] for subject in surfaces.ids}
+    for operation in history.operations:
+        if operation.subject is not None:
+            steps.setdefault(operation.subject, []).extend(_steps(operation, history))
+        elif operation.answer is not None and operation.answer.status == 200:
+            listed = {seen.id: seen.state for seen in operation.answer.seen}
+            for subject, ids in surfaces.ids.items():
+                state = next((listed[surface] for surface in ids if surface in listed), ABSENT)
+                steps[subject].append(_read(operation, {state}))
+    for subject, own in steps.items():
+        found = unexplained(own, history.marks)
+        if found is not None:
+            yield _out_of_order(subject, found, own)
+
+
+def _steps(operation: Operation, history: History) -> Iterator[Step]:
+    """What an operation says of its surface, and does to it."""
+    answer, kind = operation.answer, operation.kind
+    status = None if answer is None else answer.status
+    if kind in _DONE:
+        if status in _DONE[kind]:
+            yield _write(operation, operation.ended, None)
+        elif status is None or status in _UNKNOWN:
+            yield _write(operation, None, history.ends.get(operation.server))
+        elif kind != "upload" and status in (403, 404, 409, 424):
+            yield _read(operation, {ABSENT} if status == 404 else PRESENT)
+    elif kind in ("fetch", "values") and answer is not None:
+        if answer.status in _BYTES and not answer.seen:
+            yield _read(operation, _BYTES[answer.status])
+        elif answer.status == 503 and answer.code not in _ABOUT_THE_SERVER:
+            yield _read(operation, _NO_BYTES)
+    elif status == 404:
+        yield _read(operation, {ABSENT})
+    # Apart from what it did: the answer may be older than the end of it.
+    for seen in answer.seen if answer is not None else ():
+        yield _read(operation, {seen.state})
+
+
+def _write(operation: Operation, ended: float | None, latest: float | None) -> Step:
+    assert operation.kind in ("upload", "delete", "retry")
+    return Step(operation.kind, operation.begun, ended, latest, operation=operation)
+
+
+def _read(operation: Operation, observed: Iterable[str]) -> Step:
+    return Step("read", operation.begun, operation.ended, observed=frozenset(observed), operation=operation)
+
+
+def _out_of_order(subject: Subject, found: Unexplained, steps: list[Step]) -> Finding:
+    step, possible = found.step, found.possible
+    observed = step.observed if step.kind == "read" else frozenset({f"a {step.kind} that was acknowledged"})
+    if ABSENT in observed and ABSENT not in possible:
+        rule = "lost"
+    elif possible == {ABSENT}:
+        rule = "came back"
+    elif possible == {"ready"}:
+        rule = "went back"
+    else:
+        rule = "order"
+    expected = f"expected it to be {' or '.join(sorted(possible))}" if possible else "expected an order of events"
+    operations = {id(item.operation): item.operation for item in steps if item.begun <= (step.ended or step.begun)}
+    around = sorted(filter(None, operations.values()), key=lambda operation: operation.begun)[-_SHOWN:]
+    return Finding(rule, f"{subject}: {expected}, got {' or '.join(sorted(observed))}", tuple(around))

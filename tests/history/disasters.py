@@ -1,0 +1,230 @@
+"""What may befall a server: ended, killed, out of room, without a folder, lost and restored, without an extra."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from .driver import Client
+from .events import History, Subject
+from .site import FOLDERS, Site, copy_tree
+
+__all__ = ["KINDS", "Disasters"]
+
+_PATIENCE = 60.0
+
+_MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
+
+raise ModuleNotFoundError("No module named 'rasterio'", name="rasterio")
+'''
+
+
+class Disasters:
+    """Things that happen to one server while clients are at work.
+
+    Parameters
+    ----------
+    site : Site
+        A server is running there before and after each of them.
+    history : History
+    operator : Client
+        Who asks what nobody else does.
+    picture : Subject or None
+        A GeoTIFF that nobody but the operator uploads and deletes; without it no extra can be missing.
+    folder : Path
+        Any place apart from the server's.
+    random_ : Random
+    longest : float
+        Most seconds for which clients are left alone.
+
+    Attributes
+    ----------
+    done : Counter
+        How often each kind came.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        history: History,
+        operator: Client,
+        picture: Subject | None,
+        folder: Path,
+        random_: random.Random,
+        longest: float,
+    ) -> None:
+        self.done = Counter[str]()
+        self._site = site
+        self._history = history
+        self._operator = operator
+        self._picture = picture
+        self._folder = folder
+        self._random = random_
+        self._longest = longest
+        self._left: dict[str, list[str]] = {}
+
+    @property
+    def count(self) -> int:
+        """How many came."""
+        return sum(self.done[kind] for kind in KINDS)
+
+    def happen(self, kind: str) -> None:
+        """Let one of `KINDS` happen."""
+        self._calm()
+        KINDS[kind](self)
+        self.done[kind] += 1
+
+    def restart(self) -> None:
+        """The server is told to end, and started again."""
+        self._site.stop()
+        self._site.start()
+
+    def kill(self) -> None:
+        """The server is killed at any moment, some of its build processes before it."""
+        if self._random.random() < 0.5:
+            self.done["build processes killed"] += self._site.kill_builds()
+            self._calm()
+        self._site.kill()
+        self._site.start()
+
+    def full(self) -> None:
+        """The disk fills up; a server ends, and another starts, while it is full."""
+        disk = self._site.disk
+        assert disk is not None, "expected a site on a disk of its own"
+        disk.fill(self._random.choice((0, 0, 4096, 30_000)))
+        self._calm()
+        end = self._next("full", ("go on", "kill", "stop"))
+        if end != "go on":
+            self._end(end)
+            self._site.start()
+            self._calm()
+        disk.empty()
+
+    def unmounted(self) -> None:
+        """One of the folders, or two, are not there when the server starts: it must refuse, and lose nothing."""
+        names = self._next("unmounted", (*FOLDERS, "records uploads", "uploads containers")).split()
+        self._end(self._random.choice(("kill", "stop")))
+        data, aside = self._site.data, self._site.aside
+        aside.mkdir()
+        for name in names:
+            (data / name).rename(aside / name)
+        self._refused(f"without {' and '.join(names)}")
+        for name in names:
+            # Where a disk is not mounted there is the folder that it is mounted on.
+            (data / name).mkdir(exist_ok=True)
+        self._refused(f"with {' and '.join(names)} empty")
+        for name in names:
+            shutil.rmtree(data / name)
+            (aside / name).rename(data / name)
+        aside.rmdir()
+        self._site.start()
+
+    def _refused(self, words: str) -> None:
+        arguments = ("serve", "--data", str(self._site.inside), "--host", "127.0.0.1", "--port", "0")
+        result = self._site.command(*arguments)
+        lines = result.stderr.strip().splitlines()
+        if result.returncode != 1 or len(lines) != 1:
+            said = " / ".join(lines[-3:])
+            expected = f"{words}: expected a server that ends with 1 and one line"
+            self._history.found("start", f"{expected}, got {result.returncode} and {len(lines)} lines: {said}")
+
+    def backup(self) -> None:
+        """The folder is copied under load as docs/operating.md says, lost later, and restored from the copy."""
+        site, history = self._site, self._history
+        history.mark("backup begins")
+        copy_tree(site.data, site.backup, names=("records",))
+        self._calm()
+        copy_tree(site.data, site.backup, without=("records", "incoming", "work", "levels", "lock"))
+        history.mark("backup ends")
+        self._calm()
+        self._end(self._random.choice(("kill", "stop")))
+        history.mark("restored")
+        site.move_to(site.backup)
+        site.start()
+
+    def extra(self) -> None:
+        """A server starts without rasterio: what needs it waits, and is built once it is there again."""
+        assert self._picture is not None, "expected a GeoTIFF, got none"
+        picture, operator, site = self._picture, self._operator, self._site
+        modules = self._folder / "without-rasterio"
+        modules.mkdir(exist_ok=True)
+        (modules / "rasterio.py").write_text(_MISSING_EXTRA)
+        self._end(self._random.choice(("kill", "stop")))
+        site.start(without=modules)
+        operator.delete(picture, picture.owner)
+        operator.upload(picture)
+        self._reaches(picture, "waiting", "without rasterio")
+        self._end(self._random.choice(("kill", "stop")))
+        if self._next("extra", ("request", "command")) == "command":
+            result = site.command("fsck", str(site.inside), "--retry")
+            if result.returncode != 0:
+                said = " / ".join(result.stderr.strip().splitlines()[-3:])
+                expected = "expected lodestream fsck --retry to end with 0"
+                self._history.found("retry", f"{expected}, got {result.returncode}: {said}")
+            site.start()
+        else:
+            site.start()
+            operator.retry(picture)
+        self._reaches(picture, "ready", "with rasterio again")
+
+    def settle(self, subjects: Sequence[Subject]) -> int:
+        """Wait until every build has come to its end, ask for everything; how many surfaces are ready."""
+        until, ready = time.monotonic() + 2 * _PATIENCE, 0
+        operator = self._operator
+        operator.list(None if not subjects else subjects[0].owner)
+        for subject in subjects:
+            state = operator.settled(subject, until)
+            if state == "waiting":
+                operator.retry(subject)
+                state = self._after_retry(subject, until)
+            if state is None or state == "waiting":
+                self._history.found("never built", f"{subject}: expected its build to come to an end, got {state}")
+            operator.fetch(subject)
+            operator.values(subject)
+            ready += state == "ready"
+        return ready
+
+    def _after_retry(self, subject: Subject, until: float) -> str | None:
+        # The answer to the retry may come before the build has begun.
+        while (state := self._operator.settled(subject, until)) == "waiting" and time.monotonic() < until:
+            time.sleep(0.1)
+        return state
+
+    def _reaches(self, subject: Subject, state: str, words: str) -> None:
+        until = time.monotonic() + _PATIENCE
+        found = self._operator.settled(subject, until)
+        if state == "ready" and found == "waiting":
+            found = self._after_retry(subject, until)
+        if found != state:
+            self._history.found("extra", f"{subject} {words}: expected it to be {state}, got {found}")
+
+    def _end(self, how: str) -> None:
+        if how == "kill":
+            self._site.kill()
+        else:
+            self._site.stop()
+
+    def _calm(self) -> None:
+        time.sleep(self._random.uniform(0.05, 1) * self._random.choice((self._longest / 5, self._longest)))
+
+    def _next(self, what: str, choices: Sequence[str]) -> str:
+        """One of some choices, each once before any of them comes again."""
+        left = self._left.setdefault(what, [])
+        if not left:
+            left += self._random.sample(choices, len(choices))
+        return left.pop()
+
+
+#: What may happen, by name.
+KINDS: dict[str, Callable[[Disasters], None]] = {
+    "restart": Disasters.restart,
+    "kill": Disasters.kill,
+    "full": Disasters.full,
+    "unmounted": Disasters.unmounted,
+    "backup": Disasters.backup,
+    "extra": Disasters.extra,
+}

@@ -1,0 +1,221 @@
+"""What clients have asked of one or several servers, and what came back: the history that `checker` judges."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+__all__ = ["Answer", "Finding", "History", "Kind", "Mark", "Operation", "Seen", "Subject"]
+
+Kind: TypeAlias = Literal["upload", "delete", "retry", "look", "list", "fetch", "values"]
+MarkKind: TypeAlias = Literal["backup begins", "backup ends", "restored"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Bytes that somebody pushes under a name: on a server one surface.
+
+    Attributes
+    ----------
+    owner : str or None
+        Name of the token; None where there are no tokens.
+    name : str
+    sha256 : str
+        Of the bytes.
+    sound : bool
+        They can be read and built.
+    """
+
+    owner: str | None
+    name: str
+    sha256: str
+    sound: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.name} of {self.owner}" if self.owner else self.name
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What an answer says of one surface.
+
+    Attributes
+    ----------
+    id, state : str
+    name : str or None
+    container : str or None
+        SHA-256 in hexadecimal digits.
+    """
+
+    id: str
+    state: str
+    name: str | None = None
+    container: str | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back.
+
+    Attributes
+    ----------
+    status : int
+        Of HTTP; of the last answer where the first one is a redirect.
+    seen : tuple of Seen
+    code : str or None
+        Of a problem document.
+    sha256 : str or None
+        Of the bytes of a container, or of the values.
+    named : str or None
+        The SHA-256 under which the server showed a container.
+    """
+
+    status: int
+    seen: tuple[Seen, ...] = ()
+    code: str | None = None
+    sha256: str | None = None
+    named: str | None = None
+
+
+@dataclass(eq=False)
+class Operation:
+    """One thing that a client asked for.
+
+    Attributes
+    ----------
+    client, server : str
+        Who asked, and whom: one process of a server, which has another name after a restart.
+    kind : Kind
+    caller : str or None
+        Name of the token with which it was asked.
+    subject : Subject or None
+        None for a list.
+    surface : str or None
+        The id that was asked for.
+    begun : float
+        Seconds, by the history's clock.
+    ended : float or None
+        When the answer had come; None when none came.
+    answer : Answer or None
+    """
+
+    client: str
+    server: str
+    kind: Kind
+    caller: str | None
+    subject: Subject | None
+    surface: str | None
+    begun: float
+    ended: float | None = None
+    answer: Answer | None = None
+
+    def __str__(self) -> str:
+        ended = "" if self.ended is None else f"{self.ended:.4f}"
+        words = f"{self.begun:10.4f} to {ended:>9} {self.client} at {self.server}: {self.kind}"
+        if self.caller is not None:
+            words += f" as {self.caller}"
+        if self.answer is None:
+            return f"{words}: no answer"
+        states = ", ".join(seen.state for seen in self.answer.seen) if self.kind != "list" else ""
+        return f"{words}: {self.answer.status} {states or self.answer.code or ''}".rstrip()
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Something that happened to all surfaces at one moment."""
+
+    kind: MarkKind
+    moment: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that must not be.
+
+    Attributes
+    ----------
+    rule : str
+        Which promise is broken, in a word or two.
+    text : str
+        What was expected and what came, in one line.
+    operations : tuple of Operation
+        What was asked of that surface around it, in the order in which it began.
+    """
+
+    rule: str
+    text: str
+    operations: tuple[Operation, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join((f"{self.rule}: {self.text}", *(f"  {operation}" for operation in self.operations)))
+
+
+@dataclass
+class History:
+    """A history as it is being recorded, by several threads.
+
+    Attributes
+    ----------
+    clock : callable
+        Seconds, of any beginning; the same for all that is recorded.
+    admins : frozenset of str
+        Callers who may change what belongs to others.
+    operations : list of Operation
+    marks : list of Mark
+    ends : dict
+        When each server had ended: what it had not answered by then has happened before that moment or never.
+    findings : list of Finding
+        What was seen to be wrong while it was recorded.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    admins: frozenset[str] = frozenset()
+    operations: list[Operation] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    ends: dict[str, float] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    def begin(
+        self,
+        client: str,
+        server: str,
+        kind: Kind,
+        caller: str | None = None,
+        subject: Subject | None = None,
+        surface: str | None = None,
+    ) -> Operation:
+        """Note that something is about to be asked."""
+        with self._lock:
+            operation = Operation(client, server, kind, caller, subject, surface, self.clock())
+            self.operations.append(operation)
+            return operation
+
+    def end(self, operation: Operation, answer: Answer) -> None:
+        """Note what was answered."""
+        with self._lock:
+            operation.ended = self.clock()
+            operation.answer = answer
+
+    def forget(self, operation: Operation) -> None:
+        """Take back what was never sent."""
+        with self._lock:
+            self.operations.remove(operation)
+
+    def server_ended(self, server: str) -> None:
+        """Note that a server has ended, with all that it was doing."""
+        with self._lock:
+            self.ends[server] = self.clock()
+
+    def mark(self, kind: MarkKind) -> None:
+        """Note that a backup begins or has ended, or that a server is about to start in what was restored from it."""
+        with self._lock:
+            self.marks.append(Mark(kind, self.clock()))
+
+    def found(self, rule: str, text: str) -> None:
+        """Note that something is wrong."""
+        with self._lock:
+            self.findings.append(Finding(rule, text))

@@ -1,0 +1,230 @@
+"""Whether the answers about one surface can be explained by one order of events.
+
+A surface is a register: it is absent, or in one of the states of a server. Each operation takes effect at one moment
+between its beginning and its answer; one without an answer takes effect at some moment after its beginning, or never.
+States change by themselves as `SPONTANEOUS` says. If there is an order of such moments that gives every answer, the
+history is explained, or linearizable (Herlihy and Wing, "Linearizability: a correctness condition for concurrent
+objects", 1990). All orders are tried at once, answer by answer (Lowe, "Testing for linearizability", 2017): what is
+kept are the ways in which everything up to now can have happened, and an operation is put in order only when its own
+answer, or another one, asks for it.
+
+A backup is not a moment: files are copied one after another. It holds what the surface was at any moment of it, and if
+the surface was deleted or uploaded meanwhile, perhaps half of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+from .events import Mark, Operation
+
+__all__ = ["ABSENT", "PRESENT", "SPONTANEOUS", "Step", "Unexplained", "apply", "later", "restored", "unexplained"]
+
+ABSENT = "absent"
+_UNSETTLED = frozenset({"queued", "building", "waiting", "ready", "failed"})
+
+#: What each state may turn into while nobody asks for anything; `ready` and `failed` are for good.
+SPONTANEOUS = {
+    ABSENT: frozenset({ABSENT}),
+    "queued": _UNSETTLED,
+    "building": _UNSETTLED,
+    "waiting": _UNSETTLED,
+    "ready": frozenset({"ready"}),
+    "failed": frozenset({"failed"}),
+    "missing": frozenset({"missing"}),
+}
+
+#: The states of a surface that is there.
+PRESENT = frozenset(SPONTANEOUS) - {ABSENT}
+
+States: TypeAlias = frozenset[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one operation says of one surface, or does to it.
+
+    Attributes
+    ----------
+    kind : "read", "upload", "delete" or "retry"
+    begun : float
+    ended : float or None
+        When its answer had come. None: it may have happened or not.
+    latest : float or None
+        Without an answer, the last moment at which it may have happened; None: there is no last one.
+    observed : frozenset of str
+        Of a read, the states of which the surface was in one.
+    operation : Operation or None
+        Where it comes from.
+    """
+
+    kind: Literal["read", "upload", "delete", "retry"]
+    begun: float
+    ended: float | None = None
+    latest: float | None = None
+    observed: States = frozenset()
+    operation: Operation | None = None
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """The first answer for which there is no order.
+
+    Attributes
+    ----------
+    step : Step
+    possible : frozenset of str
+        The states in which the surface may have been while it was asked for.
+    """
+
+    step: Step
+    possible: States
+
+
+class _Way(NamedTuple):
+    """One way in which everything up to now may have happened."""
+
+    states: States
+    saved: States | None  # what the backup has met
+    saving: bool
+    pending: frozenset[int]  # steps that have begun and have not taken effect
+
+
+def later(states: States) -> States:
+    """The states that these may have turned into by themselves."""
+    return frozenset().union(*(SPONTANEOUS[state] for state in states))
+
+
+def apply(step: Step, states: States) -> States:
+    """The states after a step, given those before; none where it cannot have happened."""
+    if step.kind == "read":
+        return later(states) & step.observed
+    if step.kind == "delete":
+        # Only an answer says that there was something to delete.
+        return frozenset({ABSENT}) if step.ended is None or states & PRESENT else frozenset()
+    return frozenset().union(*(_taken_up(step.kind, state) for state in states))
+
+
+def _taken_up(kind: str, state: str) -> States:
+    if state == "failed":
+        return frozenset({"failed", "queued"})
+    if kind == "upload" and state in (ABSENT, "missing"):
+        return frozenset({"queued"})
+    return frozenset({state})
+
+
+def restored(saved: States) -> States:
+    """The states of a surface in what was restored, given those that it had during the backup."""
+    if ABSENT in saved and saved & PRESENT:
+        # It came or went meanwhile: its record, its upload and its container may be from different moments.
+        return saved | {"queued", "missing"}
+    return saved
+
+
+def unexplained(steps: Sequence[Step], marks: Iterable[Mark] = ()) -> Unexplained | None:
+    """The first answer that no order explains, or None; at first the surface is absent.
+
+    Parameters
+    ----------
+    steps : sequence of Step
+    marks : iterable of Mark
+
+    Raises
+    ------
+    ValueError
+        When something is restored of which there is no backup.
+    """
+    ways = {_Way(frozenset({ABSENT}), None, False, frozenset())}
+    for what in _in_time(steps, marks):
+        if isinstance(what, Mark):
+            ways = {_marked(way, what) for way in _all_orders(ways, steps)}
+        elif what.action == "begins":
+            ways = {way._replace(pending=way.pending | {what.number}) for way in ways}
+        else:
+            step = steps[what.number]
+            following = {way for way in ways if what.number not in way.pending}
+            ways -= following
+            for way in ways:
+                following |= _until(way, what.number, steps)
+                if step.ended is None:
+                    following.add(way._replace(pending=way.pending - {what.number}))
+            if not following:
+                possible = (later(way.states) for way in _all_orders(ways, steps, without=what.number))
+                return Unexplained(step, frozenset().union(*possible))
+            ways = following
+    return None
+
+
+class _Moment(NamedTuple):
+    action: Literal["begins", "ends"]
+    number: int
+
+
+def _in_time(steps: Sequence[Step], marks: Iterable[Mark]) -> Iterator[_Moment | Mark]:
+    # At the same moment beginnings come first: then the two overlap, and either order may explain them.
+    moments: list[tuple[float, int, _Moment | Mark]] = [(mark.moment, 1, mark) for mark in marks]
+    for number, step in enumerate(steps):
+        end = step.latest if step.ended is None else step.ended
+        if end is not None and end < step.begun:
+            continue  # nobody was there any more
+        moments.append((step.begun, 0, _Moment("begins", number)))
+        if end is not None:
+            moments.append((end, 2, _Moment("ends", number)))
+    for _, _, what in sorted(moments, key=lambda moment: moment[:2]):
+        yield what
+
+
+def _until(way: _Way, number: int, steps: Sequence[Step]) -> set[_Way]:
+    """The ways on in which a step has taken effect, after any others that were pending."""
+    found = set()
+    for before in _all_orders({way}, steps, without=number):
+        after = _happened(before, number, steps)
+        if after is not None:
+            found.add(after)
+    return found
+
+
+def _all_orders(ways: Iterable[_Way], steps: Sequence[Step], without: int | None = None) -> set[_Way]:
+    """The ways on in which any of the pending steps have taken effect, in any order."""
+    found = set(ways)
+    left = list(found)
+    while left:
+        way = left.pop()
+        for number in _distinct(way.pending, steps):
+            after = _happened(way, number, steps) if number != without else None
+            if after is not None and after not in found:
+                found.add(after)
+                left.append(after)
+    return found
+
+
+def _distinct(pending: frozenset[int], steps: Sequence[Step]) -> Iterator[int]:
+    # Of steps without an answer that do the same and never end, one is as good as another.
+    seen = set()
+    for number in sorted(pending):
+        step = steps[number]
+        if step.ended is None and step.latest is None:
+            if step.kind in seen:
+                continue
+            seen.add(step.kind)
+        yield number
+
+
+def _happened(way: _Way, number: int, steps: Sequence[Step]) -> _Way | None:
+    states = apply(steps[number], way.states)
+    if not states:
+        return None
+    saved = way.saved | states if way.saving and way.saved is not None else way.saved
+    return _Way(states, saved, way.saving, way.pending - {number})
+
+
+def _marked(way: _Way, mark: Mark) -> _Way:
+    if mark.kind == "backup begins":
+        return way._replace(saved=way.states, saving=True)
+    if mark.kind == "backup ends":
+        return way._replace(saving=False)
+    if way.saved is None:
+        raise ValueError("expected a backup before what is restored from it, got none")
+    return way._replace(states=restored(way.saved))
