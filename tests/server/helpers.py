@@ -34,6 +34,11 @@ def hills(rows: int = 40, columns: int = 30, seed: int = 1) -> NDArray[np.float3
     return np.asarray(50 * np.sin(r / 9 + seed) * np.cos(c / 7) + noise, np.float32)
 
 
+def listed(http: httpx.Client) -> list[str]:
+    """The ids of all surfaces: their states may go on changing while a test looks."""
+    return [surface["id"] for surface in http.get("/v1/surfaces", params={"limit": 1000}).json()["surfaces"]]
+
+
 def npy(array: NDArray[Any]) -> bytes:
     """The bytes of an NPY file."""
     file = io.BytesIO()

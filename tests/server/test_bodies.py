@@ -11,7 +11,7 @@ import h11
 import httpx
 import pytest
 
-from tests.server.helpers import PATIENCE, eventually, hills, npy
+from tests.server.helpers import PATIENCE, eventually, hills, listed, npy
 from tests.server.sockets import CHUNKS, Place, chunked
 
 
@@ -78,7 +78,7 @@ def test_a_client_that_sends_far_too_much_sees_why_it_was_refused(http: httpx.Cl
     ids=["small", "extensions", "trailers", "endless extension", "no number"],
 )
 def test_chunks_that_are_no_use_are_refused(http: httpx.Client, server: str, data: Path, body: bytes) -> None:
-    before = http.get("/v1/surfaces").json()
+    before = listed(http)
     with asked(server, chunked()) as connection:
         threading.Thread(target=lambda: connection.sendall(body), daemon=True).start()
         answer = b""
@@ -87,7 +87,7 @@ def test_chunks_that_are_no_use_are_refused(http: httpx.Client, server: str, dat
     document = json.loads(answer.partition(b"\r\n\r\n")[2])
     assert document["status"] == 400
     assert document["code"] in ("bad-request", "small-chunks")
-    assert http.get("/v1/surfaces").json() == before
+    assert listed(http) == before
     eventually(lambda: not list((data / "incoming").iterdir()), "the upload's folder to be removed")
 
 

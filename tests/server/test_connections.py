@@ -16,7 +16,7 @@ import pytest
 import lodestream as ls
 from lodestream.messages import CODES, Credit, End, Error, Event, Header, Open, Segments, Stop
 from lodestream_server import running_server
-from tests.server.helpers import PATIENCE, closed, eventually, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, eventually, hills, listed, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -207,13 +207,13 @@ def test_a_body_longer_than_it_says_is_cut_there(http: httpx.Client, server: str
 
 
 def test_a_body_shorter_than_it_says_is_nothing(http: httpx.Client, server: str, data: Path) -> None:
-    before = http.get("/v1/surfaces").json()
+    before = listed(http)
     with connected(server) as connection:
         connection.sendall(b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nshort")
         connection.shutdown(socket.SHUT_WR)
         all_of(connection)
     eventually(lambda: not list((data / "incoming").iterdir()), "the upload's folder to be removed")
-    assert http.get("/v1/surfaces").json() == before
+    assert listed(http) == before
 
 
 @pytest.mark.parametrize(
