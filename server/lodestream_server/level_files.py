@@ -132,7 +132,8 @@ class LevelFiles:
         for key, file in list(self._files.items()):
             if self.size <= most:
                 return
-            if not file.readers:
+            # Meanwhile its container may have gone, or somebody may have begun to read it.
+            if self._files.get(key) is file and not file.readers:
                 del self._files[key]
                 await asyncio.to_thread(remove, file.path)
 
