@@ -39,7 +39,7 @@ from functools import partial
 from pathlib import Path
 
 from lodestream.capacity import memory_limit
-from lodestream.errors import InputError
+from lodestream.errors import InputError, TooLargeError
 
 from . import results, worker
 from .access import key_of
@@ -410,7 +410,7 @@ class Builder:
             await asyncio.to_thread(self._storage.ready, record.id, job.container, built.sha256, info)
         except OSError as error:
             return _not_now(error)
-        except MissingError as error:
+        except (MissingError, TooLargeError) as error:
             return worker.Refused(str(error), final=False)
         return None
 
