@@ -69,6 +69,9 @@ _PASSING = (*_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
 
+# So often a build is tried that lacks them, where somebody waits for its end.
+_ATTEMPTS = 3
+
 # For so many seconds it counts whose builds have had a process.
 _REMEMBERED = 600.0
 
@@ -102,6 +105,9 @@ class Builder:
     settings : Settings
     finished : callable (state, seconds) or None
         Told how each build ended (``ready``, ``failed``, ``waiting``, ``missing``), and how long its last attempt took.
+    patient : bool
+        Whether builds that find no room on the disk wait until there is some. Otherwise they are given up after a few
+        attempts and stay in the queue, for the next server to build.
 
     Attributes
     ----------
@@ -112,9 +118,15 @@ class Builder:
     """
 
     def __init__(
-        self, storage: Storage, settings: Settings, finished: Callable[[State, float], None] | None = None
+        self,
+        storage: Storage,
+        settings: Settings,
+        finished: Callable[[State, float], None] | None = None,
+        *,
+        patient: bool = True,
     ) -> None:
         self.ready = False
+        self._patient = patient
         self._storage = storage
         self._settings = settings
         self._finished = finished
@@ -195,7 +207,7 @@ class Builder:
             del self._pending[caller]
         # Whoever saw the build end may have asked for another before its task was over.
         record = self._storage.find(surface)
-        if record is not None and surface not in self._deleting:
+        if self._patient and record is not None and surface not in self._deleting:
             self._resume(record, caller)
 
     def _resume(self, record: Record, caller: str | None = None) -> None:
@@ -305,8 +317,9 @@ class Builder:
             _log.warning("%s", unkept)
 
     async def _build(self, record: Record) -> None:
-        delay, said = _FIRST_DELAY, ""
+        delay, said, attempts = _FIRST_DELAY, "", 0
         while True:
+            attempts += 1
             started = time.monotonic()
             try:
                 state = await self._insist(record)
@@ -315,6 +328,8 @@ class Builder:
                     said = str(error)
                     _log.error("the build of %s %s", record.id, said)
                     self._storage.note(record.id, said)
+                if not self._patient and attempts == _ATTEMPTS:
+                    return
                 with suppress(TimeoutError):
                     async with asyncio.timeout(delay):
                         await self._room.wait()

@@ -15,10 +15,11 @@ import pytest
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
-from lodestream_server import running_server
+from lodestream_server import jobs, running_server, worker
 from lodestream_server.fsck_command import register
 from lodestream_server.storage import Storage
-from tests.server.helpers import hills, npy, push, upload_of
+from tests.server import slow
+from tests.server.helpers import hills, npy, push, settled, upload_of
 
 Fsck = Callable[..., tuple[int, dict[str, Any]]]
 
@@ -69,6 +70,23 @@ def fsck(data: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Fsck]:
     }
     assert {finding["surface"] for finding in report["findings"]} == lost
     assert code == bool(lost)
+
+
+def test_a_repair_ends_where_the_disk_stays_full(
+    data: Path, fsck: Fsck, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    container = data / "containers" / f"{surfaces[0]['container']}.lode"
+    flip(container, 100)
+    with monkeypatch.context() as full:
+        full.setattr(jobs, "_FIRST_DELAY", 0.01)
+        full.setattr(worker, "build", slow.find_full)
+        code, report = fsck("--repair")
+    assert code == 1
+    finding = next(finding for finding in report["findings"] if finding["surface"] == surfaces[0]["id"])
+    assert (finding["repaired"], finding["lost"]) == (False, False)
+    assert "room on the server's disk" in finding["repair"]
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        assert settled(http, surfaces[0]["url"])["container"] == surfaces[0]["container"]
 
 
 def flip(path: Path, place: int) -> None:
