@@ -454,7 +454,7 @@ class Builder:
         return "waiting"
 
     def _out_of_memory(self) -> str:
-        return f"the build needed more memory than one may have, {self._memory >> 20} MiB"
+        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_BUILD_MEMORY)"
 
     def _job(self, record: Record, folder: Path) -> worker.Job:
         options = dict(record.options)

@@ -327,7 +327,10 @@ class Storage:
             record = self.get(surface)
             if record.state not in _STOPPED:
                 return record
-            made = present(self._at, replace(record, state="queued", reason=None, attempts=0))
+            again = replace(record, attempts=0)
+            if record.state != "missing":  # otherwise it keeps why it is, unless something of it is there now
+                again = replace(again, state="queued", reason=None)
+            made = present(self._at, again)
             if made.state != "missing":
                 self._write(made)
             elif record.state == "failed":  # an earlier version dropped its upload
@@ -423,7 +426,7 @@ def claim(root: Path) -> int:
     OSError
         When nothing can be written there.
     """
-    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o644)
+    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o600)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

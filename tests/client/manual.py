@@ -44,7 +44,7 @@ This page is `--help` of every command, written by `python -m tests.client.manua
   exit code is then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer there is no OUT, and one
   that was there stays as it was. What came is kept, whether `--resume` was given or not, also of a `pull` that is
   killed; the next one with `--resume` asks only for the rest. A `pull` that ends as it should removes what it kept,
-  unless it was given `--resume`. Where nothing can be kept, the `pull` goes on without.
+  with `--resume` only when it has the whole surface. Where nothing can be kept, a `pull` without `--resume` goes on.
 - A limit that is out of reach gives the complete surface, with a note.
 - `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the whole surface, `--attributes speed,kind`
   these attributes beside the points, `--attributes none` the points alone; both go with each other and with the limits,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 import lodestream as ls
+from lodestream_client.commands import surfaces
 
 from .conftest import Run
 
@@ -320,6 +323,19 @@ def test_push_list_pull_rm(run: Run, server: str, tmp_path: Path) -> None:
     code, _, stderr = run("rm", url)
     assert (code, stderr.count("\n")) == (1, 1)
     assert url not in run("list", server)[1]
+
+
+def test_a_list_has_a_line_for_each_however_narrow_the_terminal(
+    run: Run, server: str, terrain_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, stdout, _ = run("push", terrain_file, server, "--name", "long " * 40)
+    assert code == 0
+    url = stdout.splitlines()[-1]
+    monkeypatch.setattr(surfaces, "console", lambda: Console(file=sys.stdout, width=40))
+    (line,) = [line for line in run("list", server)[1].splitlines() if "long" in line]
+    assert line.startswith(f"{url}  ready  ")
+    assert line.count("long") == 40
+    assert run("rm", url)[0] == 0
 
 
 def test_push_without_waiting_and_as_json(run: Run, server: str, terrain_file: Path) -> None:
