@@ -25,7 +25,7 @@ __all__ = ["connections"]
 
 # What is given to h11 at once where a body does not say how long it is: little where chunks are small, since each costs
 # as much as many bytes, and more from one piece to the next where they are not.
-_LEAST_PIECE = 1024
+_LEAST_PIECE = 256
 _LARGEST_PIECE = 8 * 1024
 
 # Chunks of a piece that are few, and chunks after which others have their turn.

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 __all__ = ["PIECES_A_TURN", "Pace", "Paced"]
 
-#: A piece takes at most some 3 ms, most take a tenth of that.
+#: A piece takes at most some milliseconds, most take a tenth of one.
 PIECES_A_TURN = 8
 
 _PROBES = {"/healthz", "/readyz"}
