@@ -178,6 +178,7 @@ class _Session:
         self._sender = Sender(container.index, container.sha256)
         self._heard = asyncio.Event()
         self._planning = parts.planning
+        self._pace = parts.pace
         # Who has the sender: a thread that plans with it, or one of the two tasks.
         self._mine = asyncio.Lock()
 
@@ -284,7 +285,7 @@ class _Session:
                     data = await asyncio.to_thread(self._container.read, wanted)
                 else:
                     # The others' turn: of many streams each has its first picture before any has its second.
-                    await asyncio.sleep(0)
+                    await self._pace.turn()
                 async with self._mine:
                     self._sender.provide(wanted, data)
             else:

@@ -179,13 +179,13 @@ def main() -> None:
     """Serve until told to end."""
     from lodestream_server import Settings
     from lodestream_server.logs import configure
-    from lodestream_server.running import make_server
+    from lodestream_server.running import serve_alone
 
     settings = Settings(**json.loads(sys.argv[1]))
     configure(settings.log_format, settings.log_level)
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
-    make_server(settings, lambda address: print(address, flush=True)).run()
+    serve_alone(settings, lambda address: print(address, flush=True))
 
 
 if __name__ == "__main__":
