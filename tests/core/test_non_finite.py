@@ -317,7 +317,7 @@ def kinds_of(container: bytes) -> list[int]:
 
 
 def sections_start() -> int:
-    return len(sections.MAGIC) + 1
+    return len(sections.SIGNATURE)
 
 
 def test_without_infinities_holes_cost_what_they_did() -> None:

@@ -16,7 +16,7 @@ from ..quantiser import MOST_BASE, Quantiser
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .model import Header
-from .sections import HEADER, KEPT_MASKS, MAGIC, MASKS, VERSION, section
+from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
     LARGEST_SURFACE,
@@ -39,7 +39,7 @@ _QUANTISED = 16
 
 
 def serialize_header(header: Header) -> bytes:
-    """Magic, version, header section and, where there are holes, the section of masks."""
+    """Signature, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
     extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
     marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
@@ -71,7 +71,7 @@ def serialize_header(header: Header) -> bytes:
         for level, axis in fitted:
             if axis < CURVES or channel < header.geometric:
                 out.pack("bb", *(int(x) for x in predictors[level, axis]))
-    data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+    data = SIGNATURE + section(HEADER, bytes(out.data))
     if not header.masked:
         return data
     return data + section(KEPT_MASKS if any(header.kept) else MASKS, _serialize_masks(header))
