@@ -24,10 +24,11 @@ from .folders import Folders, is_file, is_folder
 from .records import Record, read_record
 from .recovery import stray_containers
 from .uploads import check_upload
+from .versions import other_version
 
 __all__ = ["Finding", "Report", "What", "check", "check_container"]
 
-What = Literal["marker", "record", "upload", "container", "figures", "leftover"]
+What = Literal["marker", "record", "upload", "container", "figures", "version", "leftover"]
 
 _CHUNK = 1 << 20
 
@@ -41,6 +42,8 @@ class Finding:
     what : str
         ``record``, ``upload`` or ``container``: it is damaged or gone. ``figures``: a record says something else of its
         container than the container itself. ``marker``: the folders do not belong together, or are not all there.
+        ``version``: a whole container of another version than this server reads; the next start builds it again, and it
+        is no damage.
         ``leftover``: a file that nothing refers to, as a process leaves them that is killed; the next start removes or
         sets aside what it finds, and it is no damage.
     path : Path
@@ -85,8 +88,8 @@ class Report:
 
     @property
     def damage(self) -> list[Finding]:
-        """The findings that are no leftovers."""
-        return [finding for finding in self.findings if finding.what != "leftover"]
+        """The findings that are neither leftovers nor of another version."""
+        return [finding for finding in self.findings if finding.what not in ("leftover", "version")]
 
     @property
     def clean(self) -> bool:
@@ -182,7 +185,8 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
             report.bytes += path.stat().st_size
     index = indexes[sha256]
     if isinstance(index, str):
-        yield Finding("container", path, record.id, index)
+        # Where its bytes are not those of its name, that is what the text says.
+        yield Finding("version" if index == other_version(path) else "container", path, record.id, index)
     elif figures_of(index, record.info, at.files(record)) != record.info:
         problem = "expected the figures that the container has, got others"
         yield Finding("figures", at.record(record.id), record.id, problem)

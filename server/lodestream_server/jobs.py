@@ -8,8 +8,10 @@ the surface is deleted                  its process is killed
 the process dies, or lacks memory       one more attempt in another process, then it waits
 the process is told to end (SIGTERM)    another attempt, at most `_ENDINGS` in all: a service is being stopped
 it takes longer than it may             it waits
-a library is missing, or a limit or     it waits
-setting of this server is in its way
+a library is missing, a limit or        it waits
+setting of this server is in its way,
+or an uploaded container is of another
+version than this server reads
 the disk is full, or its owner has      it stays in the queue until there is room
 more there than one may have
 the server dies                         the next one takes it up, after those of its caller that have not been tried so

@@ -110,6 +110,8 @@ def _after(finding: Finding, found_again: bool, record: Record | None) -> Findin
     if record is None or record.state == "ready":
         if finding.what in ("container", "record"):
             done.append("whole again")
+        elif finding.what == "version":
+            done.append("built again")
         return replace(finding, repair="; ".join(done) or "gone", repaired=True)
     if record.state == "failed" and finding.what == "record":
         return replace(finding, repair="; ".join(done), repaired=True)

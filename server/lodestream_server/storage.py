@@ -25,7 +25,8 @@ from .folders import Folders, is_file, is_folder
 from .private import check_writable, make_private, tighten
 from .problems import MissingError
 from .records import Record, State, serialize
-from .recovery import finish_delete, has_upload, present, recover
+from .recovery import finish_delete, has_container, has_upload, present, recover
+from .versions import other_version
 
 __all__ = ["Storage", "claim"]
 
@@ -161,6 +162,9 @@ class Storage:
     def gone(self, sha256: str) -> LodestreamError:
         """Why a container that was known a moment ago cannot be read: it was deleted since, or its disk is gone."""
         if self._catalog.has_container(sha256):
+            other = other_version(self._at.container(sha256))
+            if other is not None:
+                return MissingError(other)
             _log.error("the container %s is not on the disk", sha256)
             return MissingError(f"expected the container {sha256} on the server's disk, where it is not now")
         return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
@@ -214,14 +218,12 @@ class Storage:
         return record.upload_sha256
 
     def _with_its_container(self, record: Record) -> Record | None:
-        if record.container is None or not is_file(self._at.container(record.container)):
-            return None
-        return replace(record, state="ready")
+        return replace(record, state="ready") if has_container(self._at, record) else None
 
     def _like_its_twin(self, record: Record) -> Record | None:
         for other in self._catalog.of_digest(record.upload_sha256 or ""):
             same = (other.options, other.name, other.filenames) == (record.options, record.name, record.filenames)
-            if same and other.state == "ready" and is_file(self._at.container(other.container)):
+            if same and other.state == "ready" and has_container(self._at, other):
                 return replace(record, state="ready", container=other.container, info=other.info)
         return None
 
@@ -267,6 +269,8 @@ class Storage:
     def ready(self, surface: str, built: Path, sha256: str, info: dict[str, object]) -> None:
         """Keep the container that was built for a surface; nothing happens if the surface is gone.
 
+        One of another version that the surface had goes then, with the last surface that has it.
+
         Raises
         ------
         OSError, MissingError
@@ -278,7 +282,9 @@ class Storage:
                 remove(built)
                 return
             self._check_mounted()
-            if record.container not in (None, sha256):
+            before = None if record.container == sha256 else record.container
+            outdated = before is not None and other_version(self._at.container(before)) is not None
+            if before is not None and not outdated:
                 _log.warning("%s was built again as another container, %s, than before", surface, sha256)
             made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
             serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
@@ -291,6 +297,10 @@ class Storage:
                 if not there:
                     remove(container)
                 raise
+            if before is not None and outdated and not self._catalog.has_container(before) and not self._unusable:
+                with suppress(OSError):  # what stays is set aside at the next start: no record speaks of it
+                    remove(self._at.container(before))
+                    sync_folder(self._at.containers)
 
     def failed(self, surface: str, reason: str) -> None:
         """Note that a reader refused the bytes of a surface; they stay until somebody deletes it."""

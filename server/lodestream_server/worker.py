@@ -17,7 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatWarning, LodestreamError, SwitchedOffError, TooLargeError, UnavailableError
+from lodestream.errors import (
+    FormatWarning,
+    LodestreamError,
+    SwitchedOffError,
+    TooLargeError,
+    UnavailableError,
+    UnsupportedVersionError,
+)
 from lodestream.metadata import with_notes
 
 from . import finished
@@ -176,8 +183,8 @@ def build(job: Job) -> Built | Refused:
 
 
 def _may_pass(error: LodestreamError) -> bool:
-    """Whether an upload was refused for what this machine lacks, or forbids, and not for its bytes."""
-    if isinstance(error, TooLargeError | UnavailableError):
+    """Whether an upload was refused for what this server lacks, or forbids, and not for its bytes."""
+    if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
         return True
     cause: BaseException | None = error
     while cause is not None:  # what a reader made its own error of

@@ -91,9 +91,9 @@ def test_the_limit_is_looked_at_first(exact: bytes) -> None:
 
 
 def test_another_version(exact: bytes) -> None:
-    for version in (sections.VERSION - 1, sections.VERSION + 1):
-        with pytest.raises(ls.UnsupportedVersionError, match=f"got version {version}"):
-            inspected(exact[:7] + bytes([version]) + exact[8:])
+    for start in (sections.MAGIC + bytes([sections.VERSION + 1]), sections.MAGIC + b"\xff", b"\x89LODE\r\n\x03"):
+        with pytest.raises(ls.UnsupportedVersionError, match=f"version {sections.VERSION}, .* got version {start[7]}"):
+            inspected(start + exact[8:])
 
 
 def test_what_is_rewritten_without_a_change_is_the_same(exact: bytes, near: bytes) -> None:

@@ -134,8 +134,6 @@ def index_forged(data: bytes) -> bytes:
 
 WRONG: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "magic alone": (lambda data: data[:7], "at byte 7"),
-    "version before": (lambda data: data[:7] + bytes([sections.VERSION - 1]) + data[8:], "version 2"),
-    "version after": (lambda data: data[:7] + bytes([sections.VERSION + 1]) + data[8:], "version 4"),
     "no header": (lambda data: data[:8], "at byte 8"),
     "half": (lambda data: data[: len(data) // 2], "cut short .at byte"),
     "without its last byte": (lambda data: data[:-1], "cut short .at byte"),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.container import sections
 from lodestream.errors import LodestreamError
 from lodestream_server import jobs, running_server, worker
 from lodestream_server.fsck_command import register
@@ -127,7 +128,7 @@ def test_a_folder_in_order(fsck: Fsck, data: Path) -> None:
         ("gone", "No such file"),
         ("other", "expected bytes with the SHA-256 of the name"),
         ("empty", "expected bytes with the SHA-256 of the name"),
-        ("version", "version 0"),
+        ("version", "got version 7"),
     ],
 )
 def test_a_damaged_container_is_found(
@@ -143,9 +144,9 @@ def test_a_damaged_container_is_found(
     elif damage == "other":
         shutil.copy(data / "containers" / f"{two['container']}.lode", path)
     else:
-        start = len(b"\x89LODE\r\n")
-        older = whole[:start] + b"\0" + whole[start + 1 :]
-        path.write_bytes({"cut": whole[:-100], "longer": whole + b"\0", "empty": b"", "version": older}[damage])
+        start = len(sections.MAGIC)
+        other = whole[:start] + b"\7" + whole[start + 1 :]
+        path.write_bytes({"cut": whole[:-100], "longer": whole + b"\0", "empty": b"", "version": other}[damage])
     code, report = fsck()
     assert (code, report["clean"]) == (1, False)
     (finding,) = report["findings"]

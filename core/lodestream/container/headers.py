@@ -16,7 +16,7 @@ from ..quantiser import MOST_BASE, Quantiser
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .model import Header
-from .sections import HEADER, KEPT_MASKS, MAGIC, MASKS, VERSION, section
+from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
     LARGEST_SURFACE,
@@ -27,11 +27,10 @@ from .shape import (
     serialize_extras,
 )
 
-__all__ = ["LARGE_TILE_BITS", "MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
+__all__ = ["MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
 
-#: Rows of a tile times columns, as an exponent of two; and of a large one.
+#: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
-LARGE_TILE_BITS = 20
 #: Most binary places between lattice steps.
 MOST_FRACTION = 6
 _RULES = ("affine", "decimal")
@@ -40,7 +39,7 @@ _QUANTISED = 16
 
 
 def serialize_header(header: Header) -> bytes:
-    """Magic, version, header section and, where there are holes, the section of masks."""
+    """Signature, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
     extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
     marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
@@ -72,7 +71,7 @@ def serialize_header(header: Header) -> bytes:
         for level, axis in fitted:
             if axis < CURVES or channel < header.geometric:
                 out.pack("bb", *(int(x) for x in predictors[level, axis]))
-    data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+    data = SIGNATURE + section(HEADER, bytes(out.data))
     if not header.masked:
         return data
     return data + section(KEPT_MASKS if any(header.kept) else MASKS, _serialize_masks(header))
@@ -154,11 +153,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         )
     # Tiles across a narrow surface would be many, and nearly empty.
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
-    fits = TILE_BITS <= sum(tile) <= LARGE_TILE_BITS and min(tile) >= 1
-    if not fits or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
-        raise CorruptStreamError(
-            f"expected tiles of 2**14 to 2**20 coefficients, got exponents {tile[0]} and {tile[1]}", offset
-        )
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
+        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
     if fraction > MOST_FRACTION:
         raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
     if not (math.isfinite(extent) and extent >= 0):
