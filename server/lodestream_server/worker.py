@@ -220,7 +220,9 @@ def _build(job: Job) -> Built:
         for key, value in job.options.items()
         if key.startswith(ATTRIBUTE)
     }
-    container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
+        container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
     with NewFile(path) as file:
         file.write(container)
     return Built(hashlib.sha256(container).hexdigest())
@@ -228,6 +230,7 @@ def _build(job: Job) -> Built:
 
 def _read(job: Job) -> Surface:
     from lodestream.formats import read
+    from lodestream.losses import at_holes
 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", FormatWarning)
@@ -239,13 +242,14 @@ def _read(job: Job) -> Surface:
             allowed=job.allowed,
             **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
         )
-    notes = list(dict.fromkeys(str(warning.message) for warning in found if warning.category is FormatWarning))
+    said = [str(warning.message) for warning in found if warning.category is FormatWarning]
+    notes = dict.fromkeys([*said, *filter(None, [at_holes(surface)])])
     if job.name is not None:
         surface.metadata["name"] = job.name
     elif job.filename is None:
         # Nobody gave it one: the reader took it from the name that stands in for the file's.
         surface.metadata.pop("name", None)
-    surface.metadata = with_notes(surface.metadata, notes)  # whoever uploaded it does not see what happens here
+    surface.metadata = with_notes(surface.metadata, list(notes))  # whoever uploaded it does not see what happens here
     return surface
 
 
