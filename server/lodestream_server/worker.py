@@ -17,7 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatWarning, LodestreamError, SwitchedOffError, TooLargeError, UnavailableError
+from lodestream.errors import (
+    FormatWarning,
+    LodestreamError,
+    StreamError,
+    SwitchedOffError,
+    TooLargeError,
+    UnavailableError,
+)
 from lodestream.metadata import with_notes
 
 from . import finished
@@ -212,7 +219,11 @@ def _build(job: Job) -> Built:
     path = job.container
     if finished.is_container(job.files[0]):
         check_allowed(("lode",), job.allowed)
-        return Built(*finished.keep(job, path, _reporter(job.folder)))
+        try:
+            return Built(*finished.keep(job, path, _reporter(job.folder)))
+        except (StreamError, TooLargeError) as error:
+            error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
+            raise
     surface = _read(job)
     precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
     precisions = {

@@ -38,8 +38,8 @@ def block(number: int, closed: tuple[bool, bool] = (False, True)) -> ls.Block:
         "heat": np.where(rows % 6 == 0, np.nan, np.sqrt(columns)).astype(np.float32),
         "flow": np.random.default_rng(number).normal(size=(*z.shape, 3)),
     }
-    for values in attributes.values():
-        values[~mask] = 0
+    for array in attributes.values():
+        array[~mask] = 0
     return ls.Block(points, closed, mask=mask, attributes=attributes)
 
 
@@ -313,6 +313,7 @@ def test_push_of_a_damaged_container(run: Run, server: str, container_file: Path
     code, out, err = run("push", tmp_path / "cut.lode", server)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert "cut short (at byte" in err
+    assert err.startswith("lodestream: cut.lode: expected ")
     with pytest.raises(RemoteError, match="at byte") as caught:
         sync.upload(server, data[:3000] + b"?" + data[3001:])
     assert caught.value.code == "failed"

@@ -110,8 +110,8 @@ def _opened(source: Source) -> Iterator[Any]:
         reason = " ".join(str(error).replace(path, "the file").split())
         if not reason or isinstance(error, SystemError) or _UNSAID.search(reason):
             raise UnavailableError(
-                f"expected the libraries of NetCDF to read the file or to say why not, got {type(error).__name__}: they "
-                "may have had too little memory"
+                f"expected the libraries of NetCDF to read the file or to say why not, got {type(error).__name__}: "
+                "they may have had too little memory"
             ) from None
         raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None
 
