@@ -159,12 +159,12 @@ def test_a_cut_container(
 @pytest.mark.parametrize(
     ("bytes_", "options", "advice"),
     [
-        (3000, ("--level", "2"), "without --level and --order level, with --partial the last whole layer is written"),
-        (3000, ("--level", "2", "--partial"), "without --level and --order level, the last whole layer is written"),
+        (3000, ("--level", "2"), "order level, with --partial the last whole layer is written"),
+        (3000, ("--level", "2", "--partial"), "order level, the last whole layer is written"),
         (
             3000,
             ("--order", "level"),
-            "without --level and --order level, with --partial the last whole layer is written",
+            "order level, with --partial the last whole layer is written",
         ),
         (40, (), "it is cut short"),
         (40, ("--partial",), "it is cut short"),
