@@ -10,6 +10,9 @@ from functools import partial
 from typing import TYPE_CHECKING, BinaryIO
 from weakref import WeakValueDictionary
 
+from lodestream.errors import StreamError
+
+from . import damage
 from .storage import Storage
 
 if TYPE_CHECKING:
@@ -82,6 +85,10 @@ class Containers:
             raise self._storage.gone(sha256) from None
         try:
             return OpenContainer(sha256, self._index(sha256, file), file)
+        except StreamError as error:
+            file.close()
+            damage.tell(self._storage, sha256, error)
+            raise
         except BaseException:
             file.close()
             raise
