@@ -354,10 +354,10 @@ class LevelQueue:
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
             raise TooLargeError(f"expected a level whose file has less than {wanted.most_bytes} bytes; {advice}")
-        error = made.error()
-        if isinstance(error, StreamError):
-            damage.tell(self._storage, key.container, error)
-        raise error
+        refused = made.error()
+        if isinstance(refused, StreamError):
+            damage.tell(self._storage, key.container, refused)
+        raise refused
 
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.

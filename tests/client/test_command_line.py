@@ -418,10 +418,10 @@ def test_out_is_written_by_rename(run: Run, container_file: Path, tmp_path: Path
 def test_an_unknown_package_s_command(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     from importlib.metadata import EntryPoint
 
-    from lodestream_client import __main__
+    from lodestream_client import program
 
     broken = EntryPoint("juggle", "no_such_package.command:register", "lodestream.commands")
-    monkeypatch.setattr(__main__, "entry_points", lambda group: [broken])
+    monkeypatch.setattr(program, "entry_points", lambda group: [broken])
     code, _, stderr = run("juggle")
     assert code == 1
     assert "juggle is not fully installed" in stderr
