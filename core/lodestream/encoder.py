@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 
 from numpy.typing import ArrayLike
 
 from . import metadata
 from .encoding import Encoding, UnreachableError
-from .errors import OptionError
+from .errors import FormatWarning, OptionError
+from .losses import at_holes
 from .preparation import Preparation
 from .surface import Surface
 from .target import Tolerance
@@ -48,7 +50,8 @@ def encode(
     Returns
     -------
     bytes
-        A container, see ``docs/format.md``.
+        A container, see ``docs/format.md``. It has no values of attributes at holes of the points; where there are
+        some, a `FormatWarning` says so.
 
     Raises
     ------
@@ -69,6 +72,9 @@ def encode(
         raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
     if precision is not None and rms is not None:
         raise OptionError("expected either a precision or a root mean square error, got both")
+    left_out = at_holes(surface)
+    if left_out is not None:
+        warnings.warn(left_out, FormatWarning, stacklevel=2)
     if rms is not None:
         container = _made_for(surface, _tolerance(rms), precisions, rising)
         if container is not None:

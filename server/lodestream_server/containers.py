@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, BinaryIO
 from weakref import WeakValueDictionary
 
 from lodestream.capacity import memory_limit
-from lodestream.errors import CorruptStreamError
+from lodestream.errors import CorruptStreamError, StreamError
 
+from . import damage
 from .problems import BusyError
 from .storage import Storage
 
@@ -100,6 +101,10 @@ class Containers:
             raise self._storage.gone(sha256) from None
         try:
             return OpenContainer(sha256, self._index(sha256, file), file)
+        except StreamError as error:
+            file.close()
+            damage.tell(self._storage, sha256, error)
+            raise
         except BaseException:
             file.close()
             raise

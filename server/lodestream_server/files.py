@@ -10,7 +10,7 @@ from starlette.types import Receive, Scope, Send
 
 from lodestream.errors import OptionError, StreamError
 
-from . import examples
+from . import damage, examples
 from .access import anybody
 from .gate import caller_of
 from .level_files import Key
@@ -73,7 +73,9 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
         raise parts.storage.gone(sha256) from None
     kept = parts.storage.container_bytes(sha256)
     if kept not in (None, status.st_size):
-        raise StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
+        error = StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
+        damage.tell(parts.storage, sha256, error)
+        raise error
     sort_out(request, status.st_size, etag)
     return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
 

@@ -75,7 +75,23 @@ class Finding:
 
 @dataclass
 class Report:
-    """What was looked at, and what was found."""
+    """What was looked at, and what was found.
+
+    Attributes
+    ----------
+    folder : Path
+    surfaces : int
+        Records, those that cannot be used among them.
+    containers, uploads : int
+        Those that are there, whole or damaged, and that a record speaks of; what several surfaces share counts once.
+    bytes : int
+        Of these containers and uploads, on the disk.
+    seconds : float
+    findings : list of Finding
+        What should be there and is not is among them.
+    records : dict of Record
+        By surface.
+    """
 
     folder: Path
     surfaces: int = 0
@@ -166,8 +182,9 @@ def _upload(at: Folders, record: Record, report: Report, known: dict[str, str | 
         return
     # Several surfaces may have the same upload.
     if record.folder not in known:
-        report.uploads += 1
-        report.bytes += record.upload_bytes
+        there = [file for file in at.files(record) if is_file(file)]
+        report.uploads += bool(there)
+        report.bytes += sum(file.stat().st_size for file in there)
         known[record.folder] = check_upload(at.files(record), record)
     problem = known[record.folder]
     if problem is not None:
@@ -179,9 +196,9 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
     path = at.container(sha256)
     # Several surfaces may have the same container.
     if sha256 not in indexes:
-        report.containers += 1
         indexes[sha256] = check_container(path, sha256)
-        if path.is_file():
+        if is_file(path):
+            report.containers += 1
             report.bytes += path.stat().st_size
     index = indexes[sha256]
     if isinstance(index, str):

@@ -32,8 +32,9 @@ from typing import Any
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
-from lodestream.errors import LodestreamError, TooLargeError
+from lodestream.errors import LodestreamError, StreamError, TooLargeError
 
+from . import damage
 from .durable import make_folder, remove
 from .folders import is_file
 from .level_files import Key, Lease, LevelFiles
@@ -365,7 +366,10 @@ class LevelQueue:
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
             raise TooLargeError(f"expected a level whose file has less than {wanted.most_bytes} bytes; {advice}")
-        raise made.error()
+        refused = made.error()
+        if isinstance(refused, StreamError):
+            damage.tell(self._storage, key.container, refused)
+        raise refused
 
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.

@@ -145,6 +145,14 @@ class Storage:
             raise self.gone(sha256)
         return path
 
+    def place_of(self, sha256: str) -> Path:
+        """Where a container lies, or would."""
+        return self._at.container(sha256)
+
+    def surfaces_of(self, sha256: str) -> list[str]:
+        """The ids of the surfaces that have a container, or had it before it was lost."""
+        return self._catalog.of_container(sha256)
+
     def container_bytes(self, sha256: str) -> int | None:
         """How long a container was when it was kept; None where it is not known."""
         record = self._catalog.one_of_container(sha256)

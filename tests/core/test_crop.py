@@ -24,6 +24,9 @@ from lodestream.target import Region
 from lodestream.tiles import Tiles, TileTable, gather
 from lodestream.transform import allocate, forward
 
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
 if TYPE_CHECKING:
     from lodestream.container.model import Header
 

@@ -18,6 +18,9 @@ from lodestream.inspection import Inspection, inspect
 
 from .forgery import index_of, rewritten, sections_of, unchanged, with_header, with_layer_errors, with_metadata
 
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
 GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("*.lode"))
 MOST = 1 << 20
 

@@ -24,6 +24,9 @@ from lodestream.selection import wish_of
 
 from .surfaces import follow, index_of, terrain, torus
 
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
 
 Values = NDArray[Any]

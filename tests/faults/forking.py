@@ -25,6 +25,7 @@ DIED = 70
 
 _MODULES = (
     "lodestream_client.__main__",
+    "lodestream_client.program",
     "lodestream_server.app",
     "lodestream_server.fsck_command",
     "lodestream_server.repair",

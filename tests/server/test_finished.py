@@ -25,6 +25,9 @@ from tests.core.forgery import index_of, rewritten, unchanged, with_layer_errors
 from tests.server.helpers import hills, npy, problem, push
 from tests.server.test_bad_uploads import stored
 
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
 
 def whole(seed: int = 1) -> ls.Surface:
     """A surface of two blocks with holes, attributes and metadata."""

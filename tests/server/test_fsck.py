@@ -107,6 +107,31 @@ def is_whole(data: Path, original: Path, *surfaces: dict[str, Any]) -> bool:
     return all((data / name).read_bytes() == (original / name).read_bytes() for name in names)
 
 
+@pytest.mark.parametrize("gone", [(), ("upload",), ("folder",), ("container",), ("upload", "container")], ids="-".join)
+def test_what_is_gone_is_not_counted(
+    fsck: Fsck, data: Path, surfaces: list[dict[str, Any]], capsys: pytest.CaptureFixture[str], gone: tuple[str, ...]
+) -> None:
+    one, *_ = surfaces
+    if "upload" in gone:
+        (upload_of(data, one) / "0").unlink()
+    if "folder" in gone:
+        shutil.rmtree(upload_of(data, one))
+    if "container" in gone:
+        (data / "containers" / f"{one['container']}.lode").unlink()
+    _, report = fsck()
+    uploads, containers = list(data.glob("uploads/*/0")), list(data.glob("containers/*.lode"))
+    assert (report["surfaces"], report["uploads"], report["containers"]) == (3, len(uploads), len(containers))
+    assert report["bytes"] == sum(path.stat().st_size for path in (*uploads, *containers))
+    what = {"folder": "upload"}
+    assert {(it["what"], it["surface"]) for it in report["findings"]} == {(what.get(it, it), one["id"]) for it in gone}
+    parser = argparse.ArgumentParser()
+    register(parser.add_subparsers())
+    args = parser.parse_args(["fsck", str(data)])
+    args.run(args)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith(f"3 surfaces, {len(uploads)} uploads, {len(containers)} containers, ")
+
+
 def state(data: Path, surface: dict[str, Any]) -> str:
     return str(json.loads((data / "records" / f"{surface['id']}.json").read_text())["state"])
 
