@@ -44,6 +44,9 @@ _MODULES = (
 )
 _EACH = 0.005
 
+# A command that has one of these words among its arguments may build.
+_BUILDING = {"serve", "--adopt", "--repair", "--retry"}
+
 _PR_SET_PDEATHSIG = 1
 
 
@@ -157,7 +160,7 @@ def _be(arguments: list[str], log: str) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for theirs, ours in ((nothing, 0), (said, 1), (said, 2)):
         os.dup2(theirs, ours)
-    if arguments[0] == "serve":
+    if _BUILDING.intersection(arguments):
         # Forked while this process has one thread.
         forked = _Forked()
         names: Any = jobs
