@@ -45,7 +45,7 @@ from lodestream.errors import InputError, TooLargeError
 
 from . import results, worker
 from .access import key_of
-from .durable import make_folder, remove
+from .durable import discard, make_folder
 from .problems import FullError, MissingError
 from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError
 from .records import Record, State
@@ -187,7 +187,8 @@ class Builder:
         try:
             record, new = await asyncio.to_thread(self._storage.add, record, upload)
         finally:
-            await asyncio.to_thread(remove, upload)  # by nobody else, and not before: it may be on its way to its place
+            # By nobody else, and not before: it may be on its way to its place.
+            await asyncio.to_thread(discard, upload)
         if new:
             self.submit(record, caller)
         return record, new
@@ -396,12 +397,12 @@ class Builder:
                 result = await self._keep(record, job, result)
             if result is None:
                 return "ready"
-            await asyncio.to_thread(remove, folder)  # whoever sees that it has failed sees nothing of it
+            await asyncio.to_thread(discard, folder)  # whoever sees that it has failed sees nothing of it
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            await asyncio.to_thread(remove, folder)
+            await asyncio.to_thread(discard, folder)
 
     async def _run(self, call: Call) -> worker.Built | worker.Refused:
         try:

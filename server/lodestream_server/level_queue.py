@@ -35,7 +35,7 @@ from starlette.requests import ClientDisconnect
 from lodestream.errors import LodestreamError, StreamError, TooLargeError
 
 from . import damage
-from .durable import make_folder, remove
+from .durable import discard, make_folder, remove
 from .folders import is_file
 from .level_files import Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, RefusedLevel, make_level
@@ -328,7 +328,7 @@ class LevelQueue:
             size = await self._insist(wanted, job.key)
             return self._files.add(job.key, wanted.path, size, kept=job.kept)
         finally:
-            await asyncio.to_thread(remove, folder)
+            await asyncio.to_thread(discard, folder)
 
     async def _insist(self, wanted: LevelJob, key: Key) -> int:
         for _ in range(_DEATHS):

@@ -20,7 +20,7 @@ from lodestream.errors import InputError, LodestreamError, NotFoundError
 
 from . import markers
 from .catalog import Catalog, Position
-from .durable import NewFile, make_folder, remove, rename, sync_folder, write_file
+from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
 from .private import check_writable, make_private, tighten
 from .problems import MissingError
@@ -207,7 +207,7 @@ class Storage:
                     f"expected an upload whose id no other has, got one with that of {record.id}; give it another name"
                 )
             if known is not None and known.state not in _STOPPED and has_upload(self._at, known):
-                remove(upload)
+                discard(upload)
                 return known, False
             record = replace(record, upload=self._upload_folder(record))
             if known is not None:
@@ -287,7 +287,7 @@ class Storage:
         with self._lock:
             record = self._catalog.find(surface)
             if record is None:
-                remove(built)
+                discard(built)
                 return
             self._check_mounted()
             before = None if record.container == sha256 else record.container
@@ -303,7 +303,7 @@ class Storage:
                 self._write(made)
             except OSError:
                 if not there:
-                    remove(container)
+                    discard(container)
                 raise
             if before is not None and outdated and not self._catalog.has_container(before) and not self._unusable:
                 with suppress(OSError):  # what stays is set aside at the next start: no record speaks of it
