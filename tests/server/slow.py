@@ -24,6 +24,7 @@ __all__ = [
     "end_by",
     "end_once",
     "explode",
+    "explode_later",
     "full_at_each_step",
     "hoard",
     "hoard_level",
@@ -158,6 +159,12 @@ def end_once(job: Job) -> Built | Refused:
 def explode(job: Job) -> Built | Refused:
     """Raise what nobody foresaw."""
     raise ZeroDivisionError(f"with a secret: {job.folder}")
+
+
+def explode_later(job: Job) -> Built | Refused:
+    """The same, once ``go`` is there."""
+    wait(job)
+    return explode(job)
 
 
 def refuse(job: Job) -> Built | Refused:
