@@ -1,4 +1,4 @@
-"""What all tests share: the profiles of the property tests, and a folder for what `pull` keeps."""
+"""What all tests share: profiles of property tests, a folder for what `pull` keeps, and what has loaded the kernels."""
 
 from __future__ import annotations
 
@@ -30,3 +30,24 @@ def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LODESTREAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def one_fork_server() -> Iterator[None]:
+    """Servers that are objects here share what has loaded the kernels: each call has a process of its own anyway.
+
+    Those that are programs of their own do as they always do. For the whole session, since tests of several folders
+    take turns in a process of pytest-xdist, and loading takes seconds.
+    """
+    from lodestream_server import jobs, worker
+    from lodestream_server.processes import ForkServer
+
+    class Shared(ForkServer):
+        def close(self) -> None:
+            """Leave it to the next server."""
+
+    shared = Shared(worker.warm)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "ForkServer", lambda _: shared)
+        yield
+    ForkServer.close(shared)
