@@ -39,14 +39,15 @@ def one_fork_server() -> Iterator[None]:
     Those that are programs of their own do as they always do. For the whole session, since tests of several folders
     take turns in a process of pytest-xdist, and loading takes seconds.
     """
-    from lodestream_server import jobs, worker
+    from lodestream_server import jobs
     from lodestream_server.processes import ForkServer
+    from tests.server import slow
 
     class Shared(ForkServer):
         def close(self) -> None:
             """Leave it to the next server."""
 
-    shared = Shared(worker.warm)
+    shared = Shared(slow.warm)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jobs, "ForkServer", lambda _: shared)
         yield
