@@ -24,6 +24,35 @@ settings.register_profile("torture", settings.get_profile("default"), derandomiz
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 
 
+#: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
+LONGEST = (
+    "tests/history/test_runs.py",
+    "tests/faults/test_sample.py",
+    "tests/server/test_floods.py",
+    "tests/server/test_kills.py",
+    "tests/server/test_crowds.py",
+    "tests/server/test_strangers.py",
+    "tests/client/test_broken_links.py",
+    "tests/client/test_interrupted.py",
+    "tests/client/test_program.py",
+    "tests/server/test_command.py",
+    "tests/server/test_levels.py",
+    "tests/torture/test_lanes.py",
+    "tests/core/test_many_parts.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(LONGEST)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What `pull` keeps, in this process and in those that it starts, is not kept in the user's folder."""

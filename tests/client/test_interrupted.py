@@ -159,7 +159,11 @@ def check_resumed(source: tuple[str, ...], out: Path, folder: Path, whole: Terra
     assert kept(folder) == 0
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("source", "number", "code"),
+    [("ws", signal.SIGINT, 130), ("http", signal.SIGTERM, 143), ("file", signal.SIGINT, 130)],
+    indirect=["source"],
+)
 def test_after_an_interrupt_there_is_what_came(
     source: tuple[str, ...], number: int, code: int, folder: Path, tmp_path: Path, relief: Terrain, run: Run
 ) -> None:
