@@ -18,6 +18,13 @@ def _one_fork_server(one_fork_server: None) -> None:
     """For all of these tests."""
 
 
+@pytest.fixture
+def called_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``serve`` may be called within this process: its log and its limits stay as they are."""
+    monkeypatch.setattr("lodestream_server.logs.configure", lambda *_: None)
+    monkeypatch.setattr("lodestream_server.open_files.raise_file_limit", lambda _: None)
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("server") / "data"

@@ -50,13 +50,11 @@ def the_line(code: int, out: str, err: str) -> str:
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
-    """The same within this process, whose log and limits stay as they are."""
+def refused(called_here: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """The same within this process."""
     for name in list(os.environ):
         if name.startswith("LODESTREAM_"):
             monkeypatch.delenv(name)
-    monkeypatch.setattr("lodestream_server.logs.configure", lambda *_: None)
-    monkeypatch.setattr("lodestream_server.open_files.raise_file_limit", lambda _: None)
 
     def call(*arguments: object) -> str:
         capsys.readouterr()
