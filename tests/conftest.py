@@ -1,4 +1,4 @@
-"""What all tests share: the profiles of the property tests, and a folder for what `pull` keeps."""
+"""What all tests share: profiles of property tests, a folder for what `pull` keeps, and what has loaded the kernels."""
 
 from __future__ import annotations
 
@@ -24,9 +24,60 @@ settings.register_profile("torture", settings.get_profile("default"), derandomiz
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 
 
+#: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
+LONGEST = (
+    "tests/history/test_runs.py",
+    "tests/faults/test_sample.py",
+    "tests/server/test_floods.py",
+    "tests/server/test_kills.py",
+    "tests/server/test_crowds.py",
+    "tests/server/test_strangers.py",
+    "tests/client/test_broken_links.py",
+    "tests/client/test_interrupted.py",
+    "tests/client/test_program.py",
+    "tests/server/test_command.py",
+    "tests/server/test_levels.py",
+    "tests/torture/test_lanes.py",
+    "tests/core/test_many_parts.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(LONGEST)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What `pull` keeps, in this process and in those that it starts, is not kept in the user's folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LODESTREAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def one_fork_server() -> Iterator[None]:
+    """Servers that are objects here share what has loaded the kernels: each call has a process of its own anyway.
+
+    Those that are programs of their own do as they always do. For the whole session, since tests of several folders
+    take turns in a process of pytest-xdist, and loading takes seconds.
+    """
+    from lodestream_server import jobs
+    from lodestream_server.processes import ForkServer
+    from tests.server import slow
+
+    class Shared(ForkServer):
+        def close(self) -> None:
+            """Leave it to the next server."""
+
+    shared = Shared(slow.warm)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "ForkServer", lambda _: shared)
+        yield
+    ForkServer.close(shared)

@@ -23,6 +23,11 @@ def make_terrain(rows: int = 97, columns: int = 70) -> NDArray[np.float32]:
     return points
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _one_fork_server(one_fork_server: None) -> None:
+    """For all of these tests."""
+
+
 @pytest.fixture(scope="session")
 def terrain() -> NDArray[np.float32]:
     return make_terrain()

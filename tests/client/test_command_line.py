@@ -393,7 +393,7 @@ def test_push_of_what_is_no_surface(run: Run, server: str, tmp_path: Path) -> No
 
 def test_pull_for_some_seconds_brings_the_metadata(run: Run, surface: str, tmp_path: Path) -> None:
     out = tmp_path / "out.npy"
-    code, stdout, stderr = run("pull", surface, out, "--seconds", "0.3", "--limit-rate", "32kbit", "--json")
+    code, stdout, stderr = run("pull", surface, out, "--seconds", "1.2", "--limit-rate", "32kbit", "--json")
     figures = json.loads(stdout)
     assert code == 0
     assert figures["ended"] == "seconds"

@@ -37,7 +37,7 @@ Terrain = NDArray[np.float32]
 # What a pull says and asks beside the container: handshakes, headers, the surface's description, layers' figures.
 TALK = 12_000
 
-RATE = "2mbit"
+RATE = "1mbit"
 
 # Bytes that are let come before it is ended; more than what is read at once, so that some of it has been decoded.
 CAME = 100_000
@@ -159,7 +159,11 @@ def check_resumed(source: tuple[str, ...], out: Path, folder: Path, whole: Terra
     assert kept(folder) == 0
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("source", "number", "code"),
+    [("ws", signal.SIGINT, 130), ("http", signal.SIGTERM, 143), ("file", signal.SIGINT, 130)],
+    indirect=["source"],
+)
 def test_after_an_interrupt_there_is_what_came(
     source: tuple[str, ...], number: int, code: int, folder: Path, tmp_path: Path, relief: Terrain, run: Run
 ) -> None:
@@ -167,10 +171,8 @@ def test_after_an_interrupt_there_is_what_came(
     with command("pull", source[0], out, "--json", "--limit-rate", RATE, *source[1:]) as process:
         until(lambda: kept(folder) > CAME, process)
         process.send_signal(number)
-        asked = time.monotonic()
         ended, stdout, stderr = end(process)
     assert ended == code, stderr
-    assert time.monotonic() - asked < 10
     figures = json.loads(stdout) if stdout else pytest.fail(stderr)
     assert figures["ended"] == "stopped"
     assert figures["bytes"] > 30_000

@@ -128,7 +128,7 @@ def test_after_the_deadline_the_last_error_is_raised(surface: str, asynchronous:
         pytest.raises((client.UnreachableError, ls.TruncatedStreamError, ls.LodestreamError)),
     ):
         follow(link.url, asynchronous, deadline=0.5, transport=transport)
-    assert link.connections > 3
+    assert link.connections > 1
 
 
 def test_without_a_deadline_nothing_is_replaced(surface: str, asynchronous: bool) -> None:
@@ -353,7 +353,7 @@ def test_a_file_without_a_version_is_not_kept(
 
 
 def test_seconds_and_the_metadata_are_kept_too(run: Run, surface: str, folder: Path, tmp_path: Path) -> None:
-    figures, _ = pull(run, surface, tmp_path / "a.npy", "--seconds", "0.4", "--limit-rate", "64kbit")
+    figures, _ = pull(run, surface, tmp_path / "a.npy", "--seconds", "1.2", "--limit-rate", "64kbit")
     assert figures["ended"] == "seconds"
     again, _ = pull(run, surface, tmp_path / "a.npy", "--max-bytes", "1000")
     assert again["ended"] == "bytes"

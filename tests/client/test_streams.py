@@ -100,14 +100,15 @@ def test_stop_from_another_thread(surface: str) -> None:
         next(stream)
         thread = threading.Thread(target=stream.stop)
         thread.start()
-        rest = list(stream)
+        list(stream)
         thread.join()
     assert stream.ended == "stopped"
-    assert len(rest) <= 3
+    assert stream.header is not None
+    assert stream.wire_bytes < stream.header.size / 2
 
 
 def test_seconds(surface: str) -> None:
-    with sync.connect(surface, target=ls.Target(seconds=0.3), limit_rate=4000.0) as stream:
+    with sync.connect(surface, target=ls.Target(seconds=1.0), limit_rate=4000.0) as stream:
         views = list(stream)
     assert stream.ended == "seconds"
     assert views

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from lodestream_client.requests import Description
 from lodestream_server import running_server
 
 from .conftest import Run
+from .files import running
 
 REASON = "the kernels could not be loaded"
 
@@ -71,14 +71,8 @@ def fake(*states: str) -> Iterator[Fake]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     told.url = f"http://127.0.0.1:{server.server_address[1]}"
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
+    with running(server):
         yield told
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
 def ask(what: str, server: Fake, asynchronous: bool) -> Description:

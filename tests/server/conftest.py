@@ -8,30 +8,21 @@ from pathlib import Path
 import httpx
 import pytest
 
-from lodestream_server import jobs, running_server, worker
-from lodestream_server.processes import ForkServer
+from lodestream_server import running_server
 from lodestream_server.tokens import SCOPES, TokenFile
 from tests.server.helpers import Keys
 
 
-class _Shared(ForkServer):
-    """A fork server that outlives the server that closes it."""
-
-    def close(self) -> None:
-        """Leave it to the next server."""
+@pytest.fixture(scope="session", autouse=True)
+def _one_fork_server(one_fork_server: None) -> None:
+    """For all of these tests."""
 
 
-@pytest.fixture(scope="package", autouse=True)
-def one_fork_server() -> Iterator[None]:
-    """Servers that are objects here share what has loaded the kernels: each call has a process of its own anyway.
-
-    Those of the client's tests, and those that are programs of their own, do as they always do.
-    """
-    shared = _Shared(worker.warm)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "ForkServer", lambda _: shared)
-        yield
-    ForkServer.close(shared)
+@pytest.fixture
+def called_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``serve`` may be called within this process: its log and its limits stay as they are."""
+    monkeypatch.setattr("lodestream_server.logs.configure", lambda *_: None)
+    monkeypatch.setattr("lodestream_server.open_files.raise_file_limit", lambda _: None)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,8 @@ from lodestream_server.markers import MARKER
 
 T = TypeVar("T")
 
-PATIENCE = 60.0
+# Nothing here takes longer than some seconds, but on a machine that does much else.
+PATIENCE = 150.0
 
 
 def hills(rows: int = 40, columns: int = 30, seed: int = 1) -> NDArray[np.float32]:

@@ -10,13 +10,15 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
-from lodestream_server import durable, jobs, level_queue
+from lodestream_server import durable, jobs, level_queue, worker
 from lodestream_server.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.processes import Allowed
 from lodestream_server.worker import Built, Job, Refused, build
 from tests.server.disks import FullDisk
+from tests.server.helpers import hills
 
 __all__ = [
     "allow_levels_more",
@@ -24,6 +26,7 @@ __all__ = [
     "end_by",
     "end_once",
     "explode",
+    "explode_later",
     "find_full",
     "full_at_each_step",
     "hoard",
@@ -46,6 +49,8 @@ __all__ = [
     "unkept",
     "use_processors",
     "wait",
+    "warm",
+    "warm_heights",
 ]
 
 
@@ -59,12 +64,28 @@ def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
     return replace(_allowed_level(job, *args), write=job.folder.parent.parent, file_bytes=None)
 
 
+# The server's limits are longer, and no test leaves it at that.
+_PATIENCE = 120.0
+
 _allowed: Callable[..., Allowed] = jobs._allowed
 _allowed_level: Callable[..., Allowed] = level_queue._allowed
 
 
 def nothing() -> None:
     """Do nothing."""
+
+
+def warm() -> str | None:
+    """What `worker.warm` does, where calls of the tests find imported what they are called from: it takes longer."""
+    import_module("tests.server.hostile")
+    return worker.warm()
+
+
+def warm_heights() -> None:
+    """Load what heights need, which is a fraction of what `worker.warm` loads for all kinds of surfaces."""
+    from lodestream import decode, encode
+
+    decode(encode(hills(64, 65)))
 
 
 def number() -> int:
@@ -125,7 +146,7 @@ def wait(job: Job) -> Built | Refused:
     """Report half, then go on when a file called ``go`` appears beside the surfaces' folders."""
     (job.folder / "progress").write_text("0.5")
     go = job.folder.parent.parent / "go"
-    until = time.monotonic() + 60
+    until = time.monotonic() + _PATIENCE
     while not go.exists():
         if time.monotonic() > until:
             return Refused("nobody said go")
@@ -159,6 +180,12 @@ def end_once(job: Job) -> Built | Refused:
 def explode(job: Job) -> Built | Refused:
     """Raise what nobody foresaw."""
     raise ZeroDivisionError(f"with a secret: {job.folder}")
+
+
+def explode_later(job: Job) -> Built | Refused:
+    """The same, once ``go`` is there."""
+    wait(job)
+    return explode(job)
 
 
 def refuse(job: Job) -> Built | Refused:
@@ -199,7 +226,7 @@ def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
     begun = job.folder.parent.parent / "begun"
     with begun.open("a") as file:
         file.write(f"{os.getpid()} {job.level}\n")
-    until = time.monotonic() + 60
+    until = time.monotonic() + _PATIENCE
     while job.level and not (begun.parent / "go").exists():
         if time.monotonic() > until:
             return RefusedLevel("OptionError", "nobody said go")

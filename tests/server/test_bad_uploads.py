@@ -22,7 +22,8 @@ VRT = b"""<VRTDataset rasterXSize="5" rasterYSize="5"><VRTRasterBand dataType="B
 
 
 def stored(data: Path) -> list[str]:
-    """What lies in the server's folder."""
+    """What lies in the server's folder, once it has cleared away what it built."""
+    eventually(lambda: not list((data / "work").iterdir()), "the builds' folders to be removed")
     return sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
 
 

@@ -85,6 +85,7 @@ def test_what_was_acknowledged_is_there_after_a_kill(tmp_path: Path) -> None:
         assert push(http, npy(hills(200, 200, seed=2)))["url"] == queued.headers["location"]
 
 
+@pytest.mark.usefixtures("called_here")
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_an_address_that_others_reach_needs_a_token_or_a_word(host: str, tmp_path: Path) -> None:
     args = parse("--host", host, "--data", str(tmp_path))
@@ -97,6 +98,7 @@ def test_an_address_that_others_reach_needs_a_token_or_a_word(host: str, tmp_pat
     create_app(Settings(host=host, data=tmp_path))
 
 
+@pytest.mark.usefixtures("called_here")
 def test_a_variable_of_the_environment_that_cannot_be_used_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from lodestream.predictors import default_predictors
 from lodestream_server import fsck, repair, running_server, worker
 from lodestream_server.records import plain
 from tests.core.forgery import index_of, rewritten, unchanged, with_layer_errors, with_metadata
-from tests.server.helpers import hills, npy, problem, push
+from tests.server.helpers import eventually, hills, npy, problem, push
 from tests.server.test_bad_uploads import stored
 
 #: What a container does not keep is another matter, see test_losses.
@@ -72,7 +71,7 @@ def test_a_container_is_kept_as_it_is(http: httpx.Client, data: Path) -> None:
     assert {key: made[key] for key in told} == told
     assert made["metadata"]["crs"] == "LOCAL_CS[]"
     assert made["name"] == "whole/1[31m"
-    assert list((data / "work").iterdir()) == []
+    eventually(lambda: not list((data / "work").iterdir()), "the build's folder to be removed")
     for level in (0, len(made["levels"]) - 1):
         answer = http.get(f"{made['url']}/levels/{level}", params={"format": "ply"})
         assert (answer.status_code, answer.content[:3]) == (200, b"ply")
@@ -216,11 +215,9 @@ def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp
         running_server(tmp_path / "data", workers=1, build_memory=600 << 20) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
     ):
-        began = time.monotonic()
         made = push(http, container)
         assert made["state"] == "waiting"
         assert "more memory than one may have, 600 MiB" in made["reason"]
-        assert time.monotonic() - began < 60
         assert push(http, promising(64, 64))["state"] == "ready"
 
 

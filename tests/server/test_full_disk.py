@@ -111,12 +111,13 @@ def test_keeping_what_was_built_at_every_step(tmp_path: Path, monkeypatch: pytes
 
 def test_a_failure_that_cannot_be_written_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
-    monkeypatch.setattr(worker, "build", slow.wait)
-    with running(data, build_seconds=0.5) as http:
+    monkeypatch.setattr(worker, "build", slow.explode_later)
+    with running(data) as http:
         location = http.post("/v1/surfaces", content=npy(hills())).headers["location"]
-        eventually(lambda: http.get(location).json()["state"] == "building" or None, "the build to begin")
+        eventually(lambda: http.get(location).json()["progress"] == 0.5 or None, "the build to begin")
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
-        assert settled(http, location)["reason"] == "the build took longer than 0.5 s"
+        (data / "go").touch()
+        assert settled(http, location)["reason"] == "the build failed inside: ZeroDivisionError"
     monkeypatch.undo()
     # It is found out again.
     storage = Storage(data)

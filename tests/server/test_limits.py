@@ -318,6 +318,7 @@ def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: py
         httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
     ):
         made = push(http, npy(hills()))
+        eventually(lambda: not list((tmp_path / "work").iterdir()), "the build's folder to be removed")
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
         monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(1 << 40, 1 << 40, 0))
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))

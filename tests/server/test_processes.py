@@ -24,7 +24,7 @@ from tests.server.programs import alive
 _MEMORY = 512 << 20
 
 # Prints which loops were compiled, or loaded, by what stands after the warming.
-_FIRST_MESH = """
+_FIRST_MESHES = """
 from pathlib import Path
 import gc, sys
 import numba.core.dispatcher
@@ -35,15 +35,16 @@ def versions():
 warm()
 before = versions()
 import lodestream
-surface = lodestream.read(Path(sys.argv[1]))
-assert surface.blocks[0].points.shape == (3, 4, 3)
+for path in sys.argv[1:]:
+    surface = lodestream.read(Path(path))
+    assert surface.blocks[0].points.shape == (3, 4, 3)
 print(len(before), sorted(versions() - before))
 """
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ForkServer]:
-    made = ForkServer()
+    made = ForkServer(slow.nothing)  # so that not every call imports it
     yield made
     made.close()
 
@@ -73,7 +74,7 @@ def gone(process: int) -> bool:
 
 
 def test_a_fork_server_killed_while_it_idles_harms_nobody() -> None:
-    server = ForkServer()
+    server = ForkServer(slow.nothing)
 
     async def check() -> None:
         async with pool(server) as made:
@@ -207,14 +208,14 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
     assert eventually(lambda: gone(child), "the process to end with its parent")
 
 
-@pytest.mark.parametrize("faces", ["{a} {b} {c} {d}", "{a} {b} {c}\nf {a} {c} {d}"])
-def test_the_first_mesh_finds_its_loops_compiled(tmp_path: Path, faces: str) -> None:
-    mesh = tmp_path / "mesh.obj"
-    lines = [f"v {column} {row} {row * column % 3}" for row in range(3) for column in range(4)]
-    lines += ["f " + faces.format(a=a, b=a + 1, c=a + 5, d=a + 4) for a in (1, 2, 3, 5, 6, 7)]
-    mesh.write_text("\n".join(lines) + "\n")
+def test_the_first_mesh_finds_its_loops_compiled(tmp_path: Path) -> None:
+    meshes = tmp_path / "quads.obj", tmp_path / "triangles.obj"
+    for mesh, faces in zip(meshes, ("{a} {b} {c} {d}", "{a} {b} {c}\nf {a} {c} {d}"), strict=True):
+        lines = [f"v {column} {row} {row * column % 3}" for row in range(3) for column in range(4)]
+        lines += ["f " + faces.format(a=a, b=a + 1, c=a + 5, d=a + 4) for a in (1, 2, 3, 5, 6, 7)]
+        mesh.write_text("\n".join(lines) + "\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", _FIRST_MESH, str(mesh)]
+    command = [sys.executable, "-c", _FIRST_MESHES, *map(str, meshes)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     count, _, new = done.stdout.partition(" ")

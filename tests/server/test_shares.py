@@ -19,6 +19,7 @@ from lodestream.sender import Sender
 from lodestream.wire import serialize
 from lodestream_server import jobs, running_server, streams, worker
 from lodestream_server.access import key_of
+from lodestream_server.shares import Turns
 from lodestream_server.tokens import TokenFile
 from tests.server import slow
 from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, problem, push, raw_stream, settled
@@ -244,8 +245,16 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
 
         return wait
 
+    entering, enter = threading.Event(), Turns._enter
+
+    async def noted(self: Turns, caller: str, rank: int) -> None:
+        if caller == key_of("good"):
+            entering.set()
+        await enter(self, caller, rank)
+
     monkeypatch.setattr(Sender, "receive", patient(Sender.receive))
     monkeypatch.setattr(Sender, "wanted", patient(Sender.wanted))
+    monkeypatch.setattr(Turns, "_enter", noted)
     with ExitStack() as stack, town.client("good") as good:
         surface = push(good, npy(hills(100, 90)))
         crumbs: dict[str, Any] = {
@@ -268,8 +277,10 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
         goes_on()
         assert planning == ["open"], "one at a time"
         # In the queue, an honest long plan is the next.
+        entering.clear()
         mine = opened(stack, town, "good", surface, **fewer)
-        threading.Timer(0.2, go.set).start()
+        assert entering.wait(PATIENCE)
+        go.set()
         assert isinstance(mine.receive(), Header)
         for stream in theirs:
             assert isinstance(stream.receive(), Header)

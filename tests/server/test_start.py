@@ -9,7 +9,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,6 +17,7 @@ import httpx
 import pytest
 
 from lodestream.errors import LodestreamError
+from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, durable, jobs, running_server, worker
 from lodestream_server.durable import Disk
 from lodestream_server.processes import ForkServer
@@ -24,6 +25,8 @@ from lodestream_server.storage import Storage
 from lodestream_server.tokens import TokenFile
 from tests.server import slow
 from tests.server.helpers import PATIENCE, Keys, eventually, hills, npy, problem, push
+
+Refused = Callable[..., str]
 
 
 def lodestream(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -33,13 +36,32 @@ def lodestream(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE)
 
 
-def refused(*arguments: object) -> str:
-    """The one line with which a command is refused."""
+def refused_program(*arguments: object) -> str:
+    """The one line with which a process of the command ends."""
     done = lodestream(*arguments)
-    assert (done.returncode, done.stdout) == (1, ""), done.stderr
-    assert done.stderr.startswith("lodestream: ")
-    assert done.stderr.count("\n") == 1
-    return done.stderr.removesuffix("\n")
+    return the_line(done.returncode, done.stdout, done.stderr)
+
+
+def the_line(code: int, out: str, err: str) -> str:
+    assert (code, out) == (1, ""), err
+    assert err.startswith("lodestream: ")
+    assert err.count("\n") == 1
+    return err.removesuffix("\n")
+
+
+@pytest.fixture
+def refused(called_here: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """The same within this process."""
+    for name in list(os.environ):
+        if name.startswith("LODESTREAM_"):
+            monkeypatch.delenv(name)
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        return the_line(code, *capsys.readouterr())
+
+    return call
 
 
 @pytest.fixture
@@ -58,12 +80,12 @@ def closed(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_folder_that_another_server_uses(tmp_path: Path) -> None:
     with running_server(tmp_path):
-        line = refused("serve", "--port", "0", "--data", tmp_path)
+        line = refused_program("serve", "--port", "0", "--data", tmp_path)
     assert str(tmp_path) in line
     assert "another" in line
 
 
-def test_a_folder_that_cannot_be_written(closed: Path) -> None:
+def test_a_folder_that_cannot_be_written(closed: Path, refused: Refused) -> None:
     assert f"{closed}/lock: " in refused("serve", "--port", "0", "--data", closed)
     assert f"{closed}/data: " in refused("serve", "--port", "0", "--data", closed / "data")
     assert f"{closed}/tokens.json" in refused("token", "create", "--data", closed)
@@ -88,7 +110,7 @@ def test_a_folder_that_can_be_read_but_not_written_any_more(
     Storage(data).close()
 
 
-def test_a_file_in_the_place_of_a_folder(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_a_folder(tmp_path: Path, refused: Refused) -> None:
     file = tmp_path / "data"
     file.write_text("not a folder")
     for folder in (file, file / "below"):
@@ -99,7 +121,7 @@ def test_a_file_in_the_place_of_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"[", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"version": 1, "tokens": [7]}'])
-def test_a_token_file_that_is_none(tmp_path: Path, content: bytes) -> None:
+def test_a_token_file_that_is_none(tmp_path: Path, refused: Refused, content: bytes) -> None:
     path = tmp_path / "tokens.json"
     path.write_bytes(content)
     for command in (("serve", "--port", "0"), ("token", "create"), ("token", "list"), ("token", "revoke", "x")):
@@ -107,17 +129,17 @@ def test_a_token_file_that_is_none(tmp_path: Path, content: bytes) -> None:
     assert path.read_bytes() == content
 
 
-def test_a_token_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_a_token_file_that_cannot_be_read(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "tokens.json"
     path.mkdir()
     for command in (("serve", "--port", "0"), ("token", "create"), ("token", "list")):
         assert str(path) in refused(*command, "--data", tmp_path)
 
 
-def test_an_address_that_is_taken_or_not_ours(tmp_path: Path) -> None:
+def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        line = refused("serve", "--port", port, "--data", tmp_path)
+        line = refused_program("serve", "--port", port, "--data", tmp_path)
         assert line == (f"lodestream: expected an address to listen at, got 127.0.0.1 port {port}: {os.strerror(98)}")
         # In the same process the folder is free again.
         for _ in range(2):
@@ -137,7 +159,7 @@ def test_a_name_with_several_addresses_is_served_at_each(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("origin", ["*", "null"])
-def test_pages_of_all_sites_need_a_token_to_be_there(tmp_path: Path, keys: Keys, origin: str) -> None:
+def test_pages_of_all_sites_need_a_token_to_be_there(tmp_path: Path, keys: Keys, refused: Refused, origin: str) -> None:
     for options in ((), ("--insecure",), ("--public-reads",)):
         line = refused("serve", "--port", "0", "--data", tmp_path, "--origins", f"https://a.example,{origin}", *options)
         assert f"LODESTREAM_ORIGINS={origin}" in line
