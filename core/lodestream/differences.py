@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .binary_coder import INDEX, WIDEST, code_bit, finish, start
+from .binary_coder import INDEX, UNKNOWN, WIDEST, code_bit, finish, start
 from .kernels import inlined, kernel
 
 __all__ = ["code_differences", "most_bits"]
@@ -23,8 +23,6 @@ _SAME = _WHICH + 16
 _CLOSE_TO = _SAME + 1
 _BESIDE = _CLOSE_TO + 1
 _CONTEXTS = _BESIDE + 16
-#: A context before anything was learned: even chances, sure to the least degree.
-_UNKNOWN = (1 << 27) | 1
 
 #: Places on the line whose last difference is remembered, in a table by their hash.
 _ENTRIES = 1 << 14
@@ -71,7 +69,7 @@ def code_differences(
     tuple of two int
         Bytes of ``data`` and of ``stored``, written or looked at.
     """
-    model = np.full(_CONTEXTS, _UNKNOWN, np.int32)
+    model = np.full(_CONTEXTS, UNKNOWN, np.int32)
     used, size = _code(decoding, line, differences, exponents, marks, most, specials, model, data, stored)
     return int(used), int(size)
 
