@@ -1,4 +1,4 @@
-"""An adaptive binary range coder whose chances come from contexts that start trained, one alone or two mixed.
+"""An adaptive binary range coder whose chances come from contexts, one alone or two mixed.
 
 A *context* is an integer: its probability of a 1 over 2**20 and, in the lowest 8 bits, how sure it is (1 to 127). After
 each bit the probability moves towards 0 or 2**20 - 1 by the part `_RATES` of the distance and gets surer by 1. Two
@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from .kernels import bare_kernel, inlined
 
-__all__ = ["INDEX", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit", "finish", "start"]
+__all__ = ["INDEX", "UNKNOWN", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit", "finish", "start"]
 
 #: Width of the interval at the start.
 WIDEST = 0xFFFFFFFF
 #: An index known to be positive spares the compiled loop the test for one that counts from the end.
 INDEX = 0x7FFFFFFF
+#: A context before anything was learned: even chances, sure to the least degree.
+UNKNOWN = (1 << 27) | 1
 #: Either weight before anything was learned, over 2**16.
 WEIGHT = 1 << 15
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from .allocation import TileCurve, assign_layers
 from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
-from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
-from .lattice import LATTICE_BITS, Lattice
+from .lattice import Lattice
 from .picture import coordinate_distances
 from .piece_coder import as_returned, encode_pieces
 from .predictors import COEFFICIENT_BITS, default_predictors
@@ -71,7 +70,6 @@ class Encoding:
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
-        self.bits = 0
         self.lattices, self.fineness = (prepared.lattices(bits), 0) if fine is None else fine
 
     def run(self) -> bytes:
@@ -121,7 +119,6 @@ class Encoding:
             predictors=self.predictors,
             extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
-            fraction=self._fraction(),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
@@ -135,12 +132,6 @@ class Encoding:
             mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
             **_kept(prepared),
         )
-
-    def _fraction(self) -> int:
-        """Binary places between lattice steps, which are fine enough as they are where there is a quantiser."""
-        if self.quantiser is not None:
-            return 0
-        return max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes()))
 
     def _quantise(self, wanted: float) -> None:
         """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
@@ -178,7 +169,6 @@ class Encoding:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
-            self.bits = max(self.bits, max(_largest(array) for array in arrays).bit_length())
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
@@ -206,10 +196,6 @@ class Encoding:
         """Range of an attribute."""
         values = [self.prepared.channel(block, channel) for block in range(len(self.prepared.arrays))]
         return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
-
-    def _most_planes(self) -> int:
-        """Bit-planes of the tile that has most; with the fraction they must fit a coefficient."""
-        return max(int(channel.top.max()) for channel in self.channels)
 
     def _empty_levels(self, top: NDArray[np.int8]) -> int:
         """The levels without a coefficient other than 0, as bits."""

@@ -81,7 +81,7 @@ def test_a_window_of_any_state(
     elif known == "anything":
         state[:] = rng.choice([0, 1, 2, 7, 16, 31, UNANNOUNCED], state.size)
     state[~needed_tiles(layout, region)] = 0
-    header = cast("Header", SimpleNamespace(layout=layout, predictors=[predictors], fraction=5, geometric=1))
+    header = cast("Header", SimpleNamespace(layout=layout, predictors=[predictors], geometric=1))
     window, fraction = window_picture(header, 0, tiles, state, region)
     whole, expected = channel_picture(header, 0, tiles, state, layout.levels)
     assert fraction == expected

@@ -117,6 +117,7 @@ def _simple() -> dict[str, Original]:
     own = np.random.default_rng(2006)
     offsets = np.repeat(np.repeat(own.random((9, 8)), 8, 0), 8, 1)[:66]
     quantised = 0.3 * (np.rint(np.cumsum(5 * own.normal(size=(66, 64)), 1)) + offsets) + 20
+    widest = np.random.default_rng(2007).choice([-(2**23), 0, 1, 2**23 - 1], (50, 56), p=[0.45, 0.05, 0.05, 0.45])
     tower = np.zeros((9, 9), np.float32)
     tower[4, 4] = 1
     return {
@@ -132,6 +133,7 @@ def _simple() -> dict[str, Original]:
         "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
         "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
         "heights-offsets": Original(ls.Surface(quantised.astype(np.float32))),
+        "heights-widest": Original(ls.Surface(widest.astype(np.int32))),
         "heights-tower": Original(ls.Surface(tower)),
         "planar-open": Original(ls.Surface(_torus(13, 11)[..., :2].astype(np.float32))),
         "torus-odd": Original(ls.Surface(_torus(21, 33).astype(np.float32), (True, True))),
