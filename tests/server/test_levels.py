@@ -222,15 +222,15 @@ def test_callers_take_turns(tmp_path: Path, slowly: None, monkeypatch: pytest.Mo
     file = TokenFile(tmp_path / "tokens.json")
     one, two = (file.create(name, ("write",))[0] for name in ("one", "two"))
     asked: list[int] = []
-    submit = level_queue.LevelQueue._submit
+    line_up = level_queue.LevelQueue._line_up
 
-    def submitted(self: level_queue.LevelQueue, key: Key, caller: str) -> Any:
-        asked.append(key.level)
-        if key.level == 0:
+    def lined_up(self: level_queue.LevelQueue, job: Any, caller: str) -> None:
+        asked.append(job.key.level)
+        if job.key.level == 0:
             (tmp_path / "go").touch()
-        return submit(self, key, caller)
+        line_up(self, job, caller)
 
-    monkeypatch.setattr(level_queue.LevelQueue, "_submit", submitted)
+    monkeypatch.setattr(level_queue.LevelQueue, "_line_up", lined_up)
     with running_server(tmp_path, workers=1) as url, client(url, one) as http, client(url, two) as other:
         surface = push(http, npy(hills()))
         finer = [len(surface["levels"]) - number for number in range(1, 5)]
