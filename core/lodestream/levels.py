@@ -16,8 +16,8 @@ from .surface import Closed
 __all__ = ["coarsen", "hierarchy"]
 
 # The optimum is x_2k + _GAIN (w_k + w_{k-1}), where w is the details d run through 1 / ((1 - r z)(1 - r / z)). That
-# series is a product, 1 / (1 - r z) = (1 + r z)(1 + r^2 z^2)(1 + r^4 z^4) ..., and each factor times its mirror image is
-# 1 + r^2n times 1 + p (z^n + z^-n). What the five factors leave out weighs less than 1e-24.
+# series is a product, 1 / (1 - r z) = (1 + r z)(1 + r^2 z^2)(1 + r^4 z^4) ..., and each factor times its mirror image
+# is 1 + r^2n times 1 + p (z^n + z^-n). What the five factors leave out weighs less than 1e-24.
 _RATIO = 2.0 * np.sqrt(2.0) - 3.0
 _SPANS = (1, 2, 4, 8, 16)
 _WEIGHTS = tuple(float(_RATIO**n / (1.0 + _RATIO ** (2 * n))) for n in _SPANS)
