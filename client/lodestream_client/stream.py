@@ -23,7 +23,7 @@ from lodestream.errors import (
     TruncatedStreamError,
 )
 from lodestream.messages import MAX_MESSAGE, MIN_WINDOW, SUBPROTOCOL
-from lodestream.opening import OPENED, to_address
+from lodestream.opening import to_address
 from lodestream.range_download import RangeDownload
 from lodestream.reception import Reception, Sink, Store
 from lodestream.target import Region, Target
@@ -266,13 +266,14 @@ class BaseStream:
             turns, self._download = self._turns, None
             download = Download(window=self._window, reception=self._reception)
         began = time.monotonic()
-        subprotocol = yield self._dial(addresses.stream_url(self.url, to_address(download.opening)))
+        opening = to_address(download.opening)
+        subprotocol = yield self._dial(addresses.stream_url(self.url, opening))
         self._connections += 1
-        if subprotocol not in (OPENED, SUBPROTOCOL):
+        if subprotocol != SUBPROTOCOL:
             raise problems.NoStreamError(
                 f"expected {self.url} to speak {SUBPROTOCOL}, got {subprotocol or 'no subprotocol'}"
             )
-        if subprotocol == OPENED:
+        if opening is not None:
             download.opened(began)
         with self._lock:
             self._download = download
@@ -422,7 +423,7 @@ class BaseStream:
 
     def _socket_options(self) -> dict[str, Any]:
         options: dict[str, Any] = {
-            "subprotocols": [OPENED, SUBPROTOCOL],
+            "subprotocols": [SUBPROTOCOL],
             "compression": None,  # what travels is coded already
             "max_size": MAX_MESSAGE,
             "max_queue": _MAX_QUEUE,

@@ -141,7 +141,7 @@ class Download:
         return messages
 
     def opened(self, now: float) -> None:
-        """Tell that the server has taken `opening` with the handshake: it is not to be sent again.
+        """Tell that `opening` stood in the address of the handshake: it is not to be sent again.
 
         Parameters
         ----------

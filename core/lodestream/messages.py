@@ -73,8 +73,8 @@ class Code:
 CODES: Mapping[str, Code] = {
     "bad-message": Code(4400, "Not a message of this protocol"),
     "out-of-turn": Code(4400, "A message that is not allowed now"),
-    "no-token": Code(4401, "A token or a ticket is needed"),
-    "bad-token": Code(4403, "A token or ticket that is not known, or no longer"),
+    "no-token": Code(4401, "A token is needed"),
+    "bad-token": Code(4403, "A token that is not known, or no longer, or that does not allow it"),
     "not-found": Code(4404, "No such surface"),
     "idle": Code(4408, "Nothing was heard or taken for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
@@ -122,8 +122,8 @@ class Open:
         Slices of the container that the client holds already, at most `MAX_HELD`.
     container : str or None
         SHA-256 of the container that they are slices of.
-    ticket : str or None
-        What allows reading where a token does and the client cannot send a header, as in a browser.
+    token : str or None
+        For a client that cannot send a header with the handshake, as in a browser; never in an address.
     """
 
     type: ClassVar[str] = "open"
@@ -131,7 +131,7 @@ class Open:
     credit: int = MAX_CREDIT
     held: tuple[tuple[int, int], ...] = ()
     container: str | None = None
-    ticket: str | None = field(default=None, repr=False)
+    token: str | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)

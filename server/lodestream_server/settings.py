@@ -38,7 +38,6 @@ class Settings(BaseSettings):
     token_file: Path | None = _field("token_file")
     public_reads: bool = _field("public_reads")
     origins: Annotated[tuple[str, ...], NoDecode] = _field("origins")
-    ticket_seconds: float = _field("ticket_seconds")
     formats: Annotated[tuple[str, ...], NoDecode] = _field("formats")
     upload_bytes: int = _field("upload_bytes")
     upload_files: int = _field("upload_files")

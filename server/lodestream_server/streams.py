@@ -19,7 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 from lodestream.container import ByteRange
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
-from lodestream.opening import OPENED, PARAMETER, from_address
+from lodestream.opening import PARAMETER, from_address
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
@@ -38,6 +38,7 @@ from .problems import (
     NoTokenError,
     NotReadyError,
     PostponedError,
+    SmallScopeError,
     TooManyError,
 )
 from .routing import Parts
@@ -76,19 +77,21 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         if SUBPROTOCOL not in offered:
             await _refuse_handshake(socket)
             return
-        opening = socket.query_params.get(PARAMETER) if OPENED in offered else None
-        await socket.accept(subprotocol=SUBPROTOCOL if opening is None else OPENED)
+        opening = socket.query_params.get(PARAMETER)
+        await socket.accept(subprotocol=SUBPROTOCOL)
     except OSError:  # the client is gone before it was answered
         return
     caller = caller_of(socket)
     try:
         with parts.limits.stream((caller or anybody(socket)).key):
             first = None if opening is None else from_address(opening)
+            if first is not None and _token(first) is not None:
+                raise MessageError("bad-message", "expected no token in an address, where logs keep it")
             if caller is None:
-                # Nothing is told of the surface, not even whether it exists, before the ticket was seen.
+                # Nothing is told of the surface, not even whether it exists, before the token was seen.
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
-                caller = parts.access.redeem(_ticket(first))
+                caller = parts.access.reader_with(_token(first))
             record = ready(parts, surface)
             container = await asyncio.to_thread(parts.containers.open, record.container or "")
             await _stream(_Session(socket, container, parts, first, caller), surface, caller)
@@ -139,11 +142,11 @@ async def _message(socket: WebSocket) -> bytes:
     return data
 
 
-def _ticket(message: bytes) -> str | None:
+def _token(message: bytes) -> str | None:
     first = parse(message)
     if not isinstance(first, Open):
         raise MessageError("out-of-turn", f"expected open, got {first.type}")
-    return first.ticket
+    return first.token
 
 
 class _SilentError(LodestreamError):
@@ -347,6 +350,7 @@ def _code(error: Exception) -> str:
         (MissingError, "missing"),
         (NoTokenError, "no-token"),
         (BadTokenError, "bad-token"),
+        (SmallScopeError, "bad-token"),
         (TooManyError, "too-many"),
         (BusyError, "busy"),
         (StreamError, "damaged"),

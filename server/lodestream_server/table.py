@@ -288,7 +288,6 @@ _SETTINGS = (
         metavar="A,B",
         usual="none",
     ),
-    Setting("ticket_seconds", _SECONDS, 60.0, "how long a ticket for a browser's stream is valid", "access", above=0),
     Setting(
         "formats",
         _FORMATS,

@@ -52,7 +52,7 @@ def test_pongs_that_nobody_takes_are_counted_in_bytes(
     monkeypatch.setattr(frames, "_FRAMES", (1e9, 0.0))
     monkeypatch.setattr(frames, "_OTHER_FRAMES", (1e9, 0.0))
     pings = frame(bytes(125), PING) * 500
-    # Somebody without a token, whose ticket is waited for.
+    # Somebody without a token, whose open is waited for.
     settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json"}
     with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}") as connection:
         assert cut_by(connection, [pings] * 2000)
