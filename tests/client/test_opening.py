@@ -14,7 +14,6 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tenacity import wait_random_exponential
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
@@ -38,7 +37,8 @@ def asynchronous(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads, "_WAIT", wait_random_exponential(multiplier=0.002, max=0.05))
+    monkeypatch.setattr(roads, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(roads, "_LONGEST_PAUSE", 0.05)
 
 
 @dataclass(frozen=True)
