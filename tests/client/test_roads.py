@@ -9,7 +9,6 @@ from websockets.http11 import Response
 
 import lodestream as ls
 from lodestream.errors import LodestreamError, RemoteError
-from lodestream_client import roads
 from lodestream_client.errors import SilenceError, UnreachableError
 from lodestream_client.roads import Roads, Transport
 
@@ -29,7 +28,7 @@ def refused(status: int, body: bytes) -> LodestreamError:
 
 @pytest.fixture(autouse=True)
 def without_chance(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads.random, "uniform", lambda least, most: most / 2)
+    monkeypatch.setattr("random.uniform", lambda least, most: most / 2)
 
 
 def road(made: Roads) -> str:
