@@ -38,7 +38,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lodestream.capacity import memory_limit
 from lodestream.errors import InputError
 
 from . import results, worker
@@ -52,16 +51,13 @@ from .shares import Turns
 from .storage import Storage
 from .uploads import check_upload
 
-__all__ = ["Builder", "default_memory"]
+__all__ = ["Builder"]
 
 _log = logging.getLogger(__name__)
 
 _DEATHS = 2
 _ENDINGS = 3
 _CRASHES = 3
-
-# Python, the libraries and the kernels alone take a third of it.
-_LEAST_MEMORY = 512 << 20
 
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
 _ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -118,7 +114,7 @@ class Builder:
         self._storage = storage
         self._settings = settings
         self._finished = finished
-        self._memory = settings.build_memory or default_memory(settings.workers)
+        self._memory = settings.memory_of_build
         self.fork_server = ForkServer(worker.warm)
         self._pool = Pool(settings.workers, self.fork_server)
         self._turns = Turns(settings.workers, _REMEMBERED)
@@ -455,11 +451,6 @@ class Builder:
             folder=folder,
             allowed=self._settings.formats,
         )
-
-
-def default_memory(workers: int) -> int:
-    """Bytes for each of so many builds: together half of the memory, so that levels and the server have theirs."""
-    return max(memory_limit() // 2 // workers, _LEAST_MEMORY)
 
 
 def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:
