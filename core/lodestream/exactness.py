@@ -16,12 +16,10 @@ from .errors import CorruptStreamError
 from .number_line import DECIMALS, MOST_DECIMALS, PATTERNS, common_zeros, decimal_places, from_line, to_line
 from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["NEIGHBOURS", "agree", "decode_piece", "encode_piece"]
+__all__ = ["agree", "decode_piece", "encode_piece"]
 
 #: The rules beside those of the line.
 _RAW, _OFFSETS = 0, 3
-#: The first byte of a piece that `neighbours` codes: it looks at whole windows.
-NEIGHBOURS = bytes([_OFFSETS | 63 << 2])
 #: Values that are on no line near the others, NaN and infinity, are told by their place in a list.
 _MOST_SPECIALS = 15
 

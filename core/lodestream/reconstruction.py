@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exactness, neighbours
+from . import exactness
 from .bitplanes import pass_count
 from .container.model import Header
 from .container.pieces import Window, windows
@@ -176,10 +176,6 @@ class Reconstruction:
                 mask, (data, offset) = masks[window.block], self._pieces[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
                 chosen = slice(None) if valid is None else valid
-                if data[:1] == exactness.NEIGHBOURS and not window.kept:
-                    lattice = self.header.lattices[window.channel]
-                    values[chosen] = neighbours.decode_window(values, valid, lattice, data[1:], offset + 1)[chosen]
-                    continue
                 known = values[chosen]
                 values[chosen] = exactness.decode_piece(known.ravel(), data, offset).reshape(known.shape)
 

@@ -178,7 +178,7 @@ def test_errors_never_rise_from_layer_to_layer_and_end_at_nothing(name: str) -> 
         assert (index.levels[-1].rms, index.levels[-1].max_error) == (0.0, 0.0)
         assert index.exactness is not None or rms[-1] == 0.0
     else:
-        assert name in ("precision", "brief")
+        assert name == "precision"
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -193,12 +193,12 @@ def test_framing_costs_little(name: str) -> None:
     assert index.header.length <= 256
 
 
-@pytest.mark.parametrize("kind", ["small", "brief", "for one error", "noise"])
+@pytest.mark.parametrize("kind", ["small", "precision", "for one error", "noise"])
 def test_progress_rises_to_one(kind: str) -> None:
     told: list[float] = []
     if kind == "small":
         ls.encode(terrain((40, 40)), progress=told.append)
-    elif kind == "brief":
+    elif kind == "precision":
         ls.encode(terrain((70, 70)), 20.0, progress=told.append)
     elif kind == "for one error":
         ls.encode(terrain((70, 70)), rms=1.0, progress=told.append)

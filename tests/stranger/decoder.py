@@ -12,7 +12,6 @@ from tests.stranger.exactness import restore
 from tests.stranger.header import Header
 from tests.stranger.layout import Levels, units_of
 from tests.stranger.masks import Masks
-from tests.stranger.neighbours import NEIGHBOURS, numbers_of
 from tests.stranger.picture import Arrays, Values, block_places, plane_value, put_together, rounded, value
 
 
@@ -129,12 +128,7 @@ class Decoder:
             if self.masks is not None:
                 valid = (self.masks.kept if kept else self.masks.masks)[block][window]
             values = found[block][channel][window]
-            if piece[:1] == NEIGHBOURS and not kept:
-                lattice = self.header.lattices[channel]
-                told = value(lattice, np.array(numbers_of(piece[1:], values, valid, lattice), float))
-                values[valid] = rounded(told, self.header.types[channel])[valid]
-            else:
-                values[valid] = restore(piece, values[valid])
+            values[valid] = restore(piece, values[valid])
         return self.shown(found, exact=True)
 
 

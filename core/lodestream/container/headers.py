@@ -27,11 +27,10 @@ from .shape import (
     serialize_extras,
 )
 
-__all__ = ["LARGE_TILE_BITS", "MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
+__all__ = ["MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
 
-#: Rows of a tile times columns, as an exponent of two; and of a large one.
+#: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
-LARGE_TILE_BITS = 20
 #: Most binary places between lattice steps.
 MOST_FRACTION = 6
 _RULES = ("affine", "decimal")
@@ -154,11 +153,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         )
     # Tiles across a narrow surface would be many, and nearly empty.
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
-    fits = TILE_BITS <= sum(tile) <= LARGE_TILE_BITS and min(tile) >= 1
-    if not fits or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
-        raise CorruptStreamError(
-            f"expected tiles of 2**14 to 2**20 coefficients, got exponents {tile[0]} and {tile[1]}", offset
-        )
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
+        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
     if fraction > MOST_FRACTION:
         raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
     if not (math.isfinite(extent) and extent >= 0):
