@@ -280,7 +280,7 @@ class BaseStream:
             if self._stopped:
                 download.stop()
             elif self._turns != turns:
-                download.focus(self._reception.region)
+                download.turn()
         self._roads.met = True
         while self.ended is None:
             left = self._tick()

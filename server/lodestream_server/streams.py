@@ -245,14 +245,18 @@ class _Session:
             data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
             async with self._mine:
-                if self._sender.state is State.IDLE and self._long(len(data) // _BYTES_OF_A_PIECE):
+                if self._takes_long(data):
                     await self._plan(self._sender.receive, data)
                 else:
                     self._sender.receive(data)
             self._heard.set()
 
-    def _long(self, more: int = 0) -> bool:
-        return self._sender.pieces + more > _PIECES_AT_ONCE
+    def _takes_long(self, data: bytes) -> bool:
+        if self._sender.state is State.ENDED:
+            # Somebody who opens again and again does it in turn with others.
+            return isinstance(parse(data), Open)
+        pieces = self._sender.pieces + len(data) // _BYTES_OF_A_PIECE
+        return self._sender.state is State.IDLE and pieces > _PIECES_AT_ONCE
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Do what takes long beside the event loop, which serves the others meanwhile."""
@@ -265,8 +269,6 @@ class _Session:
             message = self._sender.next_message()
             if message is not None:
                 return message, None
-            if self._sender.turning and self._long():
-                return None, await self._plan(self._sender.wanted)
             return None, self._sender.wanted()
 
     async def _send(self) -> None:
@@ -295,13 +297,13 @@ class _Session:
 
     async def _hear(self) -> None:
         if self._sender.state is State.ENDED:
-            patience, what = self._settings.bye_seconds, "bye"
+            patience, what = self._settings.bye_seconds, "bye or another open"
         else:
             patience, what = (
                 self._settings.idle_seconds,
                 "open" if self._sender.state is State.IDLE else "credit or stop",
             )
-        # Messages that change nothing, such as a focus without credit, do not set the clock back.
+        # Messages that change nothing, such as a credit of nothing new, do not set the clock back.
         waited = time.monotonic() - self._progress
         await _within(patience, self._heard.wait(), what, waited)
 

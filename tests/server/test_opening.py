@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed
 import lodestream as ls
 from lodestream.messages import CODES, SUBPROTOCOL, Bye, Credit, End, Error, Event, Header, Layer, Open, Segments, Stop
 from lodestream.opening import MAX_OPENING, to_address
+from lodestream.ranges import RangeSet
 from lodestream.wire import serialize
 from tests.server.helpers import Raw, data_of, hills, npy, push, raw_stream
 
@@ -162,7 +163,7 @@ def test_what_is_wrong_is_told_as_of_a_message(url: str, query: str, code: str, 
     assert words in said.detail
 
 
-def test_a_second_open_is_out_of_turn(url: str) -> None:
+def test_an_open_before_the_end_is_out_of_turn(url: str) -> None:
     with opened(url, to_address(serialize(Open(credit=0)))) as stream:
         assert isinstance(stream.receive(), Header)
         stream.send(Open())
@@ -180,3 +181,19 @@ def test_the_surface_is_whole(url: str) -> None:
     decoder = ls.Decoder()
     decoder.feed(data)
     assert np.array_equal(decoder.surface().points, hills(90, 80))
+
+
+def test_after_an_end_it_goes_on_with_what_was_not_sent(url: str, surface: dict[str, Any]) -> None:
+    with raw_stream(url) as stream:
+        stream.send(Open(ls.Target(max_bytes=3000)))
+        first = stream.until_end()
+        assert first[-1] == End("bytes")
+        stream.send(Open(ls.Target(first=((5, 20), (10, 30)))))
+        events = events_of(stream)
+    assert events[-1] == End("complete")
+    sent = RangeSet()
+    for event in (*first, *events):
+        if isinstance(event, Segments):
+            assert not list(sent.overlap(event.offset, len(event.data))), "nothing is sent twice"
+            sent.add(event.offset, len(event.data))
+    assert sent.covers(0, surface["levels"][-1]["bytes"])
