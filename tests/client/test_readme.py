@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream_client.__main__ import build_parser
+from lodestream_client.program import build_parser
 from lodestream_client.demo.terrain import terrain
 
 ROOT = Path(__file__).parents[2]

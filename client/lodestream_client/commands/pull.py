@@ -80,15 +80,6 @@ def register(subparsers: Subparsers) -> None:
         "(default: auto)",
     )
     parser.add_argument(
-        "--replica",
-        dest="replicas",
-        action="append",
-        default=[],
-        type=parse_source,
-        metavar="URL",
-        help="another address of the same surface, to go on from when a connection fails; may be repeated",
-    )
-    parser.add_argument(
         "--retry",
         type=parse_seconds,
         default=60.0,
@@ -103,7 +94,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Stream, write, report; of what came before an interruption too."""
     target = target_of(args)
-    if args.transport == "ws" and not all(map(addresses.is_surface, (args.url, *args.replicas))):
+    if args.transport == "ws" and not addresses.is_surface(args.url):
         args.parser.error("argument --transport: a file's address has no WebSocket")
     check_out(args)
     with interruptible(), Kept(args.resume) as kept:
@@ -166,7 +157,7 @@ def _receive(
     identity = kept.identity
     with _Progress(target) as bar:
         stream = sync.connect(
-            [args.url, *args.replicas],
+            args.url,
             target=target,
             token=token_of(args),
             transport=args.transport,
