@@ -219,7 +219,8 @@ def _sixteen_bits(results: Results, surface: str) -> bool:
 
 def _losses(results: Results) -> Iterator[str]:
     yield "\n## Cells that lose\n"
-    yield "All cells above 1 of ours at its best setting, each under what was tried against it.\n"
+    yield "All cells above 1 of ours at its best setting, each under its cause."
+    yield "What was tried: [experiments.md](experiments.md).\n"
     lost: dict[str, dict[str, list[str]]] = {key: {} for key in REMARKS}
     for kind, title in KINDS.items():
         for cell in results.cells(list(results.surfaces), kind):

@@ -7,10 +7,10 @@ with the first stream.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # nothing is imported here: until the command line is there, Ctrl-C prints a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from .aio import (
         Stream,
         connect,
@@ -67,6 +67,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
     module, attribute = _HOMES[name]
     value = getattr(importlib.import_module(f".{module}", __name__), attribute)
     globals()[name] = value

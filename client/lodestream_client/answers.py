@@ -221,5 +221,5 @@ _FIGURES: Mapping[str, Callable[[Any], bool]] = {
     "attributes": _list_of(_is_text),
     "levels": _list_of(_STATE),
     "layers": _list_of(_STATE),
-    "metadata": _map_of({}, notes=_list_of(_is_text)),
+    "metadata": _map_of({}),  # whose values are whatever somebody has put there
 }

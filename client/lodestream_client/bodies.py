@@ -145,11 +145,11 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
 def _is_container(file: BinaryIO) -> bool:
     file.seek(0)
     head = file.read(8)
-    if not head.startswith(b"\x89"):
+    if b"LODE" not in head:
         return False
-    from lodestream.container.sections import MAGIC  # only where it may be one
+    from lodestream.container.sections import is_container  # only where it may be one
 
-    return head.startswith(MAGIC)
+    return is_container(head)
 
 
 def _parameters(asked: Asked) -> dict[str, str | list[str]]:

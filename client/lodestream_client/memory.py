@@ -70,7 +70,7 @@ def _is_bytes(source: object) -> bool:
 
 
 def encoded(source: object, asked: Asked, progress: Callable[[str, float], None] | None) -> bytes:
-    """The container of a surface or an array.
+    """The container of a surface or an array; what it does not keep is a `FormatWarning`, and one of its ``notes``.
 
     Parameters
     ----------
@@ -94,8 +94,10 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
 
     from lodestream.encoder import encode
 
+    surface = _surface(source, asked)
+    surface.metadata = _noted(surface)
     return encode(
-        _surface(source, asked),
+        surface,
         asked.precision,
         rms=asked.rms,
         attribute_precision=asked.attribute_precision,
@@ -126,3 +128,19 @@ def _surface(source: Any, asked: Asked) -> Surface:
     if asked.name:
         surface.metadata["name"] = asked.name
     return surface
+
+
+def _noted(surface: Surface) -> dict[str, Any]:
+    """Its metadata, with a note of what a container does not keep: others are told by the container alone."""
+    from lodestream.losses import at_holes
+    from lodestream.metadata import check
+
+    lost, known = at_holes(surface), surface.metadata.get("notes", [])
+    if lost is None or not isinstance(known, list):
+        return surface.metadata
+    noted = {**surface.metadata, "notes": [*known, lost]}
+    try:
+        check(noted)
+    except InputError:  # there is no room for it; or for what was there before, which is refused in a moment
+        return surface.metadata
+    return noted

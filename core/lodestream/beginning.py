@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["in_file_order", "sure"]
 
-_SIGNATURE = len(sections.MAGIC) + 1
+_SIGNATURE = len(sections.SIGNATURE)
 _LONGEST_START = 10
 _BEGINNING = (sections.HEADER, sections.MASKS, sections.KEPT_MASKS, sections.LAYER)
 

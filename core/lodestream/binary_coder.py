@@ -1,4 +1,4 @@
-"""An adaptive binary range coder whose chances come from contexts that start trained, one alone or two mixed.
+"""An adaptive binary range coder whose chances come from contexts, one alone or two mixed.
 
 A *context* is an integer: its probability of a 1 over 2**20 and, in the lowest 8 bits, how sure it is (1 to 127). After
 each bit the probability moves towards 0 or 2**20 - 1 by the part `_RATES` of the distance and gets surer by 1. Two
@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from .kernels import bare_kernel, inlined
 
-__all__ = ["INDEX", "WEIGHT", "WIDEST", "code_bit", "code_five_mixed_bit", "code_mixed_bit", "finish", "start"]
+__all__ = ["INDEX", "UNKNOWN", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit", "finish", "start"]
 
 #: Width of the interval at the start.
 WIDEST = 0xFFFFFFFF
 #: An index known to be positive spares the compiled loop the test for one that counts from the end.
 INDEX = 0x7FFFFFFF
+#: A context before anything was learned: even chances, sure to the least degree.
+UNKNOWN = (1 << 27) | 1
 #: Either weight before anything was learned, over 2**16.
 WEIGHT = 1 << 15
 
@@ -183,43 +185,6 @@ def code_mixed_bit(
     model[weights & INDEX], model[(weights + 1) & INDEX] = _weighed(heavy, x, error), _weighed(light, y, error)
     model[slot & INDEX] = _learned(context, bit)
     model[other & INDEX] = _learned(second, bit)
-    if width < _BOTTOM:
-        low, width, place = _shift(decoding, low, width, place, data)
-    return bit, low, width, place
-
-
-@bare_kernel
-def code_five_mixed_bit(
-    decoding: bool,
-    bit: int,
-    low: int,
-    width: int,
-    place: int,
-    data: NDArray[np.uint8],
-    model: NDArray[np.int32],
-    slots: tuple[int, int, int, int, int],
-    weights: NDArray[np.int32],
-    at: int,
-) -> tuple[int, int, int, int]:
-    """Code one bit in five contexts, mixed with the five ``weights`` that begin at ``at``. See `code_mixed_bit`."""
-    first, second, third, fourth, fifth = slots
-    a, b, c = int(model[first & INDEX]), int(model[second & INDEX]), int(model[third & INDEX])
-    d, e = int(model[fourth & INDEX]), int(model[fifth & INDEX])
-    x, y = _stretched(a), _stretched(b)
-    z, t = _stretched(c), _stretched(d)
-    o = _stretched(e)
-    p, q = int(weights[at & INDEX]), int(weights[(at + 1) & INDEX])
-    r, s = int(weights[(at + 2) & INDEX]), int(weights[(at + 3) & INDEX])
-    u = int(weights[(at + 4) & INDEX])
-    chance = _mixed(p * x + q * y + r * z + s * t + u * o)
-    bit, low, width = _narrowed(decoding, bit, low, width, chance)
-    error = (65536 if bit else 0) - chance
-    weights[at & INDEX], weights[(at + 1) & INDEX] = _weighed(p, x, error), _weighed(q, y, error)
-    weights[(at + 2) & INDEX], weights[(at + 3) & INDEX] = _weighed(r, z, error), _weighed(s, t, error)
-    weights[(at + 4) & INDEX] = _weighed(u, o, error)
-    model[first & INDEX], model[second & INDEX] = _learned(a, bit), _learned(b, bit)
-    model[third & INDEX], model[fourth & INDEX] = _learned(c, bit), _learned(d, bit)
-    model[fifth & INDEX] = _learned(e, bit)
     if width < _BOTTOM:
         low, width, place = _shift(decoding, low, width, place, data)
     return bit, low, width, place

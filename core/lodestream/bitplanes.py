@@ -9,7 +9,7 @@ first 1, its sign.
 What a context sees of a coefficient are the bits known so far: of this plane for coefficients coded before it, of the
 planes above for those that come later, and of the planes at and above this one for its parent and what is around that.
 All of it is counted in units of the plane (bits below are shifted out); what lies outside the tile's band is 0. The
-contexts, in this order (`binary_coder` says what they are and learn, `initial_contexts` where they start):
+contexts, in this order (`binary_coder` says what they are and learn):
 
 - *Across*, of a coefficient's bit: ((m 5 + h) 5 + v) 4 + kind. m is the class of its own magnitude so far, in units of
   the next higher plane: 0, 1, 2 (for 2 and 3), 3 (for 4 and more). h and v are the sums of the two neighbours in its
@@ -43,8 +43,7 @@ from .band_fields import (
     ROWS,
     STRIDE,
 )
-from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
-from .initial_contexts import CHANCES, SURENESS
+from .binary_coder import INDEX, UNKNOWN, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
 from .kernels import bare_kernel, inlined, kernel
 from .trellis import ODD, TRANSITIONS
 
@@ -78,7 +77,7 @@ CONTEXTS = _FIRST_FLAG + _FLAG_CONTEXTS
 _TRELLIS_ACROSS = CONTEXTS + 4
 _TRELLIS_AROUND = _TRELLIS_ACROSS + 2 * _ACROSS_CONTEXTS // 2
 _TRELLIS_WEIGHTS = _TRELLIS_AROUND + 2 * _AROUND_CONTEXTS
-_LEAST_SURE = 2
+_TRELLIS_END = _TRELLIS_WEIGHTS + 8
 
 #: Class of a sum; 17 stands for all that is more.
 _CLASS = np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 6], np.uint8)
@@ -89,26 +88,11 @@ def pass_count(planes: int) -> int:
     return 2 * planes - 1 if planes else 0
 
 
-_START = np.array(
-    [*(chance << 16 | 1 << 15 | sure for chance, sure in zip(CHANCES, SURENESS, strict=True)), *[WEIGHT] * 4], np.int32
-)
-
-
-def _trellis_start() -> NDArray[np.int32]:
-    """Contexts of a trellis start where those without one do, but less sure."""
-    across, around = _START[: _ACROSS_CONTEXTS // 2], _START[_FIRST_AROUND:_FIRST_SIGN]
-    contexts = np.concatenate([across, across, around, around])
-    sure = np.minimum(contexts & 255, _LEAST_SURE)
-    weights = np.full(8, WEIGHT, np.int32)
-    return np.concatenate([_START, contexts & ~255 | sure, weights])
-
-
-_TRELLIS_START = _trellis_start()
-
-
 def new_model(trellis: bool = False) -> NDArray[np.int32]:
     """The contexts of a tile before its first plane, see `binary_coder`, and the weights: int32, flat."""
-    return (_TRELLIS_START if trellis else _START).copy()
+    model = np.full(_TRELLIS_END if trellis else _TRELLIS_ACROSS, UNKNOWN, np.int32)
+    model[CONTEXTS:_TRELLIS_ACROSS] = model[_TRELLIS_WEIGHTS:] = WEIGHT
+    return model
 
 
 @inlined

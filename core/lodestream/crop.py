@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .axis import AxisStep
 from .container.model import Header
-from .lifting import CLAMP, inverse_step
+from .lifting import CLAMP, FRACTION_BITS, inverse_step
 from .predictors import predictor
 from .reach import coefficients_needed
 from .target import Region
@@ -102,7 +102,6 @@ def window_picture(
     whole = 0
     while whole < layout.levels and not state[layout.tiles_of(whole + 1)].any():
         whole += 1
-    fraction = header.fraction if whole < layout.levels else 0
     crops: list[tuple[AxisCrop, AxisCrop]] = []
     spans = region
     for level in range(layout.levels, 0, -1):
@@ -111,7 +110,7 @@ def window_picture(
         spans = _nodes(rows), _nodes(columns)
     sizes = spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]
     picture = allocate(sizes)
-    _put(tiles, 0, state, 0, picture, ((spans[0][0], sizes[0], 0), (spans[1][0], sizes[1], 0)))
+    _put(tiles, 0, state, False, picture, ((spans[0][0], sizes[0], 0), (spans[1][0], sizes[1], 0)))
     for level, crop in enumerate(reversed(crops), start=1):
         steps = crop[0].step, crop[1].step
         finer = crops[-level - 1] if level < layout.levels else None
@@ -120,11 +119,11 @@ def window_picture(
         corner = canvas[: steps[0].coarse, : steps[1].coarse]
         corner[...] = picture
         if level == whole + 1:
-            np.clip(corner, -(CLAMP >> fraction), CLAMP >> fraction, out=corner)
-            corner <<= fraction
+            np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
+            corner <<= FRACTION_BITS
         full = layout.steps(0, level)
         places = tuple((c.first, c.step.coarse, f.coarse) for c, f in zip(crop, full, strict=True))
-        _put(tiles, level, state, fraction if level > whole else 0, canvas, places)
+        _put(tiles, level, state, level > whole, canvas, places)
         for axis in (1, 0):
             if steps[axis].midpoints:
                 rule = predictor(header.predictors[channel], layout.grids[0], full[axis], level, axis)
@@ -132,7 +131,7 @@ def window_picture(
         (top, bottom), (left, right) = wanted
         rows_made, columns_made = crop[0].start, crop[1].start
         picture = canvas[rows_made : rows_made + bottom - top, columns_made : columns_made + right - left]
-    return picture, fraction
+    return picture, FRACTION_BITS if whole < layout.levels else 0
 
 
 def _nodes(crop: AxisCrop) -> tuple[int, int]:
@@ -144,12 +143,13 @@ def _put(
     tiles: Tiles,
     level: int,
     state: NDArray[np.int8],
-    fraction: int,
+    finer: bool,
     canvas: NDArray[np.int32],
     places: tuple[tuple[int, int, int], ...],
 ) -> None:
     """Put the bands of a level where they belong in what is taken of it.
 
+    ``finer``: they are multiplied by 2**`FRACTION_BITS`.
     ``places``: of each axis the first node and detail, nodes that are taken, and nodes that there are.
     """
     table = tiles.table
@@ -159,7 +159,7 @@ def _put(
                 _span(*axis) for axis in zip(band.kind, (band.rows, band.columns), places, canvas.shape, strict=True)
             ]
             if all(stop > start for _, start, stop in spans):
-                values = tiles.band(band_number, state, fraction)
+                values = tiles.band(band_number, state, finer)
                 (above, top, bottom), (before, left, right) = spans
                 canvas[top:bottom, left:right] = values[above : above + bottom - top, before : before + right - left]
 

@@ -144,9 +144,11 @@ class Decoder:
             When the surface did not come whole; what came stays decodable.
         """
         if not self.complete:
+            got, wanted = len(self.layers), self.header.layer_count if self.header else None
+            what = f"{got} of {wanted} layers" if got != wanted else f"{got} layers without what makes them exact"
             raise TruncatedStreamError(
-                f"expected {self.header.layer_count if self.header else 'some'} layers, "
-                f"got {len(self.layers)} in {self._frames.position + self._frames.pending} bytes"
+                f"expected a whole container, got {what if self.header else 'no header'} in "
+                f"{self._frames.position + self._frames.pending} bytes: it is cut short"
             )
 
     @property

@@ -1,9 +1,8 @@
 """Differences on a line of whole numbers, coded: what is nearly uniform noise, of a width that is known beforehand.
 
 The width follows from the lattice's step and the value's exponent. So the bits that a difference takes are counted
-down from the most that the exponent of the restored value allows, in contexts; then come its sign and its highest bits,
-and the lower ones are stored as they are. Before all that, a place on the line that was met before tells the difference
-that it had.
+down from the most that the exponent of the restored value allows, in contexts; the bits themselves and the sign are
+stored as they are. Before all that, a place on the line that was met before tells the difference that it had.
 """
 
 from __future__ import annotations
@@ -11,24 +10,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .binary_coder import INDEX, WIDEST, code_bit, finish, start
+from .binary_coder import INDEX, UNKNOWN, WIDEST, code_bit, finish, start
 from .kernels import inlined, kernel
 
 __all__ = ["code_differences", "most_bits"]
 
-#: Highest bits of a difference, below its first, that have contexts.
-_LEARNED = 4
-# Contexts: whether a difference takes so many bits less than the most, of values that are not near zero and of those
-# that are; signs; the highest bits; specials.
+# Contexts: whether a difference takes so many bits less than the most; specials; what is remembered of a place.
 _DEEPEST = 15
-_NEAR = 256
-_SIGNS = _NEAR + 65
-_HIGHEST = _SIGNS + 20
-_SPECIALS = _HIGHEST + 5 * 16
-_REPEATS = _SPECIALS + 4 + 16
-_CONTEXTS = _REPEATS + 16 + 4 + 16
-#: A context before anything was learned: even chances, sure to the least degree.
-_UNKNOWN = (1 << 27) | 1
+_SPECIALS = 256
+_WHICH = _SPECIALS + 4
+_SAME = _WHICH + 16
+_CLOSE_TO = _SAME + 1
+_BESIDE = _CLOSE_TO + 1
+_CONTEXTS = _BESIDE + 16
 
 #: Places on the line whose last difference is remembered, in a table by their hash.
 _ENTRIES = 1 << 14
@@ -46,7 +40,6 @@ def code_differences(
     exponents: NDArray[np.int32],
     marks: NDArray[np.uint8],
     most: int,
-    mantissa: int,
     specials: int,
     data: NDArray[np.uint8],
     stored: NDArray[np.uint8],
@@ -57,7 +50,9 @@ def code_differences(
     ----------
     decoding : bool
         Read ``data`` and ``stored``, and fill ``differences`` and ``marks``, rather than write.
-    line, exponents, mantissa
+    differences : int64 array of shape (value,)
+        All above -2**63, whose magnitude has too many bits.
+    line, exponents
         Of the restored values, as `number_line.to_line` gives them.
     marks : uint8 array of shape (value,)
         For values that are on no line their number in the piece's list, from 1; else 0.
@@ -74,8 +69,8 @@ def code_differences(
     tuple of two int
         Bytes of ``data`` and of ``stored``, written or looked at.
     """
-    model = np.full(_CONTEXTS, _UNKNOWN, np.int32)
-    used, size = _code(decoding, line, differences, exponents, marks, most, mantissa, specials, model, data, stored)
+    model = np.full(_CONTEXTS, UNKNOWN, np.int32)
+    used, size = _code(decoding, line, differences, exponents, marks, most, specials, model, data, stored)
     return int(used), int(size)
 
 
@@ -95,9 +90,8 @@ def most_bits(differences: _Ints, exponents: NDArray[np.int32], marks: NDArray[n
     """The largest sum of a difference's bits and its exponent, of those that have no mark."""
     most = 0
     for i in range(differences.size):
-        magnitude = differences[i] if differences[i] >= 0 else ~differences[i]
-        if marks[i] == 0 and magnitude:
-            most = max(most, _length(magnitude) + exponents[i])
+        if marks[i] == 0 and differences[i]:
+            most = max(most, _length(abs(differences[i])) + exponents[i])
     return most
 
 
@@ -135,7 +129,6 @@ def _code(
     exponents: NDArray[np.int32],
     marks: NDArray[np.uint8],
     most: int,
-    mantissa: int,
     specials: int,
     model: NDArray[np.int32],
     data: NDArray[np.uint8],
@@ -145,8 +138,8 @@ def _code(
     width = WIDEST
     low, place = (start(data), 4) if decoding else (0, 0)
     queue, queued, at = 0, 0, 0
-    recent, repeats, close = 0, 0, 0
-    keys, values, sureness = np.zeros(_ENTRIES, np.int64), np.zeros(_ENTRIES, np.int64), np.zeros(_ENTRIES, np.uint8)
+    recent = 0
+    keys, values, filled = np.zeros(_ENTRIES, np.int64), np.zeros(_ENTRIES, np.int64), np.zeros(_ENTRIES, np.bool_)
     for i in range(differences.size):
         bit = 0
         if specials:
@@ -159,7 +152,7 @@ def _code(
                 while mark < specials:
                     if not decoding:
                         bit = 1 if marks[i & INDEX] > mark else 0
-                    slot = _SPECIALS + 4 + mark
+                    slot = _WHICH + mark
                     bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
                     if bit == 0:
                         break
@@ -170,83 +163,58 @@ def _code(
         difference = 0 if decoding else int(differences[i & INDEX])
         line = int(lines[i & INDEX])
         entry = ((line * _SPREAD) >> 40) & (_ENTRIES - 1)
-        if sureness[entry & INDEX] and keys[entry & INDEX] == line:
+        if filled[entry & INDEX] and keys[entry & INDEX] == line:
             before = int(values[entry & INDEX])
             if not decoding:
                 bit = 1 if difference == before else 0
-            slot = _REPEATS + 4 * (int(sureness[entry & INDEX]) - 1) + repeats
-            bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
-            repeats = (2 * repeats + bit) & 3
+            bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _SAME)
             if bit:
                 differences[i & INDEX] = before
-                sureness[entry & INDEX] = min(int(sureness[entry & INDEX]) + 1, 4)
                 continue
             if not decoding:
                 bit = 1 if before - _CLOSE <= difference < before + _CLOSE else 0
-            bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _REPEATS + 16 + close)
-            close = (2 * close + bit) & 3
+            bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _CLOSE_TO)
             if bit:
                 beside = difference - before + _CLOSE
                 node = 1
                 for step in range(4):
                     if not decoding:
                         bit = (beside >> (3 - step)) & 1
-                    slot = _REPEATS + 20 + node
-                    bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
+                    bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, _BESIDE + node)
                     node = 2 * node + bit
                 difference = before - _CLOSE + (node & 15)
                 differences[i & INDEX] = difference
                 values[entry & INDEX] = difference
-                sureness[entry & INDEX] = 1
                 continue
         limit = min(max(most - int(exponents[i & INDEX]), 0), 63)
-        near = limit > mantissa
-        magnitude = difference if difference >= 0 else ~difference
+        magnitude = abs(difference)
         length = 0 if decoding else _length(magnitude)
-        count, short = limit, 0
+        count = limit
         while count > 0:
             if not decoding:
                 bit = 1 if length < count else 0
-            slot = _NEAR + count if near else 16 * min(limit, _DEEPEST) + min(short, _DEEPEST)
+            slot = 16 * min(limit, _DEEPEST) + min(limit - count, _DEEPEST)
             bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, slot)
             if bit == 0:
                 break
             count -= 1
-            short += 1
-        negative = 1 if difference < 0 else 0
-        value, rest = min(count, 1), max(count - 1, 0)
-        learned = near or short == 0 or limit <= _LEARNED
-        if learned:
-            slot = _SIGNS + 4 * (4 if near else min(limit, 3)) + min(count, 3)
-            negative, low, width, place = code_bit(decoding, negative, low, width, place, data, model, slot)
-            tree = _HIGHEST + 16 * (4 if near else min(short, 3))
-            for _ in range(min(rest, _LEARNED)):
-                rest -= 1
-                if not decoding:
-                    bit = (magnitude >> rest) & 1
-                bit, low, width, place = code_bit(decoding, bit, low, width, place, data, model, tree + value)
-                value = 2 * value + bit
-        # What is left is stored: up to 32 bits at a time, highest first, and the sign where it has no context.
-        while rest > 32:
-            rest -= 32
-            part, queue, queued, at = _store(decoding, (magnitude >> rest) & WIDEST, 32, queue, queued, at, stored)
-            value = (value << 32) | part
-        last = magnitude & ((1 << rest) - 1)
-        if learned:
-            if rest:
-                part, queue, queued, at = _store(decoding, last, rest, queue, queued, at, stored)
-                value = (value << rest) | part
-        else:
-            last = 2 * last + negative
+        if count:
+            # What follows the first bit is stored: up to 32 bits at a time, highest first, and the sign at the end.
+            value, rest = 1, count - 1
+            while rest > 32:
+                rest -= 32
+                part, queue, queued, at = _store(decoding, (magnitude >> rest) & WIDEST, 32, queue, queued, at, stored)
+                value = (value << 32) | part
+            last = 2 * (magnitude & ((1 << rest) - 1)) + (1 if difference < 0 else 0)
             part, queue, queued, at = _store(decoding, last, rest + 1, queue, queued, at, stored)
-            negative = part & 1
-            value = (value << rest) | (part >> 1)
+            if decoding:
+                value = (value << rest) | (part >> 1)
+                difference = -value if part & 1 else value
         if decoding:
-            difference = ~value if negative else value
             differences[i & INDEX] = difference
         keys[entry & INDEX] = line
         values[entry & INDEX] = difference
-        sureness[entry & INDEX] = 1
+        filled[entry & INDEX] = True
     if not decoding and queued:
         stored[at & INDEX] = queue & 255
         at += 1

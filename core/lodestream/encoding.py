@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from .allocation import TileCurve, assign_layers
 from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
-from .brief import rough_step, roughen
-from .container.headers import MOST_FRACTION
 from .container.model import Header
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
-from .lattice import LATTICE_BITS, Lattice
+from .lattice import Lattice
 from .picture import coordinate_distances
 from .piece_coder import as_returned, encode_pieces
 from .predictors import COEFFICIENT_BITS, default_predictors
@@ -58,14 +56,6 @@ class Encoding:
         Keep no more of any channel than so many bits of its range.
     fine : (list of Lattice, int), optional
         What a stream for one error is quantised on, see `Preparation.fine_lattices`.
-    brief : bool
-        Rough layers, and the rest by `neighbours`.
-
-    Attributes
-    ----------
-    lattices : list of Lattice, one a channel
-    final : (float, float)
-        RMS and maximum error of the complete stream, after `run`.
     """
 
     def __init__(
@@ -74,16 +64,13 @@ class Encoding:
         progress: Callable[[float], None],
         bits: int | None = None,
         fine: tuple[list[Lattice], int] | None = None,
-        brief: bool = False,
     ) -> None:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
-        self.bits = 0
         self.lattices, self.fineness = (prepared.lattices(bits), 0) if fine is None else fine
-        self.brief = brief
 
     def run(self) -> bytes:
         """The container.
@@ -109,18 +96,14 @@ class Encoding:
         self.progress(0.4)
         states, figures = self._measured(states)
         self.progress(0.7)
-        pieces, exact, lossless = encode_pieces(prepared, self.header, self._last, self.brief)
-        last = self._lattice_figures() if self.brief else figures[-1]
-        self.final = (0.0, 0.0) if exact else last
-        levels = self._level_figures(self.final)
+        pieces, exact, lossless = encode_pieces(prepared, self.header, self._last)
+        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
         self.progress(0.8)
         metadata = dict(prepared.surface.metadata)
         if lossless:
             metadata[DIGEST] = values_digest(as_returned(prepared.given, self.header.hole))
         coded = self._coded(states, figures)
-        container = write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
-        self.progress(1.0)
-        return container
+        return write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
 
     def _header(self) -> Header:
         prepared, surface = self.prepared, self.prepared.surface
@@ -136,7 +119,6 @@ class Encoding:
             predictors=self.predictors,
             extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
-            fraction=self._fraction(),
             tile=self.layout.tile,
             exact=False,
             corrected=False,
@@ -150,12 +132,6 @@ class Encoding:
             mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
             **_kept(prepared),
         )
-
-    def _fraction(self) -> int:
-        """Binary places between lattice steps, which are fine enough as they are where there is a quantiser."""
-        if self.quantiser is not None:
-            return 0
-        return max(0, min(MOST_FRACTION, LATTICE_BITS - self.bits, COEFFICIENT_BITS - self._most_planes()))
 
     def _quantise(self, wanted: float) -> None:
         """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
@@ -193,13 +169,10 @@ class Encoding:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
-            self.bits = max(self.bits, max(_largest(array) for array in arrays).bit_length())
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
-        if self.brief:
-            roughen(arrays[0], self.layout, norms[0], rough_step(self.prepared) / lattice.spacing)
         table = self._table(number)
         true = gather(table, arrays)
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
@@ -223,10 +196,6 @@ class Encoding:
         """Range of an attribute."""
         values = [self.prepared.channel(block, channel) for block in range(len(self.prepared.arrays))]
         return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
-
-    def _most_planes(self) -> int:
-        """Bit-planes of the tile that has most; with the fraction they must fit a coefficient."""
-        return max(int(channel.top.max()) for channel in self.channels)
 
     def _empty_levels(self, top: NDArray[np.int8]) -> int:
         """The levels without a coefficient other than 0, as bits."""
@@ -307,12 +276,6 @@ class Encoding:
             state[: self.layout.tiles_of(level).stop] = 0
             figures.append(self._figures(state, canvases))
         return [*figures, last]
-
-    def _lattice_figures(self) -> Figures:
-        """Errors of heights that come back as their lattice has them."""
-        coordinates = self.prepared.coordinates(0, self.lattices[0])[0]
-        places = np.ascontiguousarray(coordinates[np.newaxis])
-        return coordinate_distances(self.prepared.originals, self.lattices, [places], [0])
 
     def _all_passes(self) -> State:
         """Passes of every tile and channel."""

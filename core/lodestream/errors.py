@@ -13,7 +13,7 @@
     ├── StreamError                      the bytes of a container cannot be used
     │   ├── CorruptStreamError           damaged, with the offset
     │   ├── TruncatedStreamError         ends before what was asked for
-    │   └── UnsupportedVersionError      newer than this program, naming both versions
+    │   └── UnsupportedVersionError      of another version than this program reads, naming both
     ├── ProtocolError                    a message out of turn or out of shape
     │   ├── LocalProtocolError           by this side
     │   └── RemoteProtocolError          by the other side
@@ -106,7 +106,7 @@ class TruncatedStreamError(StreamError):
 
 
 class UnsupportedVersionError(StreamError):
-    """A container or peer that is newer than this program."""
+    """A container or peer of another version than this program's."""
 
 
 class ProtocolError(LodestreamError):

@@ -16,12 +16,10 @@ from .errors import CorruptStreamError
 from .number_line import DECIMALS, MOST_DECIMALS, PATTERNS, common_zeros, decimal_places, from_line, to_line
 from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["NEIGHBOURS", "agree", "decode_piece", "encode_piece"]
+__all__ = ["agree", "decode_piece", "encode_piece"]
 
 #: The rules beside those of the line.
 _RAW, _OFFSETS = 0, 3
-#: The first byte of a piece that `neighbours` codes: it looks at whole windows.
-NEIGHBOURS = bytes([_OFFSETS | 63 << 2])
 #: Values that are on no line near the others, NaN and infinity, are told by their place in a list.
 _MOST_SPECIALS = 15
 
@@ -50,10 +48,10 @@ def encode_piece(original: NDArray[Any], restored: NDArray[Any], step: float | N
     specials = np.unique(patterns[~np.isfinite(original)]) if original.dtype.kind == "f" else patterns[:0]
     if specials.size <= _MOST_SPECIALS:
         usual = np.isfinite(original)
-        candidates.append(_encoded(PATTERNS, common_zeros(original[usual]), original, restored, specials))
+        candidates += _with_differences(PATTERNS, common_zeros(original[usual]), original, restored, specials)
         places = decimal_places(original[usual])
         if places is not None:
-            candidates.append(_encoded(DECIMALS, places, original, restored, specials))
+            candidates += _with_differences(DECIMALS, places, original, restored, specials)
     if step is not None and not specials.size and have_offsets(original, restored, step):
         candidates += _with_offsets(original, restored, step)
     return min(candidates, key=len)
@@ -95,11 +93,11 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     if len(data) < end:
         raise CorruptStreamError(f"expected exactness of at least {end} bytes, got {len(data)}", offset + len(data))
     specials = np.frombuffer(data, unsigned, count, 3).astype(unsigned.newbyteorder("="))
-    line, exponents, mantissa = to_line(rule, argument, restored)
+    line, exponents = to_line(rule, argument, restored)
     differences, marks = np.empty(restored.size, np.int64), np.zeros(restored.size, np.uint8)
     coded = np.frombuffer(data, np.uint8, length, start_of_coded).copy()
     stored = np.frombuffer(data[end:], np.uint8).copy()
-    used = code_differences(True, line, differences, exponents, marks, most, mantissa, count, coded, stored)[1]
+    used = code_differences(True, line, differences, exponents, marks, most, count, coded, stored)[1]
     if used != stored.size:
         raise CorruptStreamError(f"expected {used} bytes of lower bits, got {stored.size}", offset + end)
     with np.errstate(over="ignore"):
@@ -110,8 +108,10 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     return values
 
 
-def _encoded(rule: int, argument: int, original: NDArray[Any], restored: NDArray[Any], specials: NDArray[Any]) -> bytes:
-    line, exponents, mantissa = to_line(rule, argument, restored)
+def _with_differences(
+    rule: int, argument: int, original: NDArray[Any], restored: NDArray[Any], specials: NDArray[Any]
+) -> list[bytes]:
+    line, exponents = to_line(rule, argument, restored)
     marks = np.zeros(original.size, np.uint8)
     if specials.size:
         patterns = original.view(specials.dtype)
@@ -120,16 +120,16 @@ def _encoded(rule: int, argument: int, original: NDArray[Any], restored: NDArray
         original = np.where(special, restored, original)
     with np.errstate(over="ignore"):
         differences = to_line(rule, argument, original)[0] - line
+    if (differences == np.iinfo(np.int64).min).any():
+        return []
     most = int(most_bits(differences, exponents, marks))
     # A value takes at most 90 decisions of 11 bits.
     coded = np.empty(64 + 128 * original.size, np.uint8)
     stored = np.empty(16 + 8 * original.size, np.uint8)
-    length, size = code_differences(
-        False, line, differences, exponents, marks, most, mantissa, specials.size, coded, stored
-    )
+    length, size = code_differences(False, line, differences, exponents, marks, most, specials.size, coded, stored)
     head = bytes([rule | argument << 2]) + (most | specials.size << 12).to_bytes(2, "little")
     listed = specials.astype(specials.dtype.newbyteorder("<")).tobytes()
-    return head + listed + _written_length(length) + coded[:length].tobytes() + stored[:size].tobytes()
+    return [head + listed + _written_length(length) + coded[:length].tobytes() + stored[:size].tobytes()]
 
 
 def _with_offsets(original: NDArray[Any], restored: NDArray[Any], step: float) -> list[bytes]:

@@ -130,16 +130,16 @@ def _read(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _start(file: BinaryIO, size: int) -> bytes:
-    """Magic and version."""
-    start = _read(file, 0, len(sections.MAGIC) + 1)
-    if start[:-1] == sections.MAGIC[: len(start) - 1] and len(start) <= len(sections.MAGIC):
+    """The signature."""
+    start = _read(file, 0, len(sections.SIGNATURE))
+    if len(start) < len(sections.SIGNATURE) and sections.SIGNATURE.startswith(start):
         raise TruncatedStreamError(f"expected a container, got the first {size} bytes of one (at byte {size})")
     return start
 
 
 def _sections(file: BinaryIO, size: int) -> Iterator[tuple[Frame, bytes]]:
     """Each section, its CRC checked, up to the index."""
-    offset, kind = len(sections.MAGIC) + 1, -1
+    offset, kind = len(sections.SIGNATURE), -1
     while kind != sections.INDEX:
         head = _read(file, offset, _FRAME_HEAD)
         extent = section_extent(head, offset)

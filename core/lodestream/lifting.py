@@ -25,13 +25,15 @@ from numpy.typing import NDArray
 from .axis import AxisStep
 from .kernels import bare_kernel, inlined
 
-__all__ = ["CLAMP", "REACH", "TAPS", "forward_step", "inverse_step"]
+__all__ = ["CLAMP", "FRACTION_BITS", "REACH", "TAPS", "forward_step", "inverse_step"]
 
 #: The update's taps over 2^24: (1 - 1/sqrt 2)(2 sqrt 2 - 3)^j rounded so that they sum to 2^22.
 TAPS = np.array([4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1], np.float64)
 REACH = len(TAPS)
 #: Largest magnitude that the inverse hands on after each axis; a full decode never reaches it.
 CLAMP = 2**27
+#: Binary places between lattice steps in which pictures of incomplete levels are computed.
+FRACTION_BITS = 3
 
 _STRIP = 64  # columns worked on together
 _i32 = np.int32

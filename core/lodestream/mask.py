@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .binary_coder import INDEX, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
+from .binary_coder import INDEX, UNKNOWN, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
 from .errors import CorruptStreamError
 from .kernels import kernel
 
@@ -23,8 +23,6 @@ _BESIDE = 3
 _NEAR = 1 << 16  # first of the contexts that see ten points
 _GROUPS = _NEAR + (1 << 10)  # first of those of groups: by their surroundings and the last group's answer
 _WEIGHTS = _GROUPS + 4
-#: A context before anything was learned: even chances, sure to the least degree.
-_UNKNOWN = (1 << 27) | 1
 
 
 def encode_mask(mask: NDArray[np.bool_]) -> bytes:
@@ -70,7 +68,7 @@ def _field(rows: int, columns: int) -> NDArray[np.uint8]:
 
 
 def _model() -> NDArray[np.int32]:
-    model = np.full(_WEIGHTS + 2, _UNKNOWN, np.int32)
+    model = np.full(_WEIGHTS + 2, UNKNOWN, np.int32)
     model[_WEIGHTS:] = WEIGHT
     return model
 

@@ -22,7 +22,7 @@ _SAMPLE = 64
 _Ints = NDArray[np.int64]
 
 
-def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDArray[np.int32], int]:
+def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDArray[np.int32]]:
     """Put finite values, shape (value,), on the line.
 
     Returns
@@ -30,22 +30,19 @@ def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDAr
     places : int64 array of shape (value,)
     exponents : int32 array of shape (value,)
         Of the values, biased; 0 where places are of one width, whatever the value.
-    mantissa : int
-        Bits of a mantissa on the line; 64 where there are no exponents.
     """
     bits = 8 * values.dtype.itemsize
     if rule == DECIMALS:
         with np.errstate(over="ignore"):
             wide = np.clip(values.astype(np.float64) * 10.0**argument, -_LARGEST_WHOLE, _LARGEST_WHOLE)
-        return np.rint(wide).astype(np.int64), np.zeros(values.size, np.int32), 64
+        return np.rint(wide).astype(np.int64), np.zeros(values.size, np.int32)
     if values.dtype.kind != "f":
-        return values.astype(np.int64) >> argument, np.zeros(values.size, np.int32), 64
+        return values.astype(np.int64) >> argument, np.zeros(values.size, np.int32)
     signed = values.view(f"i{values.dtype.itemsize}").astype(np.int64)
     magnitudes = signed & ((1 << (bits - 1)) - 1)
-    mantissa = 23 if bits == 32 else 52
-    exponents = (magnitudes >> mantissa).astype(np.int32)
+    exponents = (magnitudes >> (23 if bits == 32 else 52)).astype(np.int32)
     magnitudes >>= argument
-    return np.where(signed < 0, ~magnitudes, magnitudes), exponents, mantissa - argument
+    return np.where(signed < 0, ~magnitudes, magnitudes), exponents
 
 
 def from_line(rule: int, argument: int, places: _Ints, dtype: np.dtype[Any]) -> NDArray[Any]:

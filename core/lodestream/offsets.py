@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .binary_coder import INDEX, WIDEST, code_bit, finish, start
+from .binary_coder import INDEX, UNKNOWN, WIDEST, code_bit, finish, start
 from .kernels import inlined, strict_kernel
 
 __all__ = ["MOST_BITS", "code_offsets", "have_offsets", "places_of", "values_at"]
@@ -29,7 +29,6 @@ _WHICH = _REST + 1
 _OFF = _WHICH + _LISTED
 _NEW = _OFF + 2 * 8
 _CONTEXTS = _NEW + 16 + MOST_BITS
-_UNKNOWN = (1 << 27) | 1
 #: Pattern of the largest float32.
 _LARGEST = 0x7F7FFFFF
 
@@ -65,7 +64,7 @@ def code_offsets(
     int
         Bytes written, or looked at.
     """
-    model = np.full(_CONTEXTS, _UNKNOWN, np.int32)
+    model = np.full(_CONTEXTS, UNKNOWN, np.int32)
     return int(_code(decoding, _bases(restored, step), places_of(restored), bits, places, model, data))
 
 

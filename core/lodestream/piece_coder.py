@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from . import exactness
-from .brief import brief_piece
 from .container.model import Header
 from .container.pieces import windows
 from .preparation import Preparation, given_channel
@@ -17,9 +16,7 @@ from .surface import Block, Surface
 __all__ = ["as_returned", "encode_pieces"]
 
 
-def encode_pieces(
-    prepared: Preparation, header: Header, restored: list[Values], brief: bool
-) -> tuple[list[bytes], bool, bool]:
+def encode_pieces(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], bool, bool]:
     """The section's pieces; whether the coordinates are exact then, and whether all is.
 
     A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
@@ -31,8 +28,6 @@ def encode_pieces(
     header : Header
     restored : list of Values, one for each block
         What comes back without these pieces.
-    brief : bool
-        All that the last layer leaves out, by `neighbours`.
     """
     pieces = []
     rough = [prepared.precision is not None or prepared.rms is not None] * prepared.geometric
@@ -46,11 +41,6 @@ def encode_pieces(
         mask = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
         wanted = given_channel(block, window.channel)[slice(*window.rows), slice(*window.columns)]
         known = restored[window.block].window(window)
-        if brief and not window.kept:
-            piece, same = brief_piece(wanted, known, mask, lattice)
-            exact[0] &= same
-            pieces.append(piece)
-            continue
         chosen = slice(None) if mask is None else mask
         wanted, known = (np.ascontiguousarray(v[chosen]).ravel() for v in (wanted, known))
         if rough[window.channel] and not window.kept:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrangement import grids_of, shared_points
-from .container.headers import LARGE_TILE_BITS, TILE_BITS
+from .container.headers import TILE_BITS
 from .container.model import AttributeKind, JointChanges
 from .heights import to_heights
 from .joints import Groups
@@ -46,9 +46,6 @@ class Preparation:
     precisions : Precisions
     rms : Tolerance, optional
         The error that a stream is made for.
-    large_tiles : bool
-        Fewer and larger tiles, and so windows of exactness, of one block: less is learned anew in each, and a region
-        takes more bytes.
 
     Attributes
     ----------
@@ -78,9 +75,7 @@ class Preparation:
         See `Header`.
     """
 
-    def __init__(
-        self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None, large_tiles: bool = False
-    ) -> None:
+    def __init__(self, surface: Surface, precisions: Precisions, rms: Tolerance | None = None) -> None:
         self.given = surface
         self.kept = [block.kept for block in surface.blocks]
         surface, self.plane = _heights(surface)
@@ -114,7 +109,7 @@ class Preparation:
         if self.arrangement is None:
             shape = first.shape
             self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
-            self.tile = tile_exponents(shape, LARGE_TILE_BITS if large_tiles else TILE_BITS)
+            self.tile = tile_exponents(shape)
             self.layout = Layout.single(shape, first.closed, self.tile)
         else:
             self.parts, self.tile = self.arrangement.parts, (TILE_BITS // 2, TILE_BITS // 2)
@@ -254,22 +249,17 @@ class Preparation:
         return None if nothing else (to_places.runs, to_vertices.runs)
 
 
-#: Most rows or columns of a tile, as an exponent of two.
-_LONGEST_TILE = 15
 #: Numbers of the rules of x and y that a header may hold.
 _LONGEST_RULES = 16
 
 
-def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
+def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
     """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
-    rows = bits // 2
-    narrow = min(shape)
-    while rows > 1 and narrow <= 1 << rows:
+    rows = TILE_BITS // 2
+    while rows > 1 and min(shape) <= 1 << rows:
         rows -= 1
-    if narrow > 1 << (bits // 2):
-        return bits // 2, bits // 2
-    longer = min(bits - rows, _LONGEST_TILE)
-    return (rows, longer) if shape[0] <= shape[1] else (longer, rows)
+    exponents = rows, TILE_BITS - rows
+    return exponents if shape[0] <= shape[1] else exponents[::-1]
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:

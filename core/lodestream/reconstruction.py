@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exactness, neighbours
+from . import exactness
 from .bitplanes import pass_count
 from .container.model import Header
 from .container.pieces import Window, windows
 from .crop import window_picture
 from .errors import CorruptStreamError
+from .lifting import FRACTION_BITS
 from .parts import assemble, level_masks, numbered_by_block
 from .picture import store_values
 from .predictors import COEFFICIENT_BITS
@@ -176,10 +177,6 @@ class Reconstruction:
                 mask, (data, offset) = masks[window.block], self._pieces[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
                 chosen = slice(None) if valid is None else valid
-                if data[:1] == exactness.NEIGHBOURS and not window.kept:
-                    lattice = self.header.lattices[window.channel]
-                    values[chosen] = neighbours.decode_window(values, valid, lattice, data[1:], offset + 1)[chosen]
-                    continue
                 known = values[chosen]
                 values[chosen] = exactness.decode_piece(known.ravel(), data, offset).reshape(known.shape)
 
@@ -216,7 +213,6 @@ class Progress:
         shape = len(header.layout.tiles), header.channels
         self.top = np.zeros(shape, np.int8)
         self.state = initial_state(header)
-        self._fraction = header.fraction
 
     def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
         """Note a segment; returns the first of its passes.
@@ -239,9 +235,9 @@ class Progress:
             raise CorruptStreamError(
                 f"expected the planes of tile {tile} once, at its first segment: {problem}", offset
             )
-        if top + self._fraction > COEFFICIENT_BITS:
+        if top > COEFFICIENT_BITS:
             raise CorruptStreamError(
-                f"expected at most {COEFFICIENT_BITS - self._fraction} bit-planes of tile {tile}, got {top}", offset
+                f"expected at most {COEFFICIENT_BITS} bit-planes of tile {tile}, got {top}", offset
             )
         if top:
             self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
@@ -290,13 +286,12 @@ def channel_picture(
     whole = 0
     while whole < level and not state[layout.tiles_of(whole + 1)].any():
         whole += 1
-    fraction = header.fraction if whole < level else 0
     for canvas in canvases or ():
         canvas.fill(0)
     coefficients = canvases or [allocate(layout.shape(number, level)) for number in range(len(layout.grids))]
-    tiles.spread_levels(level, state, coefficients, whole, fraction)
-    inverse(coefficients, layout, header.predictors[channel], level, whole, fraction, channel < header.geometric)
-    return coefficients, fraction
+    tiles.spread_levels(level, state, coefficients, whole)
+    inverse(coefficients, layout, header.predictors[channel], level, whole, channel < header.geometric)
+    return coefficients, FRACTION_BITS if whole < level else 0
 
 
 @dataclass

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import BLOCK, reconstruction_point
 from .kernels import bare_kernel, inlined
+from .lifting import FRACTION_BITS
 from .predictors import COEFFICIENT_BITS
 from .trellis import ODD, TRANSITIONS
 
@@ -20,9 +21,9 @@ _LARGEST = 1 << COEFFICIENT_BITS
 
 
 @inlined
-def _value(sixteenths: int, step: int) -> int:
-    """A coefficient from its index in sixteenths."""
-    return min((sixteenths * step) >> 4, _LARGEST)
+def _value(sixteenths: int, step: int, shift: int) -> int:
+    """A coefficient from its index in sixteenths, times 2**shift."""
+    return min(((sixteenths * step) >> 4) << shift, _LARGEST)
 
 
 @bare_kernel
@@ -33,6 +34,7 @@ def _spread_quantised(
     band: NDArray[np.int64],
     step: int,
     remaining: int,
+    shift: int,
     out: NDArray[np.int32],
     place: int,
     pitch: int,
@@ -47,6 +49,8 @@ def _spread_quantised(
         Lattice steps.
     remaining : int
         Passes of the tile that count as unknown.
+    shift : int
+        Coefficients are multiplied by 2**shift.
     out : int32, flat
         The coefficient of row i and column j goes to ``place + i * pitch + j``.
     """
@@ -73,7 +77,7 @@ def _spread_quantised(
                         sixteenths = found
                     else:
                         sixteenths = 0
-                    value = _value(sixteenths, step)
+                    value = _value(sixteenths, step, shift)
                     out[place + i * pitch + j] = value if sign[at] > 0 else -value
 
 
@@ -88,7 +92,6 @@ def spread_bands(
     numbers: NDArray[np.int64],
     state: NDArray[np.int8],
     finer: int,
-    fraction: int,
     out: NDArray[np.int32],
     pitch: int,
     first_row: int,
@@ -110,19 +113,19 @@ def spread_bands(
         Of the bands.
     state : int8, shape (tile,)
         Passes that remain of each tile, or `UNANNOUNCED`.
-    finer, fraction : int
-        Coefficients of the tiles from ``finer`` on are multiplied by 2**fraction.
+    finer : int
+        Coefficients of the tiles from this one on are multiplied by 2**`FRACTION_BITS` and kept within their bounds.
     out : int32, flat
         Coefficients from ``first_row`` and ``first_column`` on, whose rows are ``pitch`` apart; updated.
     """
     for number in range(numbers.size):
         band = numbers[number]
         tile, top, left = windows[band, 0], windows[band, 1] - first_row, windows[band, 2] - first_column
-        passes, shift = int(state[tile]), fraction if tile >= finer else 0
+        passes, shift = int(state[tile]), FRACTION_BITS if tile >= finer else 0
         width = bands[band, COLUMNS]
         if steps[band] and passes < UNANNOUNCED:
             place, row, step = top * pitch + left, bands[band], steps[band]
-            _spread_quantised(known, sign, early, row, step, passes, out, place, pitch)
+            _spread_quantised(known, sign, early, row, step, passes, shift, out, place, pitch)
             continue
         for i in range(bands[band, ROWS]):
             start = bands[band, OFFSET] + i * bands[band, STRIDE]
@@ -143,24 +146,24 @@ def _spread_row(
     signs: NDArray[np.int8],
     marks: NDArray[np.uint8],
     remaining: int,
-    fraction: int,
+    places: int,
     out: NDArray[np.int32],
 ) -> None:
     begun = remaining >> 1  # the plane whose first pass is the last one known, if the number is odd
     plane = begun + (remaining & 1)
-    shift = np.int32(fraction)
+    shift, limit = np.int32(places), np.int32(_LARGEST >> places)
     if remaining >= UNANNOUNCED:
         for j in range(out.size):
             out[j] = 0
     elif remaining == 0:
         for j in range(out.size):
-            out[j] = np.int32(np.int32(signs[j]) * magnitudes[j]) << shift
+            out[j] = np.int32(np.int32(signs[j]) * min(magnitudes[j], limit)) << shift
     elif begun == plane:
         low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
         for j in range(out.size):
             high = np.int32((magnitudes[j] >> low) << low)
             value = np.int32(high + middle) if high != 0 else np.int32(0)
-            out[j] = np.int32(np.int32(signs[j]) * value) << shift
+            out[j] = np.int32(np.int32(signs[j]) * min(value, limit)) << shift
     else:
         low, middle = np.int32(plane), np.int32(reconstruction_point(plane))
         lower, mark = np.int32(begun), np.uint8(begun + 1)
@@ -169,4 +172,4 @@ def _spread_row(
             high = np.int32((magnitudes[j] >> low) << low)
             found = np.int32(magnitudes[j] >> lower) if marks[j] == mark else np.int32(0)
             value = np.int32(high + middle) if high != 0 else middle_begun if found != 0 else np.int32(0)
-            out[j] = np.int32(np.int32(signs[j]) * value) << shift
+            out[j] = np.int32(np.int32(signs[j]) * min(value, limit)) << shift

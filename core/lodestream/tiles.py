@@ -141,29 +141,32 @@ class Tiles:
         state = np.full(len(self.table.layout.tiles), remaining, np.int8)
         first, last = self.table.first[tile : tile + 2]
         for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
-            self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, 0, 0)
+            self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, len(state))
 
     def spread_levels(
-        self, level: int, state: NDArray[np.int8], coefficients: Sequence[NDArray[np.int32]], whole: int, fraction: int
+        self, level: int, state: NDArray[np.int8], coefficients: Sequence[NDArray[np.int32]], whole: int
     ) -> None:
         """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
 
         ``coefficients`` are arrays of the grids, zeros so far: tiles that were not announced are passed over. Those of
-        levels above ``whole`` are multiplied by 2**fraction.
+        levels above ``whole`` are multiplied by 2**`FRACTION_BITS`.
         """
         tiles_of = self.table.layout.tiles_of
         last = self.table.first[tiles_of(level).stop]
         for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
             chosen = numbers[numbers < last]
             chosen = chosen[state[self.table.windows[chosen, 0]] < UNANNOUNCED]
-            self._spread(chosen, state, array, tiles_of(whole).stop, fraction)
+            self._spread(chosen, state, array, tiles_of(whole).stop)
 
-    def band(self, number: int, state: NDArray[np.int8], fraction: int) -> NDArray[np.int32]:
-        """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column)."""
+    def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
+        """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column).
+
+        ``finer``: its coefficients are multiplied by 2**`FRACTION_BITS`.
+        """
         height, width = (int(n) for n in self.table.bands[number, [ROWS, COLUMNS]])
         array = np.zeros((height, width), np.int32)
         tile, top, left = (int(n) for n in self.table.windows[number])
-        self._spread(np.array([number]), state, array, tile, fraction, (top, left))
+        self._spread(np.array([number]), state, array, tile if finer else tile + 1, (top, left))
         return array
 
     def _spread(
@@ -172,14 +175,13 @@ class Tiles:
         state: NDArray[np.int8],
         array: NDArray[np.int32],
         finer: int,
-        fraction: int,
         origin: tuple[int, int] = (0, 0),
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
         rows, columns = array.shape
         pitch = array.strides[0] // array.itemsize
         line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, fraction, line, pitch, *origin)
+        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, line, pitch, *origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:

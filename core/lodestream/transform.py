@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .axis import AxisStep
 from .kernels import kernel
 from .layout import Layout, Source
-from .lifting import CLAMP, REACH, TAPS, forward_step, inverse_step
+from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
 from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
 
 __all__ = [
@@ -91,13 +91,13 @@ def inverse(
     predictors: NDArray[np.int8],
     level: int,
     whole: int | None = None,
-    fraction: int = 0,
     coordinate: bool = True,
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
     Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
-    lattice steps, those above count steps over 2**fraction; so does the result where ``whole`` is less than ``level``.
+    lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
+    ``level``.
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
 
@@ -111,8 +111,8 @@ def inverse(
         for k in numbers:
             if whole is not None and finer == whole + 1:
                 corner = _corner(arrays[k], layout.shape(k, whole))
-                np.clip(corner, -(CLAMP >> fraction), CLAMP >> fraction, out=corner)
-                corner <<= fraction
+                np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
+                corner <<= FRACTION_BITS
             grid, steps = layout.grids[k], layout.steps(k, finer)
             corner = _corner(arrays[k], layout.shape(k, finer))
             if takes and not grid.curve:

@@ -22,6 +22,7 @@ from .level_queue import LevelQueue
 from .limits import Limits
 from .metrics import Metrics
 from .observation import Observation
+from .pace import Pace, Paced
 from .routing import State
 from .settings import Settings
 from .storage import Storage
@@ -58,7 +59,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         When there is no token where one is needed, or the token file cannot be used.
     """
     chosen = Settings() if settings is None else settings
-    access, metrics = Access(chosen), Metrics()
+    access, metrics, pace = Access(chosen), Metrics(), Pace()
 
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
@@ -72,7 +73,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         metrics.watch(storage.root, lambda: len(storage), lambda: builder.pending)
         files_of_levels = await asyncio.to_thread(_level_files, chosen, storage, limits)
         levels = LevelQueue(chosen, storage, files_of_levels, builder.fork_server)
-        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics, levels)
+        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics, levels, pace)
         try:
             builder.start(limits.check_owner)
             yield
@@ -98,7 +99,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
-    app.state.metrics = metrics
+    app.state.metrics, app.state.pace = metrics, pace
     app.openapi = lambda: interface.describe(app)  # type: ignore[method-assign]
     # The last one is the first that a request meets.
     app.add_middleware(Gate, access=access)
@@ -110,6 +111,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             allow_headers=["authorization", "if-none-match", "if-range", "range"],
             expose_headers=["content-range", "etag", "location", "retry-after", "x-request-id"],
         )
+    app.add_middleware(Paced, pace=pace)
     app.add_middleware(Observation, metrics=metrics)
     return app
 

@@ -155,6 +155,10 @@ class Catalog:
         """Whether there is a surface that has a container, or had it before it was lost."""
         return sha256 in self._containers
 
+    def of_container(self, sha256: str) -> list[str]:
+        """The ids of the surfaces that have a container, or had it before it was lost."""
+        return list(self._containers.get(sha256, ()))
+
     def one_of_container(self, sha256: str) -> Record | None:
         """One of the surfaces that have a container, or had it before it was lost; they say the same of it."""
         surface = next(iter(tuple(self._containers.get(sha256, ()))), None)

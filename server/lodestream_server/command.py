@@ -68,12 +68,11 @@ def serve(args: argparse.Namespace) -> int:
     settings = chosen_settings(args)
     from .logs import configure
     from .open_files import raise_file_limit
-    from .running import make_server
+    from .running import serve_alone
 
     configure(settings.log_format, settings.log_level)
     raise_file_limit(settings)
-    server = make_server(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
-    server.run()
+    server = serve_alone(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
     if server.refusal is not None:
         raise server.refusal
     return 0 if server.started else 1

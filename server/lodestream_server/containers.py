@@ -5,21 +5,29 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, BinaryIO
 from weakref import WeakValueDictionary
 
+from lodestream.capacity import memory_limit
+from lodestream.errors import CorruptStreamError, StreamError
+
+from . import damage
+from .problems import BusyError
 from .storage import Storage
 
 if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
 
-__all__ = ["Containers", "OpenContainer", "read_from"]
+__all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes", "read_from"]
 
-# An index holds a record per segment, a few megabytes for the largest surfaces: so many are kept when nobody has the
-# container open any more.
+# An index holds a record per segment, and whoever makes a container may make many: so many are kept when nobody has the
+# container open any more, as long as they take no more bytes than this.
 _INDEXES_KEPT = 16
+_BYTES_KEPT = 64 << 20
 
 # Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
 _NOWAIT = getattr(os, "RWF_NOWAIT", 0)
@@ -55,10 +63,19 @@ class OpenContainer:
 
 
 class Containers:
-    """The containers of a storage, with the indexes used last and those of all that are open."""
+    """The containers of a storage, with the indexes used last and those of all that are open.
 
-    def __init__(self, storage: Storage) -> None:
+    Parameters
+    ----------
+    storage : Storage
+    most : int or None
+        Bytes of memory that all indexes may take; None for `most_for_indexes`.
+    """
+
+    def __init__(self, storage: Storage, most: int | None = None) -> None:
         self._storage = storage
+        self._most = most_for_indexes() if most is None else most
+        self._coming = 0  # bytes of indexes that are being read
         self._lock = threading.Lock()
         self._used: OrderedDict[str, Index] = OrderedDict()
         self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
@@ -75,6 +92,8 @@ class Containers:
             When it is not on the disk.
         StreamError
             When it is damaged.
+        BusyError
+            When the indexes of those that are open leave no room for its own.
         """
         try:
             file = self._storage.container(sha256).open("rb")
@@ -82,6 +101,10 @@ class Containers:
             raise self._storage.gone(sha256) from None
         try:
             return OpenContainer(sha256, self._index(sha256, file), file)
+        except StreamError as error:
+            file.close()
+            damage.tell(self._storage, sha256, error)
+            raise
         except BaseException:
             file.close()
             raise
@@ -99,18 +122,40 @@ class Containers:
             with self._lock:
                 known = self._known(sha256)
             if known is None:
-                known = _read_index(file)
-                with self._lock:
-                    self._indexes[sha256] = known
-                    self._known(sha256)
+                with self._room(index_memory(file)):
+                    known = _read_index(file)
+                    with self._lock:
+                        self._indexes[sha256] = known
+                        self._known(sha256)
             return known
+
+    @contextmanager
+    def _room(self, size: int) -> Iterator[None]:
+        with self._lock:
+            if self._taken() + size > self._most:
+                self._used.clear()
+            taken = self._taken()
+            if taken + size > self._most:
+                raise BusyError(
+                    f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
+                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; come back soon"
+                )
+            self._coming += size
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._coming -= size
+
+    def _taken(self) -> int:
+        return self._coming + sum(map(_memory_of, self._indexes.values()))
 
     def _known(self, sha256: str) -> Index | None:
         index = self._indexes.get(sha256)
         if index is not None:
             self._used[sha256] = index
             self._used.move_to_end(sha256)
-            while len(self._used) > _INDEXES_KEPT:
+            while len(self._used) > _INDEXES_KEPT or sum(map(_memory_of, self._used.values())) > _BYTES_KEPT:
                 self._used.popitem(last=False)
         return index
 
@@ -120,6 +165,29 @@ class _Reader:
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
+
+
+def most_for_indexes() -> int:
+    """Bytes of memory that indexes may take: an eighth of what there is."""
+    return memory_limit() // 8
+
+
+def index_memory(file: BinaryIO) -> int:
+    """Bytes that the index of a container will take in memory, by its footer; 0 where there is none."""
+    from lodestream.container.reader import INDEX_GROWTH
+    from lodestream.container.sections import FOOTER_LENGTH, parse_footer
+
+    tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
+    try:
+        return INDEX_GROWTH * parse_footer(read_from(file.fileno(), tail, FOOTER_LENGTH), tail).length
+    except CorruptStreamError:
+        return 0
+
+
+def _memory_of(index: Index) -> int:
+    from lodestream.container.reader import INDEX_GROWTH
+
+    return INDEX_GROWTH * index.index.length
 
 
 def _read_index(file: BinaryIO) -> Index:

@@ -6,6 +6,7 @@ another there, to fill the disk at any step or to lose what was never synchronis
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
 import shutil
@@ -14,7 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
-__all__ = ["Disk", "NewFile", "disk", "make_folder", "remove", "rename", "sync_folder", "write_file"]
+__all__ = ["Disk", "NewFile", "discard", "disk", "make_folder", "remove", "rename", "sync_folder", "write_file"]
+
+_log = logging.getLogger(__name__)
 
 
 class Disk:
@@ -108,10 +111,10 @@ class NewFile:
                 if kind is None:
                     disk.sync(self._file.fileno(), self.path)
         except OSError:
-            disk.unlink(self.path)
+            discard(self.path)
             raise
         if kind is not None:
-            disk.unlink(self.path)
+            discard(self.path)
 
 
 def make_folder(path: Path) -> Path:
@@ -128,7 +131,7 @@ def write_file(path: Path, data: bytes) -> None:
     try:
         rename(temporary, path)
     except OSError:
-        disk.unlink(temporary)
+        discard(temporary)
         raise
 
 
@@ -144,6 +147,17 @@ def remove(path: Path) -> None:
         disk.remove_folder(path)
     else:
         disk.unlink(path)
+
+
+def discard(path: Path) -> None:
+    """Remove what nobody needs any more; where that fails it stays until the next start, and the log says so.
+
+    For what a start sweeps away: whatever was done before is done all the same.
+    """
+    try:
+        remove(path)
+    except OSError as error:
+        _log.warning("%s is not needed any more, and could not be removed: %s", path, error.strerror or error)
 
 
 def sync_folder(path: Path) -> None:

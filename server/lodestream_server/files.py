@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
 from lodestream.errors import OptionError, StreamError
 
-from . import examples
+from . import damage, examples
 from .access import anybody
 from .gate import caller_of
 from .level_files import Key
@@ -23,6 +24,8 @@ from .routing import Parts, State, matches, readable
 from .scopes import needs
 
 __all__ = ["router"]
+
+_log = logging.getLogger(__name__)
 
 router = APIRouter(prefix="/v1", tags=["files"])
 
@@ -73,9 +76,11 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
         raise parts.storage.gone(sha256) from None
     kept = parts.storage.container_bytes(sha256)
     if kept not in (None, status.st_size):
-        raise StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
+        error = StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
+        damage.tell(parts.storage, sha256, error)
+        raise error
     sort_out(request, status.st_size, etag)
-    return FileResponse(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
+    return _File(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
 
 
 @readable(
@@ -117,7 +122,27 @@ async def level(
         raise
 
 
-class _Borrowed(FileResponse):
+class _File(FileResponse):
+    """A file; once all of it was sent nothing that befalls it concerns the client."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        complete = False
+
+        async def watched(message: Message) -> None:
+            nonlocal complete
+            await send(message)
+            complete = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        try:
+            await super().__call__(scope, receive, watched)
+        except OSError as error:
+            if not complete:
+                raise
+            # The connection would be cut, perhaps with the client's next request on it.
+            _log.warning("%s was sent, and could not be closed: %s", self.path, error.strerror or error)
+
+
+class _Borrowed(_File):
     """A file that is given back once it was sent, or the client has gone."""
 
     def __init__(self, loan: Loan, headers: dict[str, str], media_type: str) -> None:

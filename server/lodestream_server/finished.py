@@ -42,11 +42,11 @@ _MOST_SECTIONS = 10_000
 
 
 def is_container(path: Path) -> bool:
-    """Whether a file begins like a container."""
-    from lodestream.container.sections import MAGIC
+    """Whether a file begins like a container, of whichever version."""
+    from lodestream.container.sections import SIGNATURE, is_container
 
     with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
+        return is_container(file.read(len(SIGNATURE)))
 
 
 def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:

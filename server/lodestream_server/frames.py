@@ -13,11 +13,15 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 
 from .cuts import Allowance, Cuts
+from .pace import Pace
 
 __all__ = ["stream_connections"]
 
-# How many bytes are looked at before the bounds are: at most 170 frames, which take some 3 ms.
-_PIECE = 1024
+# How many bytes are looked at before the bounds are: at most 42 frames, which take less than a millisecond.
+_PIECE = 256
+
+# Frames after which others have their turn.
+_FRAMES_A_TURN = 16
 
 # Before the handshake is answered nothing should come; a client that hurries is not refused for it.
 _MOST_EARLY = 64 * 1024
@@ -38,13 +42,14 @@ _OTHER_FRAMES = (200.0, 50.0)
 _EARNED = 4.0
 
 
-def stream_connections(cuts: Cuts) -> type[WebSocketsSansIOProtocol]:
+def stream_connections(cuts: Cuts, pace: Pace) -> type[WebSocketsSansIOProtocol]:
     """The class of a server's WebSocket connections; uvicorn makes one for each."""
 
     class Chosen(_Connection):
         pass
 
     Chosen.cuts = cuts
+    Chosen.pace = pace
     return Chosen
 
 
@@ -55,17 +60,22 @@ class _Connection(WebSocketsSansIOProtocol):
     ----------
     cuts : Cuts
         Where it is written down when the connection is cut.
+    pace : Pace
+        What has come and is not looked at yet waits there.
     """
 
     cuts: Cuts
+    pace: Pace
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._held = bytearray()
         self._asked = False
+        self._waits = False
         self._is_cut = False
         self._frames = Allowance(*_FRAMES)
         self._other_frames = Allowance(*_OTHER_FRAMES)
+        self._seen = 0
         self._fragments = 0
         self._control_bytes = 0
 
@@ -76,7 +86,8 @@ class _Connection(WebSocketsSansIOProtocol):
             super().data_received(data)
             return
         self._held += data
-        self._feed()
+        if not self._waits:
+            self._feed()
         if not self.handshake_complete and len(self._held) > _MOST_EARLY:
             self._cut("frames")
 
@@ -96,12 +107,29 @@ class _Connection(WebSocketsSansIOProtocol):
 
     def _feed(self) -> None:
         # After each message it is the application's turn: what is behind it waits, and no more is read meanwhile.
-        while self._held and self.handshake_complete and not self.read_paused and not self.transport.is_closing():
+        before = self._seen
+        while self._may_feed() and self._seen - before < _FRAMES_A_TURN:
             piece = bytes(self._held[:_PIECE])
             del self._held[:_PIECE]
             super().data_received(piece)
         if self.transport.is_closing():
             self._held.clear()
+        elif self._may_feed():
+            # While some of it waits no more is read.
+            self.transport.pause_reading()
+            if not self._waits:
+                self._waits = True
+                self.pace.later(self._go_on)
+
+    def _go_on(self) -> None:
+        self._waits = False
+        self._feed()
+        if not self._waits and not self.read_paused:
+            self.transport.resume_reading()
+
+    def _may_feed(self) -> bool:
+        able = self.handshake_complete and not self.read_paused and not self.transport.is_closing()
+        return bool(self._held) and able
 
     def handle_ping(self) -> None:
         if self._is_cut:
@@ -137,6 +165,7 @@ class _Connection(WebSocketsSansIOProtocol):
         self._count(message=event.fin)
 
     def _count(self, *, message: bool) -> None:
+        self._seen += 1
         if not self._frames.take() or not (message or self._other_frames.take()):
             self._cut("frames")
 

@@ -24,10 +24,11 @@ from .folders import Folders, is_file, is_folder
 from .records import Record, read_record
 from .recovery import stray_containers
 from .uploads import check_upload
+from .versions import other_version
 
 __all__ = ["Finding", "Report", "What", "check", "check_container"]
 
-What = Literal["marker", "record", "upload", "container", "figures", "leftover"]
+What = Literal["marker", "record", "upload", "container", "figures", "version", "leftover"]
 
 _CHUNK = 1 << 20
 
@@ -41,6 +42,8 @@ class Finding:
     what : str
         ``record``, ``upload`` or ``container``: it is damaged or gone. ``figures``: a record says something else of its
         container than the container itself. ``marker``: the folders do not belong together, or are not all there.
+        ``version``: a whole container of another version than this server reads; the next start builds it again, and it
+        is no damage.
         ``leftover``: a file that nothing refers to, as a process leaves them that is killed; the next start removes or
         sets aside what it finds, and it is no damage.
     path : Path
@@ -72,7 +75,23 @@ class Finding:
 
 @dataclass
 class Report:
-    """What was looked at, and what was found."""
+    """What was looked at, and what was found.
+
+    Attributes
+    ----------
+    folder : Path
+    surfaces : int
+        Records, those that cannot be used among them.
+    containers, uploads : int
+        Those that are there, whole or damaged, and that a record speaks of; what several surfaces share counts once.
+    bytes : int
+        Of these containers and uploads, on the disk.
+    seconds : float
+    findings : list of Finding
+        What should be there and is not is among them.
+    records : dict of Record
+        By surface.
+    """
 
     folder: Path
     surfaces: int = 0
@@ -85,8 +104,8 @@ class Report:
 
     @property
     def damage(self) -> list[Finding]:
-        """The findings that are no leftovers."""
-        return [finding for finding in self.findings if finding.what != "leftover"]
+        """The findings that are neither leftovers nor of another version."""
+        return [finding for finding in self.findings if finding.what not in ("leftover", "version")]
 
     @property
     def clean(self) -> bool:
@@ -163,8 +182,9 @@ def _upload(at: Folders, record: Record, report: Report, known: dict[str, str | 
         return
     # Several surfaces may have the same upload.
     if record.folder not in known:
-        report.uploads += 1
-        report.bytes += record.upload_bytes
+        there = [file for file in at.files(record) if is_file(file)]
+        report.uploads += bool(there)
+        report.bytes += sum(file.stat().st_size for file in there)
         known[record.folder] = check_upload(at.files(record), record)
     problem = known[record.folder]
     if problem is not None:
@@ -176,13 +196,14 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
     path = at.container(sha256)
     # Several surfaces may have the same container.
     if sha256 not in indexes:
-        report.containers += 1
         indexes[sha256] = check_container(path, sha256)
-        if path.is_file():
+        if is_file(path):
+            report.containers += 1
             report.bytes += path.stat().st_size
     index = indexes[sha256]
     if isinstance(index, str):
-        yield Finding("container", path, record.id, index)
+        # Where its bytes are not those of its name, that is what the text says.
+        yield Finding("version" if index == other_version(path) else "container", path, record.id, index)
     elif figures_of(index, record.info, at.files(record)) != record.info:
         problem = "expected the figures that the container has, got others"
         yield Finding("figures", at.record(record.id), record.id, problem)

@@ -145,7 +145,9 @@ def _print(report: Report, waiting: Sequence[Record]) -> None:
     problems += f", {repaired} of these repaired" if repaired else ""
     problems += f", {lost} lost" if lost else ""
     problems += f", {len(waiting)} surfaces wait for another attempt" if waiting else ""
-    leftovers = len(report.findings) - found
+    others = sum(finding.what == "version" and finding.repair is None for finding in report.findings)
+    problems += f", {others} of another version, which the next start builds again" if others else ""
+    leftovers = sum(finding.what == "leftover" for finding in report.findings)
     print(
         f"{report.surfaces} surfaces, {report.uploads} uploads, {report.containers} containers, "
         f"{report.bytes / 1e6:.1f} MB in {report.seconds:.1f} s: {problems}"

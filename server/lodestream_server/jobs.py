@@ -8,8 +8,10 @@ the surface is deleted                  its process is killed
 the process dies, or lacks memory       one more attempt in another process, then it waits
 the process is told to end (SIGTERM)    another attempt, at most `_ENDINGS` in all: a service is being stopped
 it takes longer than it may             it waits
-a library is missing, or a limit or     it waits
-setting of this server is in its way
+a library is missing, a limit or        it waits
+setting of this server is in its way,
+or an uploaded container is of another
+version than this server reads
 the disk is full, or its owner has      it stays in the queue until there is room
 more there than one may have
 the server dies                         the next one takes it up, after those of its caller that have not been tried so
@@ -39,11 +41,11 @@ from functools import partial
 from pathlib import Path
 
 from lodestream.capacity import memory_limit
-from lodestream.errors import InputError
+from lodestream.errors import InputError, TooLargeError
 
 from . import results, worker
 from .access import key_of
-from .durable import make_folder, remove
+from .durable import discard, make_folder
 from .problems import FullError, MissingError
 from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError
 from .records import Record, State
@@ -68,6 +70,9 @@ _ROOM = (errno.ENOSPC, errno.EDQUOT)
 _PASSING = (*_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
+
+# So often a build is tried that lacks them, where somebody waits for its end.
+_ATTEMPTS = 3
 
 # For so many seconds it counts whose builds have had a process.
 _REMEMBERED = 600.0
@@ -102,6 +107,9 @@ class Builder:
     settings : Settings
     finished : callable (state, seconds) or None
         Told how each build ended (``ready``, ``failed``, ``waiting``, ``missing``), and how long its last attempt took.
+    patient : bool
+        Whether builds that find no room on the disk wait until there is some. Otherwise they are given up after a few
+        attempts and stay in the queue, for the next server to build.
 
     Attributes
     ----------
@@ -112,9 +120,15 @@ class Builder:
     """
 
     def __init__(
-        self, storage: Storage, settings: Settings, finished: Callable[[State, float], None] | None = None
+        self,
+        storage: Storage,
+        settings: Settings,
+        finished: Callable[[State, float], None] | None = None,
+        *,
+        patient: bool = True,
     ) -> None:
         self.ready = False
+        self._patient = patient
         self._storage = storage
         self._settings = settings
         self._finished = finished
@@ -173,7 +187,8 @@ class Builder:
         try:
             record, new = await asyncio.to_thread(self._storage.add, record, upload)
         finally:
-            await asyncio.to_thread(remove, upload)  # by nobody else, and not before: it may be on its way to its place
+            # By nobody else, and not before: it may be on its way to its place.
+            await asyncio.to_thread(discard, upload)
         if new:
             self.submit(record, caller)
         return record, new
@@ -195,7 +210,7 @@ class Builder:
             del self._pending[caller]
         # Whoever saw the build end may have asked for another before its task was over.
         record = self._storage.find(surface)
-        if record is not None and surface not in self._deleting:
+        if self._patient and record is not None and surface not in self._deleting:
             self._resume(record, caller)
 
     def _resume(self, record: Record, caller: str | None = None) -> None:
@@ -305,8 +320,9 @@ class Builder:
             _log.warning("%s", unkept)
 
     async def _build(self, record: Record) -> None:
-        delay, said = _FIRST_DELAY, ""
+        delay, said, attempts = _FIRST_DELAY, "", 0
         while True:
+            attempts += 1
             started = time.monotonic()
             try:
                 state = await self._insist(record)
@@ -315,6 +331,8 @@ class Builder:
                     said = str(error)
                     _log.error("the build of %s %s", record.id, said)
                     self._storage.note(record.id, said)
+                if not self._patient and attempts == _ATTEMPTS:
+                    return
                 with suppress(TimeoutError):
                     async with asyncio.timeout(delay):
                         await self._room.wait()
@@ -379,12 +397,12 @@ class Builder:
                 result = await self._keep(record, job, result)
             if result is None:
                 return "ready"
-            await asyncio.to_thread(remove, folder)  # whoever sees that it has failed sees nothing of it
+            await asyncio.to_thread(discard, folder)  # whoever sees that it has failed sees nothing of it
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            await asyncio.to_thread(remove, folder)
+            await asyncio.to_thread(discard, folder)
 
     async def _run(self, call: Call) -> worker.Built | worker.Refused:
         try:
@@ -410,7 +428,7 @@ class Builder:
             await asyncio.to_thread(self._storage.ready, record.id, job.container, built.sha256, info)
         except OSError as error:
             return _not_now(error)
-        except MissingError as error:
+        except (MissingError, TooLargeError) as error:
             return worker.Refused(str(error), final=False)
         return None
 
@@ -439,7 +457,7 @@ class Builder:
         return "waiting"
 
     def _out_of_memory(self) -> str:
-        return f"the build needed more memory than one may have, {self._memory >> 20} MiB"
+        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_BUILD_MEMORY)"
 
     def _job(self, record: Record, folder: Path) -> worker.Job:
         options = dict(record.options)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from .durable import remove
+from .durable import discard
 
 __all__ = ["Key", "Lease", "LevelFiles"]
 
@@ -87,7 +87,7 @@ class LevelFiles:
 
     def close(self) -> None:
         """Remove them all."""
-        remove(self.folder)
+        discard(self.folder)
 
     @property
     def longest(self) -> int:
@@ -117,7 +117,7 @@ class LevelFiles:
         if not file.readers:
             self._lent -= file.size
             if file.forgotten:
-                remove(file.path)
+                discard(file.path)
 
     async def make_room(self) -> int:
         """Remove what is in the way of another file; bytes that one may have, 0 if there is no room."""
@@ -132,9 +132,10 @@ class LevelFiles:
         for key, file in list(self._files.items()):
             if self.size <= most:
                 return
-            if not file.readers:
+            # Meanwhile its container may have gone, or somebody may have begun to read it.
+            if self._files.get(key) is file and not file.readers:
                 del self._files[key]
-                await asyncio.to_thread(remove, file.path)
+                await asyncio.to_thread(discard, file.path)
 
     def new_folder(self, key: Key) -> Path:
         """The path of a folder for making a file."""
@@ -155,4 +156,4 @@ class LevelFiles:
             file = self._files.pop(key)
             file.forgotten = True
             if not file.readers:
-                remove(file.path)
+                discard(file.path)

@@ -5,7 +5,8 @@ What becomes of a request:
 ======================================  ================================================================================
 the file is there                       it is lent at once
 the same level is being made            it waits for that
-otherwise                               it waits its turn: callers take turns, whatever each of them asks for
+otherwise                               it waits its turn: callers take turns, whatever each of them asks for; what
+                                        several wait for is made in the first turn of any of them
 the client goes                         it leaves the queue; when nobody else waits, the process is killed
 the level is too large, its file too    413
 long, or it takes too long
@@ -31,9 +32,10 @@ from typing import Any
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
-from lodestream.errors import LodestreamError, TooLargeError
+from lodestream.errors import LodestreamError, StreamError, TooLargeError
 
-from .durable import make_folder, remove
+from . import damage
+from .durable import discard, make_folder, remove
 from .folders import is_file
 from .level_files import Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, RefusedLevel, make_level
@@ -61,6 +63,8 @@ class _Job:
     ----------
     waiting : int
         How many do.
+    callers : set of str
+        In whose turns it may be made; empty once it is being made.
     done : future
         Whether it was made, or why not.
     lease : Lease or None
@@ -69,9 +73,9 @@ class _Job:
         The container is still there, so that others may ask for the file.
     """
 
-    def __init__(self, key: Key, caller: str) -> None:
+    def __init__(self, key: Key) -> None:
         self.key = key
-        self.caller = caller
+        self.callers: set[str] = set()
         self.waiting = 0
         self.done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.lease: Lease | None = None
@@ -227,7 +231,12 @@ class LevelQueue:
         most = self._settings.max_level_requests
         if self._waiting >= most:
             raise BusyError(f"expected at most {most} requests for levels at the same time; come back soon")
-        job = self._jobs.get(key) or self._submit(key, caller)
+        job = self._jobs.get(key)
+        if job is None:
+            job = self._jobs[key] = _Job(key)
+            self._line_up(job, caller)
+        elif job.callers:
+            self._line_up(job, caller)
         job.waiting += 1
         self._waiting += 1
         try:
@@ -240,12 +249,20 @@ class LevelQueue:
             if not job.waiting:
                 self._abandon(job)
 
-    def _submit(self, key: Key, caller: str) -> _Job:
-        job = self._jobs[key] = _Job(key, caller)
-        self._turns.setdefault(caller, deque()).append(job)
+    def _line_up(self, job: _Job, caller: str) -> None:
+        if caller not in job.callers:
+            job.callers.add(caller)
+            self._turns.setdefault(caller, deque()).append(job)
         # In the next step of the loop: whoever asks has not begun to wait yet.
         asyncio.get_running_loop().call_soon(self._go_on)
-        return job
+
+    def _leave_line(self, job: _Job) -> None:
+        for caller in job.callers:
+            turns = self._turns[caller]
+            turns.remove(job)
+            if not turns:
+                del self._turns[caller]
+        job.callers.clear()
 
     def _abandon(self, job: _Job) -> None:
         """Nobody waits for it any more."""
@@ -257,11 +274,7 @@ class LevelQueue:
         self._drop(job)
         if self._working is not None and self._working[0] is job:
             self._working[1].cancel()
-            return
-        turns = self._turns[job.caller]
-        turns.remove(job)
-        if not turns:
-            del self._turns[job.caller]
+        self._leave_line(job)
 
     def _drop(self, job: _Job) -> None:
         if self._jobs.get(job.key) is job:
@@ -273,10 +286,10 @@ class LevelQueue:
         loop = asyncio.get_running_loop()
         if not self._turns:
             return
-        caller, turns = self._turns.popitem(last=False)
-        job = turns.popleft()
-        if turns:
-            self._turns[caller] = turns
+        caller = next(iter(self._turns))
+        self._turns.move_to_end(caller)
+        job = self._turns[caller][0]
+        self._leave_line(job)
         task = loop.create_task(self._work(job))
         self._working = job, task
         task.add_done_callback(self._worked)
@@ -315,7 +328,7 @@ class LevelQueue:
             size = await self._insist(wanted, job.key)
             return self._files.add(job.key, wanted.path, size, kept=job.kept)
         finally:
-            await asyncio.to_thread(remove, folder)
+            await asyncio.to_thread(discard, folder)
 
     async def _insist(self, wanted: LevelJob, key: Key) -> int:
         for _ in range(_DEATHS):
@@ -353,7 +366,10 @@ class LevelQueue:
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
             raise TooLargeError(f"expected a level whose file has less than {wanted.most_bytes} bytes; {advice}")
-        raise made.error()
+        refused = made.error()
+        if isinstance(refused, StreamError):
+            damage.tell(self._storage, key.container, refused)
+        raise refused
 
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.

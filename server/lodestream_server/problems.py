@@ -216,7 +216,7 @@ async def _raised(request: HTTPConnection, error: Exception) -> Response:
 def answer(request: HTTPConnection, error: Exception) -> Response:
     """The problem document for an error."""
     status, code, title, detail = problem(error)
-    if status >= 500:
+    if status >= 500 and not isinstance(error, StreamError):  # whoever found the damage has told of it
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
     headers = getattr(error, "headers", FullError.headers if status == 507 else {})
     return _document(request, status, code, title, detail, headers)

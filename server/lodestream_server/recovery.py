@@ -11,6 +11,8 @@ a record that cannot be used                  set aside, and the one beside the 
 an upload without any record                  set aside
 a container that no record speaks of          set aside, unless it may be that of a surface that has none yet
 a record without its container                it is built again from its upload
+a container of another version than this      it is built again from the upload, and kept until that is done; without
+server reads                                  its upload the surface waits
 a record without its container and upload     it is missing, until they are back or it is deleted
 uploads and builds under way, files half      removed: nobody was told that they are there, or they can be made again
 written, levels that were fetched
@@ -29,8 +31,9 @@ from .aside import set_aside
 from .durable import remove, sync_folder, write_file
 from .folders import Folders, is_file
 from .records import Record, read_record, serialize
+from .versions import other_version
 
-__all__ = ["finish_delete", "has_upload", "present", "recover", "stray_containers"]
+__all__ = ["finish_delete", "has_container", "has_upload", "present", "recover", "stray_containers"]
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +70,7 @@ def recover(at: Folders) -> list[Record]:
 
 
 def present(at: Folders, record: Record) -> Record:
-    """A record as what lies on the disk shows it: ready, to be built, or missing.
+    """A record as what lies on the disk shows it: ready, to be built, waiting for its upload, or missing.
 
     Raises
     ------
@@ -76,10 +79,17 @@ def present(at: Folders, record: Record) -> Record:
     """
     if record.state == "failed":
         return record
-    if _has_container(at, record):
+    if has_container(at, record):
         return replace(record, state="ready", reason=None)
+    other = None if record.container is None else other_version(at.container(record.container))
     if has_upload(at, record):
-        return record if record.state == "waiting" else replace(record, state="queued", reason=None)
+        if record.state == "waiting":
+            return record
+        if other is not None:
+            _log.info("%s is built again: %s", record.id, other)
+        return replace(record, state="queued", reason=None)
+    if other is not None:
+        return replace(record, state="waiting", reason=f"{other}; its upload is not here to build it again from")
     if record.state == "missing":  # its record cannot be used, which is the reason
         return record
     reason = "neither its upload nor its container is on the server's disk"
@@ -87,8 +97,12 @@ def present(at: Folders, record: Record) -> Record:
     return replace(record, state="missing", reason=reason)
 
 
-def _has_container(at: Folders, record: Record) -> bool:
-    return record.container is not None and is_file(at.container(record.container))
+def has_container(at: Folders, record: Record) -> bool:
+    """Whether the container of a surface is there, and not of another version than this server reads."""
+    if record.container is None:
+        return False
+    path = at.container(record.container)
+    return is_file(path) and other_version(path) is None
 
 
 def has_upload(at: Folders, record: Record) -> bool:
@@ -197,7 +211,7 @@ def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) ->
 
 def _take_from_twins(at: Folders, records: dict[str, Record]) -> None:
     # A record from beside an upload does not know its container; that of a surface that was made alike may.
-    made = {key: record for record in records.values() if (key := _recipe(record)) and _has_container(at, record)}
+    made = {key: record for record in records.values() if (key := _recipe(record)) and has_container(at, record)}
     for surface, record in records.items():
         twin = made.get(_recipe(record) or ()) if record.container is None and record.state != "failed" else None
         if twin is not None:
@@ -224,7 +238,7 @@ def _count_attempts(at: Folders, records: dict[str, Record]) -> None:
     for surface in {path.name.partition(".")[0] for path in at.work.iterdir()}:
         begun = records.get(surface)
         # One that has its container was built: only its folder was still to be removed.
-        if begun is not None and begun.state in ("queued", "ready") and not _has_container(at, begun):
+        if begun is not None and begun.state in ("queued", "ready") and not has_container(at, begun):
             records[surface] = replace(begun, attempts=begun.attempts + 1)
             with suppress(OSError):  # a full disk: it is counted again after the next end
                 write_file(at.record(surface), serialize(records[surface]))

@@ -48,6 +48,8 @@ def set_aside(report: Report) -> None:
 async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> dict[str, Record]:
     """Build every surface that is queued, as a server would; the records of all surfaces after that.
 
+    Those for which there is no room on the disk stay in the queue.
+
     Parameters
     ----------
     folder : Path
@@ -100,13 +102,16 @@ def _after(finding: Finding, found_again: bool, record: Record | None) -> Findin
         return finding
     if found_again:
         missing = record is not None and record.state == "missing"
-        done.append("there is nothing to make it again from" if missing else "still so")
+        why = "" if record is None or not record.reason else f": {record.reason}"
+        done.append("there is nothing to make it again from" if missing else f"still so{why}")
         return replace(finding, repair="; ".join(done), lost=finding.lost or missing)
     if finding.what == "leftover":
         return replace(finding, repair="removed, or set aside", repaired=True)
     if record is None or record.state == "ready":
         if finding.what in ("container", "record"):
             done.append("whole again")
+        elif finding.what == "version":
+            done.append("built again")
         return replace(finding, repair="; ".join(done) or "gone", repaired=True)
     if record.state == "failed" and finding.what == "record":
         return replace(finding, repair="; ".join(done), repaired=True)
@@ -118,7 +123,7 @@ async def _build(storage: Storage, settings: Settings) -> None:
     queued = [record for record in storage.records() if record.state == "queued"]
     if not queued:
         return
-    builder = Builder(storage, settings)
+    builder = Builder(storage, settings, patient=False)
     try:
         for record in queued:
             builder.submit(record)

@@ -12,9 +12,9 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import CorruptStreamError, InputError, StreamError
+from lodestream.errors import CorruptStreamError, InputError, StreamError, TooLargeError
 
-from . import finished
+from . import containers, finished
 from .processes import WrongAnswerError
 
 if TYPE_CHECKING:
@@ -53,6 +53,8 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
     ------
     WrongAnswerError
         When there is no such file, it has not the bytes that it should have, or is no container.
+    TooLargeError
+        When its index would take more memory than all indexes of this server may.
     OSError
         When it cannot be read.
     """
@@ -67,6 +69,12 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         if sha256 != built.sha256:
             raise WrongAnswerError(f"expected a container with the SHA-256 {built.sha256}, got {sha256}")
+
+        needed, most = containers.index_memory(file), containers.most_for_indexes()
+        if needed > most:
+            raise TooLargeError(
+                f"expected a container whose index takes at most {most >> 20} MiB of memory, got {needed >> 20} MiB"
+            )
 
         def read(offset: int, length: int) -> bytes:
             if length > _MOST_AT_ONCE:

@@ -16,6 +16,7 @@ from .jobs import Builder
 from .level_queue import LevelQueue
 from .limits import Limits
 from .metrics import Metrics
+from .pace import Pace
 from .settings import Settings
 from .shares import Turns
 from .storage import Storage
@@ -43,6 +44,7 @@ class State:
     limits: Limits
     metrics: Metrics
     levels: LevelQueue
+    pace: Pace
     planning: Turns = field(default_factory=lambda: Turns(1, _PLANS_REMEMBERED), init=False)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import socket
 import threading
@@ -24,7 +25,7 @@ from .logs import drain
 from .settings import Settings
 from .storage import Storage
 
-__all__ = ["Server", "make_server", "running_server"]
+__all__ = ["Server", "make_server", "running_server", "serve_alone"]
 
 _START_SECONDS = 60.0
 _GRACEFUL_SECONDS = 4
@@ -118,13 +119,13 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         As `create_app` does.
     """
     app = create_app(settings)
-    cuts = Cuts(app.state.metrics)
+    cuts, pace = Cuts(app.state.metrics), app.state.pace
     config = uvicorn.Config(
         app,
         host=settings.host,
         port=settings.port,
-        http=connections(settings, cuts),
-        ws=stream_connections(cuts),
+        http=connections(settings, cuts, pace),
+        ws=stream_connections(cuts, pace),
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.
         ws_per_message_deflate=False,
@@ -140,6 +141,32 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         forwarded_allow_ips=list(settings.trusted_proxies),
     )
     return Server(config, settings.data, listening)
+
+
+def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
+    """Run a server that is all that its process does, until it is told to end; the server.
+
+    Parameters
+    ----------
+    settings : Settings
+    listening : callable
+        Called with the server's address once it accepts connections.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        As `create_app` does.
+    """
+
+    def started(address: str) -> None:
+        # What is loaded by now stays: no collection, during which nobody is answered, has to look at it again.
+        gc.collect()
+        gc.freeze()
+        listening(address)
+
+    server = make_server(settings, started)
+    server.run()
+    return server
 
 
 @contextmanager

@@ -20,12 +20,13 @@ from lodestream.errors import InputError, LodestreamError, NotFoundError
 
 from . import markers
 from .catalog import Catalog, Position
-from .durable import NewFile, make_folder, remove, rename, sync_folder, write_file
+from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
 from .private import check_writable, make_private, tighten
 from .problems import MissingError
 from .records import Record, State, serialize
-from .recovery import finish_delete, has_upload, present, recover
+from .recovery import finish_delete, has_container, has_upload, present, recover
+from .versions import other_version
 
 __all__ = ["Storage", "claim"]
 
@@ -144,6 +145,14 @@ class Storage:
             raise self.gone(sha256)
         return path
 
+    def place_of(self, sha256: str) -> Path:
+        """Where a container lies, or would."""
+        return self._at.container(sha256)
+
+    def surfaces_of(self, sha256: str) -> list[str]:
+        """The ids of the surfaces that have a container, or had it before it was lost."""
+        return self._catalog.of_container(sha256)
+
     def container_bytes(self, sha256: str) -> int | None:
         """How long a container was when it was kept; None where it is not known."""
         record = self._catalog.one_of_container(sha256)
@@ -161,6 +170,9 @@ class Storage:
     def gone(self, sha256: str) -> LodestreamError:
         """Why a container that was known a moment ago cannot be read: it was deleted since, or its disk is gone."""
         if self._catalog.has_container(sha256):
+            other = other_version(self._at.container(sha256))
+            if other is not None:
+                return MissingError(other)
             _log.error("the container %s is not on the disk", sha256)
             return MissingError(f"expected the container {sha256} on the server's disk, where it is not now")
         return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
@@ -195,7 +207,7 @@ class Storage:
                     f"expected an upload whose id no other has, got one with that of {record.id}; give it another name"
                 )
             if known is not None and known.state not in _STOPPED and has_upload(self._at, known):
-                remove(upload)
+                discard(upload)
                 return known, False
             record = replace(record, upload=self._upload_folder(record))
             if known is not None:
@@ -214,14 +226,12 @@ class Storage:
         return record.upload_sha256
 
     def _with_its_container(self, record: Record) -> Record | None:
-        if record.container is None or not is_file(self._at.container(record.container)):
-            return None
-        return replace(record, state="ready")
+        return replace(record, state="ready") if has_container(self._at, record) else None
 
     def _like_its_twin(self, record: Record) -> Record | None:
         for other in self._catalog.of_digest(record.upload_sha256 or ""):
             same = (other.options, other.name, other.filenames) == (record.options, record.name, record.filenames)
-            if same and other.state == "ready" and is_file(self._at.container(other.container)):
+            if same and other.state == "ready" and has_container(self._at, other):
                 return replace(record, state="ready", container=other.container, info=other.info)
         return None
 
@@ -267,6 +277,8 @@ class Storage:
     def ready(self, surface: str, built: Path, sha256: str, info: dict[str, object]) -> None:
         """Keep the container that was built for a surface; nothing happens if the surface is gone.
 
+        One of another version that the surface had goes then, with the last surface that has it.
+
         Raises
         ------
         OSError, MissingError
@@ -275,10 +287,12 @@ class Storage:
         with self._lock:
             record = self._catalog.find(surface)
             if record is None:
-                remove(built)
+                discard(built)
                 return
             self._check_mounted()
-            if record.container not in (None, sha256):
+            before = None if record.container == sha256 else record.container
+            outdated = before is not None and other_version(self._at.container(before)) is not None
+            if before is not None and not outdated:
                 _log.warning("%s was built again as another container, %s, than before", surface, sha256)
             made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
             serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
@@ -289,8 +303,12 @@ class Storage:
                 self._write(made)
             except OSError:
                 if not there:
-                    remove(container)
+                    discard(container)
                 raise
+            if before is not None and outdated and not self._catalog.has_container(before) and not self._unusable:
+                with suppress(OSError):  # what stays is set aside at the next start: no record speaks of it
+                    remove(self._at.container(before))
+                    sync_folder(self._at.containers)
 
     def failed(self, surface: str, reason: str) -> None:
         """Note that a reader refused the bytes of a surface; they stay until somebody deletes it."""
@@ -327,7 +345,10 @@ class Storage:
             record = self.get(surface)
             if record.state not in _STOPPED:
                 return record
-            made = present(self._at, replace(record, state="queued", reason=None, attempts=0))
+            again = replace(record, attempts=0)
+            if record.state != "missing":  # otherwise it keeps why it is, unless something of it is there now
+                again = replace(again, state="queued", reason=None)
+            made = present(self._at, again)
             if made.state != "missing":
                 self._write(made)
             elif record.state == "failed":  # an earlier version dropped its upload
@@ -423,7 +444,7 @@ def claim(root: Path) -> int:
     OSError
         When nothing can be written there.
     """
-    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o644)
+    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o600)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

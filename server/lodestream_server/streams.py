@@ -25,6 +25,7 @@ from lodestream.protocol import State
 from lodestream.sender import Sender
 from lodestream.wire import parse, serialize
 
+from . import damage
 from .access import Caller, anybody
 from .containers import OpenContainer
 from .files import ready
@@ -175,9 +176,11 @@ class _Session:
         self._socket = socket
         self._container = container
         self._settings = parts.settings
+        self._storage = parts.storage
         self._sender = Sender(container.index, container.sha256)
         self._heard = asyncio.Event()
         self._planning = parts.planning
+        self._pace = parts.pace
         # Who has the sender: a thread that plans with it, or one of the two tasks.
         self._mine = asyncio.Lock()
 
@@ -209,7 +212,9 @@ class _Session:
             return
         except (LodestreamError, OSError) as error:
             await self._fail(_code(error), str(error) if isinstance(error, LodestreamError) else "see the server's log")
-            if not isinstance(error, MessageError | UnsupportedVersionError | BadTokenError | _SilentError):
+            if isinstance(error, StreamError) and not isinstance(error, UnsupportedVersionError):
+                damage.tell(self._storage, self._container.sha256, error)
+            elif not isinstance(error, MessageError | UnsupportedVersionError | BadTokenError | _SilentError):
                 _log.error("a stream failed", exc_info=error)
         else:
             self.result = self._sender.why or "closed"
@@ -284,7 +289,7 @@ class _Session:
                     data = await asyncio.to_thread(self._container.read, wanted)
                 else:
                     # The others' turn: of many streams each has its first picture before any has its second.
-                    await asyncio.sleep(0)
+                    await self._pace.turn()
                 async with self._mine:
                     self._sender.provide(wanted, data)
             else:

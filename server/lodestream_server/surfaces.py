@@ -14,7 +14,7 @@ from fastapi.responses import JSONResponse, Response
 
 from . import examples, options, uploads
 from .access import Caller, anybody
-from .durable import remove
+from .durable import discard
 from .files import ready
 from .gate import caller_of
 from .problems import BusyError, FullError, NotOwnerError, TooManyError, responses
@@ -177,7 +177,7 @@ async def _keep(
         received = await uploads.receive(request, folder, parts.settings, chosen.filename)
         record = await asyncio.to_thread(_record, received, chosen, caller.owner, parts)
     except BaseException:
-        await asyncio.to_thread(remove, folder)
+        await asyncio.to_thread(discard, folder)
         raise
     record, _ = await parts.builder.accept(record, folder, caller.key)
     return received, record

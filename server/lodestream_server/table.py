@@ -382,7 +382,7 @@ _SETTINGS = (
         None,
         "most memory of one build",
         "limits",
-        64 << 20,
+        256 << 20,
         usual="half of the memory there is, divided by the builds at the same time",
     ),
     Setting("build_seconds", _SECONDS, 3600.0, "longest time of one build, and most processor time", "time", above=0),

@@ -122,7 +122,8 @@ class TokenFile:
                 )
             return tuple(Token.from_json(values) for values in document["tokens"])
         except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise LodestreamError(f"expected a file of tokens, got {self.path}, which is none: {error!r}") from None
+            why = f"{type(error).__name__}: {error}"  # its repr may hold all of the file
+            raise LodestreamError(f"expected a file of tokens, got {self.path}, which is none: {why}") from None
 
     def create(self, name: str, scopes: tuple[str, ...], days: float | None = None) -> tuple[str, Token]:
         """Add a token; the token itself, which is kept nowhere, and what is kept.

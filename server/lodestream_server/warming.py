@@ -93,13 +93,10 @@ def _surfaces() -> Iterator[Surface]:
     yield Surface(_with_holes(heights))
     yield Surface(_with_holes(heights).astype(np.float32))
     yield Surface(heights, mask=np.isfinite(_with_holes(heights)))
-    # Of as many points as a stream by neighbours is thought of for.
-    many = np.mgrid[0:64, 0:65]
-    terraces = np.rint(4 * np.sin(many[0] / 9) * np.cos(many[1] / 7)) + 5
     for name in _TYPES:
-        values = terraces.astype(name)
+        values = np.asarray(heights + 50).astype(name)
         yield Surface(values)
-        yield Surface(np.asarray(heights + 50).astype(name), attributes={"more": values[:37, :41]})
+        yield Surface(values, attributes={"more": values})
     yield Surface(xyz, mask=np.isfinite(_with_holes(heights)))
     yield Surface(xyz.astype(np.float32), mask=np.isfinite(_with_holes(heights)))
     yield Surface(xyz.astype(np.float32), closed=(False, True))

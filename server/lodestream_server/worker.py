@@ -17,7 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatWarning, LodestreamError, SwitchedOffError, TooLargeError, UnavailableError
+from lodestream.errors import (
+    FormatWarning,
+    LodestreamError,
+    StreamError,
+    SwitchedOffError,
+    TooLargeError,
+    UnavailableError,
+    UnsupportedVersionError,
+)
 from lodestream.metadata import with_notes
 
 from . import finished
@@ -176,8 +184,8 @@ def build(job: Job) -> Built | Refused:
 
 
 def _may_pass(error: LodestreamError) -> bool:
-    """Whether an upload was refused for what this machine lacks, or forbids, and not for its bytes."""
-    if isinstance(error, TooLargeError | UnavailableError):
+    """Whether an upload was refused for what this server lacks, or forbids, and not for its bytes."""
+    if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
         return True
     cause: BaseException | None = error
     while cause is not None:  # what a reader made its own error of
@@ -212,7 +220,11 @@ def _build(job: Job) -> Built:
     path = job.container
     if finished.is_container(job.files[0]):
         check_allowed(("lode",), job.allowed)
-        return Built(*finished.keep(job, path, _reporter(job.folder)))
+        try:
+            return Built(*finished.keep(job, path, _reporter(job.folder)))
+        except (StreamError, TooLargeError) as error:
+            error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
+            raise
     surface = _read(job)
     precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
     precisions = {
@@ -220,7 +232,9 @@ def _build(job: Job) -> Built:
         for key, value in job.options.items()
         if key.startswith(ATTRIBUTE)
     }
-    container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
+        container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
     with NewFile(path) as file:
         file.write(container)
     return Built(hashlib.sha256(container).hexdigest())
@@ -228,6 +242,7 @@ def _build(job: Job) -> Built:
 
 def _read(job: Job) -> Surface:
     from lodestream.formats import read
+    from lodestream.losses import at_holes
 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", FormatWarning)
@@ -239,13 +254,14 @@ def _read(job: Job) -> Surface:
             allowed=job.allowed,
             **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
         )
-    notes = list(dict.fromkeys(str(warning.message) for warning in found if warning.category is FormatWarning))
+    said = [str(warning.message) for warning in found if warning.category is FormatWarning]
+    notes = dict.fromkeys([*said, *filter(None, [at_holes(surface)])])
     if job.name is not None:
         surface.metadata["name"] = job.name
     elif job.filename is None:
         # Nobody gave it one: the reader took it from the name that stands in for the file's.
         surface.metadata.pop("name", None)
-    surface.metadata = with_notes(surface.metadata, notes)  # whoever uploaded it does not see what happens here
+    surface.metadata = with_notes(surface.metadata, list(notes))  # whoever uploaded it does not see what happens here
     return surface
 
 

@@ -34,8 +34,11 @@ This page is `--help` of every command, written by `python -m tests.client.manua
 
 - Results go to standard output; progress, notes and errors to standard error. With `--json`, standard output is one
   JSON object.
+- Notes on standard error name what does not come along: what a file has and a surface has not, values of attributes
+  at holes, what a format has no place for. Those of a server's build come back with `push`, and stand in the
+  surface's `notes`.
 - Exit code 0: done. 1: it could not be done, and one line says why. 2: the command line alone is wrong. 130:
-  interrupted by Ctrl-C; 143: ended by SIGTERM.
+  interrupted by Ctrl-C, without a word where nothing had begun; 143: ended by SIGTERM.
 - A path `-` is standard input or output. A file is written beside its name and renamed when it is whole.
 - `decode` and `pull` with `--json` print `bytes` (held of the surface, comparable with the layers of `info`),
   `wire_bytes` (all that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
@@ -44,7 +47,7 @@ This page is `--help` of every command, written by `python -m tests.client.manua
   exit code is then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer there is no OUT, and one
   that was there stays as it was. What came is kept, whether `--resume` was given or not, also of a `pull` that is
   killed; the next one with `--resume` asks only for the rest. A `pull` that ends as it should removes what it kept,
-  unless it was given `--resume`. Where nothing can be kept, the `pull` goes on without.
+  with `--resume` only when it has the whole surface. Where nothing can be kept, a `pull` without `--resume` goes on.
 - A limit that is out of reach gives the complete surface, with a note.
 - `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the whole surface, `--attributes speed,kind`
   these attributes beside the points, `--attributes none` the points alone; both go with each other and with the limits,

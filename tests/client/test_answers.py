@@ -112,7 +112,6 @@ def test_json_that_is_of_no_use(asynchronous: bool, body: bytes) -> None:
         {"layers": [7]},
         {"layers": [{"bytes": 1, "level": 0, "rms": "none"}]},
         {"metadata": ["a"]},
-        {"metadata": {"notes": "one"}},
         {"attributes": "abc"},
         {"name": ["a"]},
         {"progress": "half"},
@@ -123,6 +122,13 @@ def test_json_that_is_of_no_use(asynchronous: bool, body: bytes) -> None:
 def test_figures_of_another_kind(asynchronous: bool, wrong: dict[str, Any]) -> None:
     with pytest.raises(RemoteProtocolError, match=re.escape(f", got {next(iter(wrong))} ")):
         describe(document({**READY, **wrong}), asynchronous)
+
+
+@pytest.mark.parametrize("notes", ["one", 7, {"a": 1}, [3, "two"]], ids=repr)
+def test_metadata_may_have_any_values(run: Run, notes: Any) -> None:
+    with scripted(lambda _: document({**READY, "metadata": {"notes": notes}})) as server:
+        code, _, stderr = run("retry", f"{server.url}/v1/surfaces/ab")
+    assert (code, stderr) == (0, "lodestream: 3\nlodestream: two\n" if isinstance(notes, list) else "")
 
 
 @pytest.mark.parametrize("missing", [{}, {"bytes": None, "dtype": None, "levels": None, "metadata": None, "exact": 3}])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 import lodestream as ls
+from lodestream_client.commands import surfaces
 
 from .conftest import Run
 
@@ -145,12 +148,44 @@ def test_a_cut_container(
     code, stdout, stderr = run("decode", cut, out, "--json")
     assert (code, stdout, stderr.count("\n")) == (1, "", 1)
     assert not out.exists()
-    code, stdout, _ = run("decode", cut, out, "--json", "--partial")
+    assert stderr.startswith(f"lodestream: {cut}: expected a whole container, got ")
+    assert stderr.endswith(" in 3000 bytes: it is cut short; --partial writes the last whole layer before that\n")
+    code, stdout, stderr = run("decode", cut, out, "--json", "--partial")
+    assert stderr.startswith(f"lodestream: {cut}: expected a whole container, got ")
     layer = [it for it in info["layers"] if it["bytes"] <= 3000][-1]
     figures = json.loads(stdout)
     assert code == 0
     assert (figures["ended"], figures["bytes"], figures["rms"]) == ("truncated", layer["bytes"], layer["rms"])
     assert error_of(np.load(out), terrain) == pytest.approx(layer["rms"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("bytes_", "options", "advice"),
+    [
+        (3000, ("--level", "2"), "order level, with --partial the last whole layer is written"),
+        (3000, ("--level", "2", "--partial"), "order level, the last whole layer is written"),
+        (
+            3000,
+            ("--order", "level"),
+            "order level, with --partial the last whole layer is written",
+        ),
+        (40, (), "it is cut short"),
+        (40, ("--partial",), "it is cut short"),
+    ],
+)
+def test_a_cut_container_says_what_can_be_had(
+    run: Run, container_file: Path, tmp_path: Path, bytes_: int, options: tuple[str, ...], advice: str
+) -> None:
+    cut = tmp_path / "cut.lode"
+    cut.write_bytes(container_file.read_bytes()[:bytes_])
+    code, stdout, stderr = run("decode", cut, tmp_path / "out.npy", *options)
+    assert (code, stdout, stderr.count("\n"), (tmp_path / "out.npy").exists()) == (1, "", 1, False)
+    assert stderr.startswith(f"lodestream: {cut}: expected ")
+    assert advice in stderr
+    code, stdout, stderr = run("info", cut)
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+    assert stderr.startswith(f"lodestream: {cut}: expected ")
+    assert stderr.endswith("; lodestream decode --partial writes what is whole of it\n")
 
 
 @pytest.mark.parametrize(
@@ -180,6 +215,8 @@ def test_a_damaged_container(run: Run, container_file: Path, tmp_path: Path) -> 
     code, _, stderr = run("decode", damaged, out)
     assert code == 1
     assert "at byte" in stderr
+    assert stderr.startswith(f"lodestream: {damaged}: ")
+    assert stderr.endswith("; --partial writes the last whole layer before that\n")
     code, stdout, _ = run("decode", damaged, out, "--json", "--partial")
     assert code == 0
     assert json.loads(stdout)["ended"] == "truncated"
@@ -192,6 +229,7 @@ def test_what_is_no_container(run: Run, tmp_path: Path, command: str) -> None:
         path.write_bytes(content)
         code, stdout, stderr = run(command, path, *([tmp_path / "o.npy"] if command == "decode" else []))
         assert (code, stdout, stderr.count("\n")) == (1, "", 1), stderr
+        assert stderr.startswith(f"lodestream: {path}: expected ")
 
 
 def test_encode_takes_surface_options(run: Run, tmp_path: Path) -> None:
@@ -322,6 +360,19 @@ def test_push_list_pull_rm(run: Run, server: str, tmp_path: Path) -> None:
     assert url not in run("list", server)[1]
 
 
+def test_a_list_has_a_line_for_each_however_narrow_the_terminal(
+    run: Run, server: str, terrain_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, stdout, _ = run("push", terrain_file, server, "--name", "long " * 40)
+    assert code == 0
+    url = stdout.splitlines()[-1]
+    monkeypatch.setattr(surfaces, "console", lambda: Console(file=sys.stdout, width=40))
+    (line,) = [line for line in run("list", server)[1].splitlines() if "long" in line]
+    assert line.startswith(f"{url}  ready  ")
+    assert line.count("long") == 40
+    assert run("rm", url)[0] == 0
+
+
 def test_push_without_waiting_and_as_json(run: Run, server: str, terrain_file: Path) -> None:
     code, stdout, _ = run("push", terrain_file, server, "--no-wait", "--json")
     pushed = json.loads(stdout)
@@ -383,10 +434,10 @@ def test_out_is_written_by_rename(run: Run, container_file: Path, tmp_path: Path
 def test_an_unknown_package_s_command(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     from importlib.metadata import EntryPoint
 
-    from lodestream_client import __main__
+    from lodestream_client import program
 
     broken = EntryPoint("juggle", "no_such_package.command:register", "lodestream.commands")
-    monkeypatch.setattr(__main__, "entry_points", lambda group: [broken])
+    monkeypatch.setattr(program, "entry_points", lambda group: [broken])
     code, _, stderr = run("juggle")
     assert code == 1
     assert "juggle is not fully installed" in stderr

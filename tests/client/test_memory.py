@@ -13,7 +13,9 @@ import pytest
 
 import lodestream as ls
 import lodestream_client as client
-from lodestream.errors import InputError, OptionError, RemoteError
+from lodestream.digest import DIGEST
+from lodestream.errors import FormatWarning, InputError, OptionError, RemoteError
+from lodestream.metadata import MAX_BYTES, packed
 from lodestream_client import sync
 from lodestream_client.requests import Description
 from tests.core.forgery import index_of, with_layer_errors
@@ -36,6 +38,8 @@ def block(number: int, closed: tuple[bool, bool] = (False, True)) -> ls.Block:
         "heat": np.where(rows % 6 == 0, np.nan, np.sqrt(columns)).astype(np.float32),
         "flow": np.random.default_rng(number).normal(size=(*z.shape, 3)),
     }
+    for array in attributes.values():
+        array[~mask] = 0
     return ls.Block(points, closed, mask=mask, attributes=attributes)
 
 
@@ -54,7 +58,8 @@ def raster() -> ls.Surface:
         "recognised": "a raster",
         "more": {"list": [1, 2.5, "three", None, True], "bytes": b"ab"},
     }
-    return ls.Surface(heights, mask=mask, attributes={"slope": np.abs(np.gradient(heights)[0])}, metadata=metadata)
+    slope = np.where(mask, np.abs(np.gradient(heights)[0]), np.nan)
+    return ls.Surface(heights, mask=mask, attributes={"slope": slope}, metadata=metadata)
 
 
 SURFACES: dict[str, Callable[[], ls.Surface]] = {
@@ -113,6 +118,34 @@ def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     assert (given.metadata, given.closed) == ({"name": "given"}, (False, False))
     made = sync.upload(server, given, rms=0.01)
     assert container_of(made) == ls.encode(given, rms=0.01)
+
+
+@pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
+@pytest.mark.parametrize("before", [None, ["read before"], "mine"], ids=str)
+def test_values_at_holes_are_told_in_the_container(server: str, before: Any, asynchronous: bool) -> None:
+    given = raster()
+    given.attributes["slope"][12, 30:33] = 4
+    given.metadata |= {"name": f"{before} {asynchronous}"} | ({} if before is None else {"notes": before})
+    metadata = dict(given.metadata)
+    note = "values of attributes at 3 holes of the points left out: slope"
+    with pytest.warns(FormatWarning, match=f"^{note}$"):
+        made = asyncio.run(client.upload(server, given)) if asynchronous else sync.upload(server, given)
+    # What somebody says under this name is left alone.
+    notes = before if isinstance(before, str) else [*(before or ()), note]
+    assert sync.describe(made.url).details["metadata"]["notes"] == made.details["metadata"]["notes"] == notes
+    assert given.metadata == metadata
+    # The note is not repeated: nothing is lost again.
+    back = pulled(made.url)
+    assert container_of(sync.upload(server, back)) == container_of(made)
+
+
+def test_a_note_that_has_no_room_is_a_warning_only(server: str) -> None:
+    given = raster()
+    given.attributes["slope"][12, 30:33] = 4
+    given.metadata["long"] = "x" * (MAX_BYTES - len(packed({**given.metadata, "long": "", DIGEST: "0" * 64})) - 10)
+    with pytest.warns(FormatWarning, match="at 3 holes"):
+        made = sync.upload(server, given)
+    assert "notes" not in made.details["metadata"]
 
 
 ARRAYS: dict[str, Callable[[], Any]] = {
@@ -280,6 +313,7 @@ def test_push_of_a_damaged_container(run: Run, server: str, container_file: Path
     code, out, err = run("push", tmp_path / "cut.lode", server)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert "cut short (at byte" in err
+    assert err.startswith("lodestream: cut.lode: expected ")
     with pytest.raises(RemoteError, match="at byte") as caught:
         sync.upload(server, data[:3000] + b"?" + data[3001:])
     assert caught.value.code == "failed"

@@ -55,7 +55,7 @@ def test_importing_the_client_is_light() -> None:
 
 
 def test_the_command_line_is_lighter_still() -> None:
-    statement = "from lodestream_client.__main__ import build_parser\nbuild_parser()"
+    statement = "from lodestream_client.program import build_parser\nbuild_parser()"
     assert loaded_after(statement, (*HEAVY, "numpy", "httpx", "websockets", "rich")) == []
 
 
@@ -111,6 +111,51 @@ def test_a_closed_pipe_is_quiet(container_file: Path, arguments: tuple[str, ...]
     os.close(write)
     assert done.returncode == 1
     assert done.stderr == b""
+
+
+INTERRUPTING = """\
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == {name!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.write(1, b"went on\\n" if {ignored!r} else b"")
+sys.meta_path.insert(0, Finder())
+from lodestream_client.__main__ import main
+sys.exit(main(["formats"]))
+"""
+
+#: What is loaded before a command begins: the first of it, what the parsers need, and the server's part.
+LOADED = (
+    "lodestream_client.program",
+    "argparse",
+    "lodestream",
+    "lodestream_client.commands",
+    "lodestream_server.command",
+)
+
+
+@pytest.mark.usefixtures("interrupts")
+@pytest.mark.parametrize("name", LOADED)
+def test_an_interrupt_while_a_command_is_loaded_is_silent(name: str) -> None:
+    code = INTERRUPTING.format(name=name, ignored=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment(), check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+
+
+def test_an_interrupt_that_is_ignored_stays_so() -> None:
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + INTERRUPTING.format(
+        name="lodestream_client.program", ignored=True
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment(), check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.startswith(b"went on\n")
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_nothing_is_loaded_before_interrupts_are_seen_to() -> None:
+    statement = "import lodestream_client.__main__"
+    assert loaded_after(statement, ("argparse", "contextlib", "enum", "typing", "lodestream", "numpy", "pathlib")) == []
 
 
 @pytest.mark.usefixtures("interrupts")

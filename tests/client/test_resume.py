@@ -418,3 +418,14 @@ def test_a_link_in_the_folder_is_not_followed(
     assert code == 0, stderr
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
     assert victim.read_bytes() == b"of somebody else"
+
+
+def test_a_folder_that_cannot_be_used_is_named(
+    run: Run, surface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LODESTREAM_CACHE", str(tmp_path / "file"))
+    code, _, stderr = run("pull", surface, tmp_path / "o.npy", "--resume")
+    assert code == 1
+    assert f"LODESTREAM_CACHE), got {tmp_path / 'file'}: " in stderr
+    assert "without --resume" in stderr

@@ -172,6 +172,16 @@ def test_holes_are_noted(run: Run, server: str, files: Path, tmp_path: Path) -> 
     assert "holes" not in run("encode", files / "wing.fmt", tmp_path / "wing.lode")[2]
 
 
+def test_values_at_holes_are_told(run: Run, server: str, files: Path, tmp_path: Path) -> None:
+    note = "values of attributes at 250 holes of the points left out: intensity, ring"
+    code, _, err = run("encode", files / "scan.pcd", tmp_path / "scan.lode")
+    assert (code, err.count(f"lodestream: {note}\n")) == (0, 1)
+    code, out, err = run("push", files / "scan.pcd", server)
+    assert (code, err.count(f"lodestream: {note}\n")) == (0, 1)
+    assert json.loads(run("info", out.strip(), "--json")[1])["metadata"]["notes"] == [note]
+    assert sync.upload(server, files / "scan.pcd").details["metadata"]["notes"] == [note]
+
+
 def test_what_a_reader_notes_is_told_by_push_and_encode(run: Run, server: str, tmp_path: Path) -> None:
     volume = np.stack(np.meshgrid(np.arange(3.0), np.arange(5.0), np.arange(4.0) ** 2, indexing="ij"))
     (tmp_path / "box.fmt").write_text("4 5 3\n" + " ".join(map(repr, volume[::-1].ravel().tolist())) + "\n")

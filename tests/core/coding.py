@@ -88,7 +88,6 @@ def header_for(layout: Layout, channels: int) -> Header:
         lattices=(Lattice("affine", 0.0, 1.0),) * channels,
         predictors=np.stack([default_predictors(layout)] * channels),
         extent=1.0,
-        fraction=0,
         empty=(0,) * channels,
         tile=layout.tile,
         exact=False,

@@ -56,7 +56,6 @@ def _samples() -> dict[str, tuple[Points, tuple[bool, bool], float | None]]:
         "zeros": (zeros, (False, False), None),
         "pair": (np.array([[1.5, np.pi]], np.float32), (False, False), None),
         "terraces": (np.floor(terrain((70, 66), 2) / 15).astype(np.int16), (False, False), None),
-        "brief": (terrain((64, 65), 3).astype(np.float32), (False, True), 20.0),
     }
 
 

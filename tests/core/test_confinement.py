@@ -149,6 +149,36 @@ def test_calls_that_no_reader_needs_are_refused(tmp_path: Path) -> None:
 
 
 @has_seccomp
+@pytest.mark.parametrize("processes", [False, True])
+def test_nothing_is_changed_of_other_processes(processes: bool) -> None:
+    # Whoever may lower a limit of another process, or choose the signal that a pipe sends it, can end it.
+    limits, priority = "__import__('resource').prlimit", "os.setpriority(os.PRIO_PROCESS, {0}, 1)"
+    told = confined(
+        [
+            f"{limits}(os.getppid(), 7)",
+            f"{limits}(os.getpid(), 7) == {limits}(0, 7)",
+            "__import__('resource').setrlimit(7, (64, 64))",
+            "__import__('fcntl').fcntl(0, 8, os.getppid())",
+            "len(__import__('fcntl').fcntl(1, 1).to_bytes(4, 'big'))",
+            priority.format("os.getppid()"),
+            priority.format("0"),
+            "os.sched_setscheduler(os.getppid(), os.SCHED_BATCH, os.sched_param(0))",
+            "os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))",
+            "os.sched_setaffinity(os.getppid(), os.sched_getaffinity(0))",
+            "os.sched_setaffinity(0, os.sched_getaffinity(0))",
+        ],
+        processes=processes,
+    )
+    refused = "PermissionError 1"
+    assert told["found"] == [
+        *(refused, "True", "None"),
+        *(refused, "4"),
+        *(refused, refused, refused, refused),
+        *(refused, "None"),
+    ]
+
+
+@has_seccomp
 @has_landlock
 def test_processes_have_the_same_rights(tmp_path: Path) -> None:
     (tmp_path / "other").write_text("x")
@@ -200,6 +230,13 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
         *("allow", "error 1", "error 1", "allow")
     ]
     assert [verdict("prctl", 1, 9), verdict("prctl", 1, 0), verdict("prctl", 15, 0)] == [*("allow", "error 1", "allow")]
+    for name in ("prlimit64", "sched_setaffinity"):
+        assert [verdict(name, pid) for pid in (0, 77, 78, 1)] == ["allow", "allow", "error 1", "error 1"]
+        assert [verdict(name, pid, processes=True) for pid in (0, 78)] == ["allow", "error 1"]
+    # F_DUPFD, F_SETFL, F_SETOWN, F_GETOWN, F_SETSIG, F_SETOWN_EX
+    assert [verdict("fcntl", 1, command, 78) for command in (0, 4, 8, 9, 10, 15)] == [
+        *("allow", "allow", "error 1", "allow", "error 1", "error 1")
+    ]
     for name in {*seccomp._DENIED.split()} & calls.keys():
         assert verdict(name) == verdict(name, processes=True) == "error 1", name
     known = {*calls.values()}

@@ -22,7 +22,7 @@ from lodestream.reception import Reception
 
 from .surfaces import contained, figures, follow, index_of
 
-HEADER_START = len(sections.MAGIC) + 1
+HEADER_START = len(sections.SIGNATURE)
 
 
 def expected_views(container: bytes) -> list[tuple[tuple[int, int, int, float, float, bool], bytes]]:
@@ -34,7 +34,7 @@ def resection(container: bytes, change: Callable[[bytearray], None]) -> bytes:
     (frame,) = FrameReader().feed(container[: index_of(container).header.length])
     payload = bytearray(frame.payload)
     change(payload)
-    return sections.MAGIC + bytes([sections.VERSION]) + sections.section(sections.HEADER, bytes(payload))
+    return sections.SIGNATURE + sections.section(sections.HEADER, bytes(payload))
 
 
 def assert_equal(one: Index, other: Index) -> None:
@@ -55,7 +55,7 @@ def lying_header(shape: tuple[int, int], channels: int = 1, **changes: Any) -> b
     out.pack("d", changes.get("extent", 1.0))
     out.byte(changes.get("rule", 0))
     out.pack("dd", changes.get("origin", 0.0), changes.get("step", 1.0))
-    return sections.MAGIC + bytes([sections.VERSION]) + sections.section(sections.HEADER, bytes(out.data))
+    return sections.SIGNATURE + sections.section(sections.HEADER, bytes(out.data))
 
 
 @pytest.mark.parametrize(("name", "flips"), [("small", 400), ("noise", 350), ("torus", 100), ("constant", 250)])
@@ -169,14 +169,18 @@ def test_headers_with_bytes_missing_or_left_over_are_corrupt() -> None:
 
 def test_other_files_and_newer_versions_are_told_apart() -> None:
     container, _ = contained("small")
-    for other in (b"\x93NUMPY", b"II*\0", b"v 0 0 0\n", b"\x89LODE\n\n"):
+    for other in (b"\x93NUMPY", b"II*\0", b"v 0 0 0\n", b"\xf5LODE\n\n", b"\x89LODE\n\n", b"\x75LODE\r\n\0"):
         with pytest.raises(CorruptStreamError, match="expected a Lodestream container") as caught:
             Decoder().feed(other)
         assert caught.value.offset == 0
-    newer = sections.MAGIC + bytes([sections.VERSION + 1]) + container[HEADER_START:]
-    for read in (Decoder().feed, index_of):
-        with pytest.raises(UnsupportedVersionError, match=f"{sections.VERSION}.*{sections.VERSION + 1}"):
-            read(newer)
+    others = {
+        sections.MAGIC + bytes([sections.VERSION + 1]): "got version 1$",
+        b"\x89LODE\r\n\3": "got version 3 of an",
+    }
+    for start, words in others.items():
+        for read in (Decoder().feed, index_of):
+            with pytest.raises(UnsupportedVersionError, match=f"expected .* version {sections.VERSION}, .*, {words}"):
+                read(start + container[HEADER_START:])
     header = index_of(container).header.length
     with pytest.raises(UnsupportedVersionError, match="kind 100"):
         Decoder().feed(container[:header] + sections.section(100, b"must be understood"))

@@ -178,7 +178,7 @@ def test_errors_never_rise_from_layer_to_layer_and_end_at_nothing(name: str) -> 
         assert (index.levels[-1].rms, index.levels[-1].max_error) == (0.0, 0.0)
         assert index.exactness is not None or rms[-1] == 0.0
     else:
-        assert name in ("precision", "brief")
+        assert name == "precision"
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -193,12 +193,12 @@ def test_framing_costs_little(name: str) -> None:
     assert index.header.length <= 256
 
 
-@pytest.mark.parametrize("kind", ["small", "brief", "for one error", "noise"])
+@pytest.mark.parametrize("kind", ["small", "precision", "for one error", "noise"])
 def test_progress_rises_to_one(kind: str) -> None:
     told: list[float] = []
     if kind == "small":
         ls.encode(terrain((40, 40)), progress=told.append)
-    elif kind == "brief":
+    elif kind == "precision":
         ls.encode(terrain((70, 70)), 20.0, progress=told.append)
     elif kind == "for one error":
         ls.encode(terrain((70, 70)), rms=1.0, progress=told.append)
@@ -266,13 +266,17 @@ def test_a_precision_leaves_attributes_as_they_are() -> None:
     assert not index_of(container).header.exact
 
 
-def test_planes_and_fraction_together_fit_a_coefficient() -> None:
+def test_pictures_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
+    """Their coefficients and nodes reach what pictures in eighths of a step are kept within."""
     rng = np.random.default_rng(8)
-    for bits in (3, 10, 17, 23):
-        points = rng.choice([-(2**bits), 2**bits], (70, 90))
-        header = index_of(assert_comes_back(points)).header
-        planes = max(segment.top for segment in index_of(ls.encode(points)).segments)
-        assert planes + header.fraction <= 28
+    points = rng.choice([-(2**23), 0, 1, 2**23 - 1], (70, 90), p=[0.45, 0.05, 0.05, 0.45])
+    assert index_of(assert_comes_back(points)).header.lattices[0].step == 1
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(points))
+    assert len(decoder.layers) > 5
+    assert max(segment.top for segment in index_of(ls.encode(points)).segments) == 26
+    for view in decoder.layers:
+        assert (view.rms, view.max_error) == pytest.approx(errors(view.points, points), rel=1e-9)
 
 
 @pytest.mark.parametrize("precision", [None, 0.5])

@@ -79,6 +79,12 @@ def test_the_extremes_of_64_bits_come_back(dtype: str) -> None:
     assert_comes_back(original, original[::-1])
 
 
+def test_a_difference_whose_magnitude_has_64_bits_comes_back() -> None:
+    original, restored = np.arange(40), np.arange(40)
+    original[7], restored[7] = 0, np.iinfo(np.int64).min
+    assert_comes_back(original, restored)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_equal_values_need_nothing(dtype: str) -> None:
     values = np.arange(12).astype(dtype)

@@ -16,10 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream import formats
+import lodestream as ls
+from lodestream import formats, losses
 from lodestream.errors import FormatWarning
 from lodestream.heights import coordinates, to_xyz
-from lodestream.surface import Surface
+from lodestream.surface import Block, Surface
 
 Array = NDArray[Any]
 
@@ -330,3 +331,55 @@ def test_names_from_a_file_make_no_long_notes(tmp_path: Path) -> None:
     _, notes = noted(lambda: formats.read(tmp_path / "a.npz"))
     assert len(notes) == 1
     assert notes[0].endswith(" and 289 more")
+
+
+LONG_NAME = f"a {'b' * 55}..."
+
+
+def at_holes(kind: str) -> Surface:
+    """A surface of which nothing is said at holes, but for what the kind names."""
+    points = np.stack([*np.mgrid[:4, :5], np.zeros((4, 5))], axis=-1)
+    mask = np.ones((4, 5), np.bool_)
+    mask[1, 2:4] = mask[3, 0] = False
+    heat = np.where(mask, 1.5, np.nan)
+    flow = np.where(mask[..., np.newaxis], np.ones((4, 5, 3)), 0)
+    count = np.where(mask, 7, -9).astype(np.int16)
+    metadata = {"nodata": -9}
+    if kind == "heat":
+        heat[1, 2] = 2
+    elif kind == "flow and heat":
+        heat[1, 2], flow[1, 2:4, 1], flow[3, 0] = 2, 3, np.inf
+    elif kind == "count":
+        metadata = {}
+    elif kind == "channels":
+        points = np.concatenate([points, np.where(mask, 0, 4)[..., np.newaxis]], axis=-1)
+    attributes: dict[str, Array] = {"heat": heat, "flow": flow, "count": count}
+    if kind == "kept":
+        points[1, 2, 0], heat[1, 2] = np.inf, 2
+    elif kind == "names":
+        attributes = {f"a\n{'b' * 80}{number}": np.ones((4, 5)) for number in range(14)}
+    one = Block(points, mask=mask, attributes=attributes)
+    return Surface(blocks=[one, Block(points[:, ::-1], attributes=attributes)], metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("kind", "note"),
+    [
+        ("nothing", None),
+        ("kept", None),
+        ("heat", "values of attributes at 1 hole of the points left out: heat"),
+        ("flow and heat", "values of attributes at 3 holes of the points left out: heat, flow"),
+        ("count", "values of attributes at 3 holes of the points left out: count"),
+        ("channels", "values of attributes at 3 holes of the points left out: channels beyond the third"),
+        ("names", f"values of attributes at 3 holes of the points left out: {', '.join(12 * [LONG_NAME])} and 2 more"),
+    ],
+)
+def test_values_at_holes_are_told_by_whoever_encodes(kind: str, note: str | None) -> None:
+    surface = at_holes(kind)
+    container, notes = noted(lambda: ls.encode(surface))
+    assert notes == ([] if note is None else [note])
+    assert losses.at_holes(surface) == note
+    # What is told is what is lost, and nothing is lost of what comes back.
+    back, notes = noted(lambda: ls.decode(container))
+    assert notes == []
+    assert noted(lambda: ls.encode(back))[1] == []

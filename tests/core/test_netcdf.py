@@ -346,3 +346,29 @@ def test_a_netcdf_without_its_libraries_says_what_to_install(tmp_path: Path, mon
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
         formats.read(path)
+
+
+@pytest.mark.parametrize("kind", ["classic", "4"])
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (SystemError, "<built-in method read> returned NULL without setting an exception"),
+        (RuntimeError, ""),
+        (OSError, " "),
+        (RuntimeError, "Unspecified error in H5Dread (return value <0)"),
+    ],
+)
+def test_a_library_that_does_not_say_why_has_not_refused_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception], words: str, kind: str
+) -> None:
+    path = save(tmp_path / "a.nc", {"z": (("y", "x"), hills())}, kind)
+    said = [error(words), RuntimeError("expected a whole chunk")]
+
+    def fail(*args: Any, **options: Any) -> None:
+        raise said.pop(0)
+
+    monkeypatch.setattr(xarray.Variable, "isel", fail)
+    with pytest.raises(UnavailableError, match=f"got {error.__name__}: they may have had too little memory"):
+        formats.read(path)
+    with pytest.raises(FormatError, match="expected a whole chunk"):
+        formats.read(path)

@@ -244,7 +244,8 @@ def test_heights_given_as_xyz_take_hardly_more_bytes(name: str, dtype: str) -> N
     heights = np.where(valid_of(surface), surface.points, np.nan).astype(dtype)
     points = to_xyz(Surface(heights, metadata=surface.metadata)).points.astype(dtype)
     plain, placed = (ls.encode(Surface(array)) for array in (heights, points))
-    assert len(placed) <= len(plain) + 64
+    # The rules of x and y, and a layer more or less: errors are relative to another extent.
+    assert len(placed) <= len(plain) + 96
     back = ls.decode(placed)
     assert back.dtype == points.dtype
     np.testing.assert_array_equal(back.points, points)

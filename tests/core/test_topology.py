@@ -27,6 +27,9 @@ from lodestream.sides import LatticeBlock
 from .layouts import layouts, overlapping, tubes
 from .meshes import collapse, grid_faces
 
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
 #: Number of vertices and the faces, or edges, over them, in the order of the file.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
+import signal
 import struct
 import tempfile
 from pathlib import Path
@@ -16,7 +18,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
+from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError, UnavailableError
+from lodestream.formats import vtk_grids
 from lodestream.mesh.cells import unpack_cells
 
 pytest.importorskip("vtkmodules")
@@ -238,6 +241,39 @@ def test_an_xml_file_that_lies_is_refused(tmp_path: Path, content: bytes, messag
     (tmp_path / "g.vts").write_bytes(content)
     with pytest.raises(FormatError, match=message):
         formats.read(tmp_path / "g.vts")
+
+
+_GRID = {
+    "dims": [3, 2, 1],
+    "arrays": [{"role": "points", "name": "", "dtype": "<f8", "shape": [6, 3]}],
+    "left_out": [],
+    "words": {},
+}
+_BEGUN = f"print({json.dumps({'grids': [_GRID]})!r}, flush=True)"
+
+_DEATHS = {
+    **{
+        number.name: (f"os.kill(os.getpid(), {int(number)})", signal.strsignal(number))
+        for number in (signal.SIGKILL, signal.SIGTERM, signal.SIGXCPU, signal.SIGABRT, signal.SIGSEGV, signal.SIGBUS)
+    },
+    "no memory": ("raise MemoryError", "exit code 1"),
+    "no word": ("pass", "exit code 0"),
+    "half a line": ("sys.stdout.write('{')", "exit code 0"),
+    "no points": (_BEGUN, "exit code 0"),
+    "half the points": (f"{_BEGUN}; sys.stdout.buffer.write(bytes(70)); sys.stdout.flush(); os.abort()", "Aborted"),
+}
+
+
+@pytest.mark.parametrize(("death", "words"), _DEATHS.values(), ids=_DEATHS)
+def test_a_reader_that_ends_has_not_refused_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, death: str, words: str
+) -> None:
+    script, path = tmp_path / "reader.py", tmp_path / "a.vts"
+    script.write_text(f"import os, signal, sys\n{death}\n")
+    path.write_bytes(appended(len(RAW)))
+    monkeypatch.setattr(vtk_grids, "_SCRIPT", script)
+    with pytest.raises(UnavailableError, match=rf"ended before it had answered \({words}\); it may take \d+ MiB and"):
+        formats.read(path)
 
 
 def test_an_xml_file_that_promises_too_much_is_refused(tmp_path: Path) -> None:

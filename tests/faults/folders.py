@@ -7,6 +7,7 @@ These are the only lines of the harness that know how a folder is laid out (docs
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -21,9 +22,11 @@ from tests.server.helpers import hills, npy
 
 from .oracle import Ledger, Talk
 from .programs import Programs, Server
+from .shim import Fault
 
 __all__ = ["DAMAGES", "Folder", "Made"]
 
+_ALWAYS = 1 << 31
 _NOBODY = "0123456789abcdef" * 2
 
 
@@ -97,7 +100,8 @@ def _mixed(programs: Programs, folder: Folder) -> Folder:
         for surface in (_push(talk, hills(12, 11, seed=1), closed="none"), _push(talk, None)):
             talk.quiet(surface)
     with ExitStack() as held:
-        # The processes that build need longer to begin than this server lives.
+        # A build that finds the disk full waits in the queue for as long as this server lives.
+        held.enter_context(programs.shim.failing(Fault("mkdir", "work/ID", 0, "ENOSPC", times=_ALWAYS)))
         talk = _serve(programs, folder, held)
         for seed in (5, 6):
             queued = _push(talk, hills(12, 11, seed=seed))
@@ -133,7 +137,8 @@ def _container(folder: Folder, number: int) -> Path:
 
 
 def _upload(folder: Folder) -> Path:
-    return folder.data / "uploads" / _surface(folder, 0) / "0"
+    record = json.loads((folder.data / "records" / f"{_surface(folder, 0)}.json").read_bytes())
+    return folder.data / "uploads" / str(record["upload"]) / "0"
 
 
 def _flip(path: Path) -> None:

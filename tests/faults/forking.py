@@ -1,22 +1,31 @@
 """Commands of ``lodestream`` in processes that are forked from one that has imported everything.
 
-A case that needs a server, or fsck, of its own then begins in milliseconds. Each line of standard input is an order in
-JSON, answered by one line: ``{"run": [arguments], "log": path}`` with ``{"pid": n}``, and ``{"wait": n, "seconds": s}``
-with ``{"code": exit code}``, null where the process goes on.
+A case that needs a server, or fsck, of its own then begins in milliseconds. So does its first build: its fork server is
+forked from here too, where the kernels are loaded, and from then on is what it always is.
+
+Each line of standard input is an order in JSON, answered by one line: ``{"run": [arguments], "log": path}`` with
+``{"pid": n}``, and ``{"wait": n, "seconds": s}`` with ``{"code": exit code}``, null where the process goes on.
 """
 
 from __future__ import annotations
 
 import ctypes
 import faulthandler
+import gc
 import json
 import os
 import signal
+import socket
+import subprocess
 import sys
+import threading
 import time
 import traceback
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
+
+from lodestream_server import forkserver, jobs, processes, worker
 
 __all__ = ["DIED", "main"]
 
@@ -25,6 +34,7 @@ DIED = 70
 
 _MODULES = (
     "lodestream_client.__main__",
+    "lodestream_client.program",
     "lodestream_server.app",
     "lodestream_server.fsck_command",
     "lodestream_server.repair",
@@ -35,7 +45,74 @@ _MODULES = (
 )
 _EACH = 0.005
 
+# A command that has one of these words among its arguments may build.
+_BUILDING = {"serve", "--adopt", "--repair", "--retry"}
+
 _PR_SET_PDEATHSIG = 1
+
+
+class _Forked:
+    """A fork server that was forked from this process, with what is asked of one that `subprocess` has started.
+
+    Attributes
+    ----------
+    pid : int
+    control : socket
+        Over which it is asked for processes.
+    """
+
+    def __init__(self) -> None:
+        self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._code: int | None = None
+        self._lock = threading.Lock()
+        self.pid = os.fork()
+        if not self.pid:
+            try:
+                self.control.close()
+                sys.argv[1:] = [str(theirs.detach()), ""]
+                forkserver.main()
+            finally:
+                os._exit(0)
+        theirs.close()
+
+    def poll(self) -> int | None:
+        """Its exit code, once it has ended."""
+        with self._lock:
+            if self._code is None:
+                ended, status = os.waitpid(self.pid, os.WNOHANG)
+                self._code = os.waitstatus_to_exitcode(status) if ended else None
+            return self._code
+
+    def kill(self) -> None:
+        """Kill it, unless it has ended."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Its exit code, when it has ended.
+
+        Raises
+        ------
+        subprocess.TimeoutExpired
+        """
+        until = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if timeout is not None and until is not None and time.monotonic() >= until:
+                raise subprocess.TimeoutExpired("the fork server", timeout)
+            time.sleep(_EACH)
+        return code
+
+
+class _ForkServer(processes.ForkServer):
+    """Has one fork server already; when that has died, it starts another as it always does."""
+
+    def __init__(self, warm: Callable[[], object] | None, forked: _Forked) -> None:
+        super().__init__(warm)
+        self._forked: Any = forked
+
+    def _start(self) -> Any:
+        forked, self._forked = self._forked, None
+        return super()._start() if forked is None else processes._Started(forked, forked.control)
 
 
 def main() -> None:
@@ -43,12 +120,14 @@ def main() -> None:
     # Now, not in each process.
     for module in _MODULES:
         import_module(module)
-    # The processes of builds are asked by the shim whether their calls are to fail; nothing else is told to them.
-    processes: Any = import_module("lodestream_server.processes")
-    processes._ENVIRONMENT += ("LODE_FAULT_CONTROL",)
-    # What shim.c asks for: from which lines a call comes. The file stays open as long as the process lives.
-    calls = open(os.environ["LODE_FAULT_CALLS"], "a")  # noqa: SIM115
-    faulthandler.register(signal.SIGUSR2, calls, all_threads=False)
+    worker.warm()
+    gc.collect()
+    gc.freeze()  # or the first collection in each process would copy every page
+    # A fork server that is started anew belongs to the shim, too.
+    shim: Any = processes
+    shim._ENVIRONMENT += ("LODE_FAULT_CONTROL", "LODE_FAULT_CALLS")
+    # What shim.c asks for: from which lines a call comes. The processes of builds keep this file open, and no other.
+    faulthandler.register(signal.SIGUSR2, ctypes.CDLL(None).lode_calls(), all_threads=False)
     for line in sys.stdin:
         order = json.loads(line)
         answer = _run(order["run"], order["log"]) if "run" in order else _wait(order["wait"], order["seconds"])
@@ -82,6 +161,11 @@ def _be(arguments: list[str], log: str) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for theirs, ours in ((nothing, 0), (said, 1), (said, 2)):
         os.dup2(theirs, ours)
+    if _BUILDING.intersection(arguments):
+        # Forked while this process has one thread.
+        forked = _Forked()
+        names: Any = jobs
+        names.ForkServer = lambda warm: _ForkServer(warm, forked)
     return main(arguments)
 
 

@@ -260,9 +260,9 @@ class Talk:
 
 
 def contents(folder: Path, *, without: tuple[str, ...] = ()) -> Counter[str]:
-    """The hashes of all files beneath a folder, and how many files have each; some folders in it may be left out."""
+    """The hashes of all files beneath a folder, and how many files have each; without some names."""
     return Counter(
         hashlib.sha256(path.read_bytes()).hexdigest()
         for path in folder.rglob("*")
-        if path.is_file() and path.relative_to(folder).parts[0] not in without
+        if path.is_file() and not set(without).intersection(path.relative_to(folder).parts)
     )

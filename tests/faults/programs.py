@@ -24,6 +24,9 @@ __all__ = ["PATIENCE", "Program", "Programs", "Server"]
 #: The longest that anything may take, in seconds: what takes longer hangs.
 PATIENCE = 60.0
 
+# A process from which others are forked has one thread.
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "NUMBA", "OMP", "OPENBLAS")}
+
 _LISTENING = re.compile(r"Lodestream serving (http://\S+)")
 
 
@@ -47,7 +50,7 @@ class Programs:
         self.shim = Shim(library(folder), folder / "page")
         # A program without a file: a process that is spawned from it would import that file again.
         command = [sys.executable, "-c", "from tests.faults.forking import main; main()"]
-        environment = {**self.shim.environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        environment = self.shim.environment() | _ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
         )

@@ -145,7 +145,8 @@ class Rest:
         *,
         fails: bool,
     ) -> None:
-        everything, precious = contents(folder.data), contents(folder.data, without=("records", "lock"))
+        # A marker says only where its folder belongs, and --adopt changes it.
+        everything, precious = contents(folder.data), contents(folder.data, without=("records", "lock", "identity"))
         with fault:
             first = self._programs.run("fsck", str(folder.data), *options)
         self._note()

@@ -49,8 +49,8 @@
 
 /* What lies in the folder itself; the first is the folder, the last whatever has another name. */
 #define TOPS(X) \
-    X("") X("lock") X("tokens.json") X("records") X("uploads") X("containers") X("incoming") X("work") X("damaged") \
-    X("other")
+    X("") X("lock") X("tokens.json") X("records") X("uploads") X("containers") X("incoming") X("work") X("levels") \
+    X("damaged") X("other")
 
 /* Itself; below it what is called by an id, by another name, or is being written; below that a number, another name. */
 #define KINDS(X) X("") X("/ID") X("/name") X("/*.new") X("/*/N") X("/*/name")
@@ -74,7 +74,7 @@ static const char *const kind_names[] = {KINDS(X)};
 #undef X
 
 #define TOP_COUNT ((int)(sizeof top_names / sizeof *top_names))
-#define PLACE_COUNT (10 * KIND_COUNT)
+#define PLACE_COUNT (11 * KIND_COUNT)
 _Static_assert(sizeof top_names / sizeof *top_names * KIND_COUNT == PLACE_COUNT, "one place for each top and kind");
 
 /* ---- the page; tests/faults/shim.py has the same ---- */
@@ -101,6 +101,9 @@ static int calls = -1; /* the file of calls */
 
 /* For tests/faults/shim.py, which loads this library to ask for names. */
 extern const char *lode_call(int number);
+/* For tests/faults/forking.py, whose processes write from which lines a call comes into the same file. */
+extern int lode_calls(void);
+int lode_calls(void) { return calls; }
 extern const char *lode_place(int number);
 extern size_t lode_size(void);
 const char *lode_call(int number) { return number < CALL_COUNT ? call_names[number] : NULL; }
@@ -476,8 +479,23 @@ HANDLE_CALL(STATVFS, int, fstatvfs64, (int handle, struct statvfs64 *status), (h
 HANDLE_CALL(STATVFS, int, fstatfs, (int handle, struct statfs *status), (handle, status), handle)
 HANDLE_CALL(STATVFS, int, fstatfs64, (int handle, struct statfs64 *status), (handle, status), handle)
 
+/* The file of calls stays open where a process that begins a build closes everything that it has not been given. */
+extern int close_range(unsigned int first, unsigned int last, int flags);
+int close_range(unsigned int first, unsigned int last, int flags)
+{
+    REAL(close_range);
+    unsigned int kept = (unsigned int)calls;
+    if (calls < 0 || kept < first || kept > last)
+        return real(first, last, flags);
+    if (kept > first && real(first, kept - 1, flags) != 0)
+        return -1;
+    return kept < last ? real(kept + 1, last, flags) : 0;
+}
+
 int close(int handle)
 {
+    if (handle >= 0 && handle == calls)
+        return 0;
     REAL(close);
     int fault = handle_fault(CALL_CLOSE, handle);
     int result = real(handle);

@@ -117,6 +117,7 @@ def _simple() -> dict[str, Original]:
     own = np.random.default_rng(2006)
     offsets = np.repeat(np.repeat(own.random((9, 8)), 8, 0), 8, 1)[:66]
     quantised = 0.3 * (np.rint(np.cumsum(5 * own.normal(size=(66, 64)), 1)) + offsets) + 20
+    widest = np.random.default_rng(2007).choice([-(2**23), 0, 1, 2**23 - 1], (50, 56), p=[0.45, 0.05, 0.05, 0.45])
     tower = np.zeros((9, 9), np.float32)
     tower[4, 4] = 1
     return {
@@ -132,6 +133,7 @@ def _simple() -> dict[str, Original]:
         "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
         "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
         "heights-offsets": Original(ls.Surface(quantised.astype(np.float32))),
+        "heights-widest": Original(ls.Surface(widest.astype(np.int32))),
         "heights-tower": Original(ls.Surface(tower)),
         "planar-open": Original(ls.Surface(_torus(13, 11)[..., :2].astype(np.float32))),
         "torus-odd": Original(ls.Surface(_torus(21, 33).astype(np.float32), (True, True))),
@@ -178,33 +180,12 @@ def _not_finite() -> dict[str, Original]:
     blocks = _cut(_terrain(24, 31), [0, 9, 23], [0, 30])
     for block, place in zip(blocks, (np.s_[9, 4:7, 2], np.s_[0, 4:7, 2]), strict=True):
         block[place] = -np.inf
-    steps = np.floor(10 * _wave(66, 64)).astype(np.float32)
-    steps[3:5, 7:20], steps[30, 30:40] = np.inf, np.nan
     return {
         "infinite-heights": Original(ls.Surface(heights)),
         "infinite-points": Original(ls.Surface(points, (True, True), attributes=named)),
         "infinite-plane": Original(ls.Surface(plane)),
         "infinite-blocks": Original(_blocks(blocks)),
-        "infinite-brief": Original(ls.Surface(steps)),
         "infinite-error": Original(ls.Surface(heights), rms="1e-2d"),
-    }
-
-
-def _terraces() -> dict[str, Original]:
-    """Heights in steps, which cost least by their neighbours, and rough ones at a wide precision."""
-    rng = np.random.default_rng(2005)
-    y, x = np.mgrid[:66, :64] / 20.0
-    hills = 2 * np.sin(1.1 * x + 0.3) * np.cos(0.9 * y) + np.sin(2.3 * x - 1.7 * y) + 0.03 * rng.normal(size=x.shape)
-    turn = 2 * np.pi * np.arange(64) / 64
-    around = np.sin(turn + y) + 0.3 * np.cos(2 * turn - 2 * y) + 0.01 * rng.normal(size=x.shape)
-    lake = (np.hypot(y - 1, x - 2) < 0.5) | (rng.random(x.shape) < 0.01)
-    metres = (5 * np.floor(10 * hills)).astype(np.int16)
-    metres[lake] = -32768
-    return {
-        "terraces-uint8": Original(ls.Surface((np.floor(10 * hills) + 100).astype(np.uint8))),
-        "terraces-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -32768})),
-        "terraces-decimal": Original(ls.Surface(np.round(np.floor(30 * around) / 10, 1), (False, True))),
-        "terraces-precision": Original(ls.Surface((hills + rng.normal(size=x.shape)).astype(np.float32)), "2e-2d"),
     }
 
 
@@ -325,7 +306,6 @@ def _made_for_an_error() -> dict[str, Original]:
         "error-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -9999}), rms="5"),
         "error-attributes": Original(ls.Surface(_torus(48, 51), (True, True), attributes=colors), rms="2e-3d"),
         "error-blocks": Original(_blocks(_cut(globe, [0, 16], [0, 9, 24])), rms="1e-3d"),
-        "error-brief": Original(ls.Surface(np.rint(40 * _wave(150, 290)).astype(np.int16)), rms="0.1"),
         "error-curve": Original(ls.Surface(_torus(1, 90)[0][:, None], (True, False)), rms="1e-3d"),
     }
 
@@ -337,7 +317,6 @@ def originals() -> dict[str, Original]:
         **_simple(),
         **_with_holes(),
         **_not_finite(),
-        **_terraces(),
         **_with_attributes(),
         **_planes(),
         **_arrangements(),

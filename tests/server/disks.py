@@ -11,7 +11,7 @@ from lodestream_server.durable import Disk
 
 T = TypeVar("T")
 
-__all__ = ["CountingDisk", "FullDisk", "LosingDisk"]
+__all__ = ["CountingDisk", "FullDisk", "LosingDisk", "StickyDisk"]
 
 
 class CountingDisk(Disk):
@@ -77,6 +77,25 @@ class FullDisk(CountingDisk):
         super().ask(step)
         if number == self._step or (self._lasting and number > self._step):
             raise OSError(errno.ENOSPC, "No space left on device")
+
+
+class StickyDisk(Disk):
+    """A disk that removes nothing beneath some folders."""
+
+    def __init__(self, *folders: Path) -> None:
+        self._folders = folders
+
+    def unlink(self, path: Path) -> None:
+        self._ask(path)
+        super().unlink(path)
+
+    def remove_folder(self, path: Path) -> None:
+        self._ask(path)
+        super().remove_folder(path)
+
+    def _ask(self, path: Path) -> None:
+        if any(path.is_relative_to(folder) for folder in self._folders):
+            raise OSError(errno.EIO, "Input/output error")
 
 
 class _Node:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import hashlib
 import json
 import mmap
@@ -92,6 +93,11 @@ def escape(job: Job) -> Built | Refused:
         "start a thread": lambda: threading.Thread(target=int).start(),
         "signal the parent": lambda: os.kill(os.getppid(), 0),
         "signal everybody": lambda: os.kill(-1, 0),
+        "signal the parent by a pipe": lambda: fcntl.fcntl(os.pipe()[0], fcntl.F_SETOWN, os.getppid()),
+        "limit the parent": lambda: resource.prlimit(os.getppid(), resource.RLIMIT_CORE, (0, 0)),
+        "slow the parent down": lambda: os.setpriority(os.PRIO_PROCESS, os.getppid(), 1),
+        "slow everybody down": lambda: os.setpriority(os.PRIO_USER, 0, 1),
+        "come before others": lambda: os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0)),
         "leave the group": os.setsid,
         "share memory": lambda: mmap.mmap(-1, 4096),
         "make memory a file": lambda: os.memfd_create("x"),

@@ -179,7 +179,7 @@ def main() -> None:
     """Serve until told to end."""
     from lodestream_server import Settings, worker
     from lodestream_server.logs import configure
-    from lodestream_server.running import make_server
+    from lodestream_server.running import serve_alone
     from tests.server import slow
 
     settings = Settings(**json.loads(sys.argv[1]))
@@ -187,7 +187,7 @@ def main() -> None:
     worker.warm = slow.warm_heights  # other kinds of surfaces do not come
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
-    make_server(settings, lambda address: print(address, flush=True)).run()
+    serve_alone(settings, lambda address: print(address, flush=True))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ __all__ = [
     "end_once",
     "explode",
     "explode_later",
+    "find_full",
     "full_at_each_step",
     "hoard",
     "hoard_level",
@@ -246,6 +247,11 @@ def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
         (job.folder / "level").write_bytes(b"half")
         os.kill(os.getpid(), signal.SIGKILL)
     return make_level(job)
+
+
+def find_full(job: Job) -> Built | Refused:
+    """Find the disk full."""
+    raise OSError(errno.ENOSPC, "no space left", str(job.folder))
 
 
 def raise_full(job: LevelJob) -> MadeLevel | RefusedLevel:

@@ -8,14 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO
 
+import httpx
 import pytest
 
 from lodestream import encode
 from lodestream.container import Index
-from lodestream_server import containers
+from lodestream_server import containers, running_server
 from lodestream_server.containers import Containers
+from lodestream_server.problems import BusyError
 from lodestream_server.storage import Storage
-from tests.server.helpers import hills
+from tests.server.helpers import hills, kept, push
 
 
 @pytest.fixture
@@ -51,6 +53,47 @@ def test_no_more_indexes_are_kept_than_are_worth_it(names: list[str]) -> None:
     for name in names:
         made.open(name).close()
     assert _indexes() - before == containers._INDEXES_KEPT
+
+
+def test_nor_more_than_so_many_bytes_of_them(names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Containers(Storage.__new__(Storage))
+    with made.open(names[0]).file as file:
+        each = containers.index_memory(file)
+    assert each > 1000
+    monkeypatch.setattr(containers, "_BYTES_KEPT", 3 * each + 1)
+    before = _indexes() - 1
+    for name in names:
+        made.open(name).close()
+    assert _indexes() - before == 3
+
+
+def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(names: list[str]) -> None:
+    with Containers(Storage.__new__(Storage)).open(names[0]).file as file:
+        each = containers.index_memory(file)
+    made = Containers(Storage.__new__(Storage), 5 * each)
+    for name in names[5:20]:  # what nobody has open any more is in nobody's way
+        made.open(name).close()
+    held = [made.open(name) for name in names[:5]]
+    with pytest.raises(BusyError, match="indexes of all surfaces that are streamed"):
+        made.open(names[5])
+    again = made.open(names[0])
+    assert again.index is held[0].index
+    again.close()
+    held.pop().close()
+    gc.collect()
+    held.append(made.open(names[5]))
+    for opened in held:
+        opened.close()
+
+
+def test_a_container_whose_index_takes_too_much_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(containers, "most_for_indexes", lambda: 1000)
+    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        surface = push(http, encode(hills()))
+        assert surface["state"] == "waiting"
+        assert "whose index takes at most" in surface["reason"]
+        assert kept(tmp_path, "containers") == []
+        assert len(kept(tmp_path, "uploads")) == 1
 
 
 def _indexes() -> int:

@@ -23,7 +23,7 @@ def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: P
         assert outcome.wrong == ()
         assert outcome.remains == ()
         assert outcome.hostile == len(crowd.BEHAVIOURS) * COUNT
-        assert outcome.health.late < 5
+        assert outcome.health.own < 1
         assert outcome.grown < 128 * 1024
         assert list((data / "incoming").iterdir()) == []
     log = running.log.read_text()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import io
+from contextlib import closing
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
+import anyio
 import httpx
 import numpy as np
 import pytest
@@ -158,6 +162,30 @@ def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any
         answer = http.get(surface["url"] + path)
         assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")
         assert words in answer.json()["detail"]
+
+
+def test_a_file_that_was_sent_and_cannot_be_closed_cuts_no_connection(
+    http: httpx.Client, surface: dict[str, Any], address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = anyio.AsyncFile.aclose
+
+    async def fail(file: anyio.AsyncFile[bytes]) -> None:
+        await close(file)
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(anyio.AsyncFile, "aclose", fail)
+    for path in (address, f"{surface['url']}/levels/2"):
+        whole = http.get(path).content
+        with closing(HTTPConnection(http.base_url.host, http.base_url.port or 80, timeout=60)) as connection:
+            connection.connect()
+            first = connection.sock
+            for headers in ({}, {"range": "bytes=0-9"}, {"range": "bytes=0-9,20-29"}, {}):
+                connection.request("GET", path, headers=headers)
+                answer = connection.getresponse()
+                assert answer.status in (200, 206)
+                got = answer.read()
+            assert got == whole
+            assert connection.sock is first
 
 
 def test_nothing_is_left_behind(http: httpx.Client, surface: dict[str, Any], data: Path) -> None:

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.container import sections
 from lodestream.errors import LodestreamError
-from lodestream_server import running_server
+from lodestream_server import jobs, running_server, worker
 from lodestream_server.fsck_command import register
 from lodestream_server.storage import Storage
-from tests.server.helpers import hills, npy, push, upload_of
+from tests.server import slow
+from tests.server.helpers import hills, npy, push, settled, upload_of
 
 Fsck = Callable[..., tuple[int, dict[str, Any]]]
 
@@ -71,6 +73,23 @@ def fsck(data: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Fsck]:
     assert code == bool(lost)
 
 
+def test_a_repair_ends_where_the_disk_stays_full(
+    data: Path, fsck: Fsck, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    container = data / "containers" / f"{surfaces[0]['container']}.lode"
+    flip(container, 100)
+    with monkeypatch.context() as full:
+        full.setattr(jobs, "_FIRST_DELAY", 0.01)
+        full.setattr(worker, "build", slow.find_full)
+        code, report = fsck("--repair")
+    assert code == 1
+    finding = next(finding for finding in report["findings"] if finding["surface"] == surfaces[0]["id"])
+    assert (finding["repaired"], finding["lost"]) == (False, False)
+    assert "room on the server's disk" in finding["repair"]
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        assert settled(http, surfaces[0]["url"])["container"] == surfaces[0]["container"]
+
+
 def flip(path: Path, place: int) -> None:
     bytes_ = bytearray(path.read_bytes())
     bytes_[place] ^= 1
@@ -86,6 +105,31 @@ def is_whole(data: Path, original: Path, *surfaces: dict[str, Any]) -> bool:
         if surface["container"]:
             names += [f"containers/{surface['container']}.lode"]
     return all((data / name).read_bytes() == (original / name).read_bytes() for name in names)
+
+
+@pytest.mark.parametrize("gone", [(), ("upload",), ("folder",), ("container",), ("upload", "container")], ids="-".join)
+def test_what_is_gone_is_not_counted(
+    fsck: Fsck, data: Path, surfaces: list[dict[str, Any]], capsys: pytest.CaptureFixture[str], gone: tuple[str, ...]
+) -> None:
+    one, *_ = surfaces
+    if "upload" in gone:
+        (upload_of(data, one) / "0").unlink()
+    if "folder" in gone:
+        shutil.rmtree(upload_of(data, one))
+    if "container" in gone:
+        (data / "containers" / f"{one['container']}.lode").unlink()
+    _, report = fsck()
+    uploads, containers = list(data.glob("uploads/*/0")), list(data.glob("containers/*.lode"))
+    assert (report["surfaces"], report["uploads"], report["containers"]) == (3, len(uploads), len(containers))
+    assert report["bytes"] == sum(path.stat().st_size for path in (*uploads, *containers))
+    what = {"folder": "upload"}
+    assert {(it["what"], it["surface"]) for it in report["findings"]} == {(what.get(it, it), one["id"]) for it in gone}
+    parser = argparse.ArgumentParser()
+    register(parser.add_subparsers())
+    args = parser.parse_args(["fsck", str(data)])
+    args.run(args)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith(f"3 surfaces, {len(uploads)} uploads, {len(containers)} containers, ")
 
 
 def state(data: Path, surface: dict[str, Any]) -> str:
@@ -109,7 +153,7 @@ def test_a_folder_in_order(fsck: Fsck, data: Path) -> None:
         ("gone", "No such file"),
         ("other", "expected bytes with the SHA-256 of the name"),
         ("empty", "expected bytes with the SHA-256 of the name"),
-        ("version", "version 0"),
+        ("version", "got version 7"),
     ],
 )
 def test_a_damaged_container_is_found(
@@ -125,9 +169,9 @@ def test_a_damaged_container_is_found(
     elif damage == "other":
         shutil.copy(data / "containers" / f"{two['container']}.lode", path)
     else:
-        start = len(b"\x89LODE\r\n")
-        older = whole[:start] + b"\0" + whole[start + 1 :]
-        path.write_bytes({"cut": whole[:-100], "longer": whole + b"\0", "empty": b"", "version": older}[damage])
+        start = len(sections.MAGIC)
+        other = whole[:start] + b"\7" + whole[start + 1 :]
+        path.write_bytes({"cut": whole[:-100], "longer": whole + b"\0", "empty": b"", "version": other}[damage])
     code, report = fsck()
     assert (code, report["clean"]) == (1, False)
     (finding,) = report["findings"]

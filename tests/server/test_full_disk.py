@@ -9,7 +9,7 @@ import pytest
 from lodestream_server import durable, jobs, worker
 from lodestream_server.storage import Storage
 from tests.server import slow
-from tests.server.disks import CountingDisk, FullDisk
+from tests.server.disks import CountingDisk, FullDisk, StickyDisk
 from tests.server.helpers import eventually, hills, kept, npy, push, settled
 from tests.server.test_builds import running
 from tests.torture import small_disk
@@ -137,6 +137,27 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.skipif(not small_disk.can_mount(), reason="no small disk can be mounted on this machine")
+def test_what_nobody_needs_any_more_may_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    passing = [data / name for name in ("incoming", "work", "levels")]
+    with running(data) as http:
+        monkeypatch.setattr(durable, "disk", StickyDisk(*passing))
+        first = push(http, npy(hills(seed=1)))
+        assert first["state"] == "ready"
+        again = http.post("/v1/surfaces", content=npy(hills(seed=1)))
+        assert (again.status_code, again.json()["id"]) == (200, first["id"])
+        assert push(http, npy(hills(seed=2))[:-1])["state"] == "failed"
+        assert http.post("/v1/surfaces", content=b"just some text").status_code == 422
+        assert http.get(f"{first['url']}/levels/1").status_code == 200
+        assert http.get(first["url"]).json() == first
+        assert http.delete(first["url"]).status_code == 204
+        assert http.get(first["url"]).status_code == 404
+        assert all(any(folder.iterdir()) for folder in passing)
+    monkeypatch.setattr(durable, "disk", durable.Disk())
+    with running(data):
+        assert not any(folder.exists() and any(folder.iterdir()) for folder in passing)
+
+
 def test_a_disk_that_is_really_small(tmp_path: Path) -> None:
     done = small_disk.run(tmp_path, 20, size="300k")
     assert min(done.uploads, done.refused, done.deletes, done.kept) > 0

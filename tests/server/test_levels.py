@@ -6,7 +6,7 @@ import asyncio
 import io
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -245,6 +245,26 @@ def test_callers_take_turns(tmp_path: Path, slowly: None, monkeypatch: pytest.Mo
         assert order.index(0) <= 2
 
 
+def test_a_level_that_another_waits_for_too_is_made_in_the_turn_of_either(tmp_path: Path, slowly: None) -> None:
+    file = TokenFile(tmp_path / "tokens.json")
+    one, two = (file.create(name, ("write",))[0] for name in ("one", "two"))
+    with running_server(tmp_path, workers=1) as url, client(url, one) as http, client(url, two) as other:
+        surface = push(http, npy(hills(90, 80)))
+        count = len(surface["levels"])
+        assert count >= 6
+        with ExitStack() as held:
+            asked = [*range(count - 1, count - 6, -1), 0]
+            for level in asked:
+                held.enter_context(asking(url, f"{surface['url']}/levels/{level}", one))
+                eventually(lambda: begun(tmp_path), "a level to begin")
+            threading.Timer(0.5, (tmp_path / "go").touch).start()
+            assert other.get(f"{surface['url']}/levels/0").status_code == 200
+            order = [level for _, level in eventually(lambda: _so_many(tmp_path, len(asked)), "all to be made")]
+        assert sorted(order) == sorted(asked)
+        assert order[0] == count - 1
+        assert order.index(0) <= 2
+
+
 def _so_many(data: Path, count: int) -> list[tuple[int, int]] | None:
     found = begun(data)
     return found if len(found) >= count else None
@@ -338,8 +358,8 @@ def files(folder: Path, most: int, free: int = 1 << 40) -> LevelFiles:
     return LevelFiles(folder, most, room)
 
 
-def put(made: LevelFiles, number: int, size: int, *, kept: bool = True) -> Any:
-    key = Key("a" * 64, number, "npy")
+def put(made: LevelFiles, number: int, size: int, *, kept: bool = True, container: str = "a" * 64) -> Any:
+    key = Key(container, number, "npy")
     folder = made.new_folder(key)
     folder.mkdir(parents=True)
     (folder / "level").write_bytes(bytes(size))
@@ -404,6 +424,23 @@ def test_files_of_a_container_that_is_gone_go_with_their_readers(tmp_path: Path)
         assert lease.path.exists()
         lease.release()
     assert (made.size, list(tmp_path.iterdir())) == (0, [])
+
+
+def test_a_container_may_go_while_room_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = files(tmp_path, 1000)
+    for number in range(2):
+        put(made, number, 200, container="b" * 64).release()
+    for number in range(3):
+        put(made, number, 200).release()
+
+    async def gone_meanwhile(function: Callable[..., None], path: Path) -> None:
+        function(path)
+        made.forget("b" * 64)
+
+    monkeypatch.setattr(asyncio, "to_thread", gone_meanwhile)
+    assert asyncio.run(made.make_room()) == 250
+    assert numbers(made) == {1, 2}
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_sizes_carry_units(text: str, size: int) -> None:
         ("port", 65536, "0 to 65535"),
         ("idle_seconds", "nan", "more than 0"),
         ("idle_seconds", "inf", "more than 0"),
-        ("build_memory", "1MiB", "at least 64MiB"),
+        ("build_memory", "64MiB", "at least 256MiB"),
         ("insecure", "perhaps", "yes or no"),
         ("log_format", "xml", "one of text, json"),
         ("root_path", "maps/", "begins with a slash"),

@@ -212,6 +212,7 @@ def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
         surface = push(http, npy(hills(12, 9)))
     assert surface["state"] == "ready"
     assert mode(data) == 0o700
+    assert mode(data / "lock") == 0o600
     files = [path for folder in ("records", "uploads", "containers") for path in (data / folder).rglob("*")]
     assert len(files) >= 5
     for path in files:

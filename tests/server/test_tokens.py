@@ -112,6 +112,15 @@ def test_a_file_of_something_else_allows_nobody_anything(path: Path, content: st
     assert path.read_text() == content
 
 
+def test_nothing_of_a_file_that_is_none_is_told(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"secret \xff" * 100_000)
+    with pytest.raises(LodestreamError, match="expected a file of tokens") as caught:
+        Tokens(path)
+    assert len(str(caught.value)) < 500
+    assert "secret" not in str(caught.value)
+
+
 def test_names_are_told_apart_and_missed(path: Path) -> None:
     TokenFile(path).create("one", ("read",))
     with pytest.raises(OptionError, match="'one'"):

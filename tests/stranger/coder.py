@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import mul
 
-from tests.stranger.tables import LOGISTIC, START_CHANCE, START_SURENESS
+from tests.stranger.tables import LOGISTIC
 
 BLOCK = 8
 MARGIN = 2  # zeros around a band's magnitudes, so that neighbours can be looked at without asking
@@ -104,21 +104,9 @@ class Model:
         return len(self._chance) - 1
 
 
-def model_of_unit() -> Model:
-    """Where the contexts of a unit start, and the weights of its two mixtures."""
-    return Model([256 * c + 128 for c in START_CHANCE], START_SURENESS, 2)
-
-
-#: Where the contexts of plane 0 begin, by whether the index is odd-sided: across, around.
-ACROSS, AROUND = len(START_CHANCE), len(START_CHANCE) + 400
-
-
-def model_of_indices() -> Model:
-    """The same of a unit of indices: behind all others the contexts of plane 0."""
-    more = [*range(200), *range(200), *range(400, 484), *range(400, 484)]
-    chances = [*START_CHANCE, *(START_CHANCE[number] for number in more)]
-    surenesses = [*START_SURENESS, *(min(START_SURENESS[number], 2) for number in more)]
-    return Model([256 * c + 128 for c in chances], surenesses, 6)
+#: Contexts of a unit, and where those of plane 0 begin in one of indices: across, around.
+CONTEXTS = 547
+ACROSS, AROUND = CONTEXTS, CONTEXTS + 400
 
 
 NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
@@ -203,7 +191,7 @@ class Unit:
     model: Model = field(init=False)
 
     def __post_init__(self) -> None:
-        self.model = model_of_indices() if self.indices else model_of_unit()
+        self.model = new_contexts(CONTEXTS + 568, 6) if self.indices else new_contexts(CONTEXTS, 2)
 
     def decode(self, top: int | None, passes: int, segment: bytes, most: int) -> None:
         """Takes the next segment of a unit that may have so many bit-planes at most."""

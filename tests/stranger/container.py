@@ -12,8 +12,8 @@ from tests.stranger.fields import DamagedError, Fields
 from tests.stranger.header import Header, read_header
 from tests.stranger.masks import Masks, read_masks
 
-MAGIC = b"\x89LODE\r\n"
-VERSION = 3
+MAGIC = b"\xf5LODE\r\n"
+VERSION = 0
 FOOTER_MAGIC = b"LODEEND\n"
 HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS = 1, 2, 3, 4, 5, 6, 7
 

@@ -12,8 +12,7 @@ from tests.stranger.exactness import restore
 from tests.stranger.header import Header
 from tests.stranger.layout import Levels, units_of
 from tests.stranger.masks import Masks
-from tests.stranger.neighbours import NEIGHBOURS, numbers_of
-from tests.stranger.picture import Arrays, Values, block_places, plane_value, put_together, rounded, value
+from tests.stranger.picture import EIGHTHS, Arrays, Values, block_places, plane_value, put_together, rounded, value
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Decoder:
         """Decodes the segments of one layer, or all those that the index names of one level."""
         self.named = level
         for segment in segments:
-            self.units[segment.unit].decode(segment.top, segment.passes, segment.data, 28 - self.header.fraction)
+            self.units[segment.unit].decode(segment.top, segment.passes, segment.data, 28)
         self.known.append(self._remaining())
 
     def whole(self, channel: int, level: int, remaining: list[int], complete: bool) -> int:
@@ -63,15 +62,14 @@ class Decoder:
     def _channel(self, channel: int, level: int, remaining: list[int], complete: bool) -> list[Values]:
         """The values of a channel, block by block."""
         header = self.header
-        scale = 2**header.fraction
         whole = self.whole(channel, level, remaining, complete)
         arrays = Arrays(header, self.levels, channel, level)
         for number in range(channel, len(self.units), header.channels):
             unit = self.units[number]
             if unit.level <= level and remaining[number] >= 0:
-                arrays.put(unit, remaining[number], scale if unit.level > whole else 1)
+                arrays.put(unit, remaining[number], EIGHTHS if unit.level > whole else 1)
         arrays.to_points(whole)
-        over = scale if whole < level else 1
+        over = EIGHTHS if whole < level else 1
         shown = []
         for block in range(len(header.blocks)):
             grid = put_together(header, self.levels, block, level, arrays.numbers)
@@ -129,12 +127,7 @@ class Decoder:
             if self.masks is not None:
                 valid = (self.masks.kept if kept else self.masks.masks)[block][window]
             values = found[block][channel][window]
-            if piece[:1] == NEIGHBOURS and not kept:
-                lattice = self.header.lattices[channel]
-                told = value(lattice, np.array(numbers_of(piece[1:], values, valid, lattice), float))
-                values[valid] = rounded(told, self.header.types[channel])[valid]
-            else:
-                values[valid] = restore(piece, values[valid])
+            values[valid] = restore(piece, values[valid])
         return self.shown(found, exact=True)
 
 

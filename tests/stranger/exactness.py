@@ -35,7 +35,6 @@ class Line:
         self.bits = 8 * dtype.itemsize
         self.is_float = dtype.kind == "f"
         self.fraction = {32: 23, 64: 52}[self.bits] if self.is_float else 0
-        self.mantissa = self.fraction - t if self.is_float and rule == 1 else 64
 
     def _pattern(self, value: Any) -> int:
         return int(value.view(f"<u{self.dtype.itemsize}"))
@@ -102,69 +101,51 @@ class Piece:
     coder: RangeDecoder
     stored: Stored
     contexts: Contexts = field(default_factory=Contexts)
-    last: dict[str, int] = field(default_factory=dict)  # the last two bits of a sort, as one number
-    memory: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # entry -> place, difference, sureness
+    special: int = 0  # the last two bits that said whether a value is special, as one number
+    memory: dict[int, tuple[int, int]] = field(default_factory=dict)  # entry -> place, difference
 
-    def _bit(self, name: str, number: int) -> int:
+    def _bit(self, name: str, number: int = 0) -> int:
         return self.contexts.bit(self.coder, name, number)
-
-    def _remembered_bit(self, name: str, base: int = 0) -> int:
-        before = self.last.get(name, 0)
-        bit = self._bit(name, base + before)
-        self.last[name] = 2 * (before & 1) + bit
-        return bit
 
     def value(self, x: Any) -> bytes:
         """The value sought where the layers gave x."""
-        if self.specials and self._remembered_bit("special"):
-            k = 1
-            while k < len(self.specials) and self._bit("which", k):
-                k += 1
-            return self.specials[k - 1]
+        if self.specials:
+            bit = self._bit("special", self.special)
+            self.special = 2 * (self.special & 1) + bit
+            if bit:
+                k = 1
+                while k < len(self.specials) and self._bit("which", k):
+                    k += 1
+                return self.specials[k - 1]
         place = self.line.place(x)
         entry = (place * SPREAD % 2**64 >> 40) & (MEMORY - 1)
-        found = self.memory.get(entry)
-        if found is not None and found[0] == place:
-            _, y, g = found
-            if self._remembered_bit("same", 4 * (g - 1)):
-                self.memory[entry] = (place, y, min(g + 1, 4))
-                return self.line.back(signed(place + y))
-            if self._remembered_bit("close"):
+        z = self._difference(x, self.memory.get(entry), place)
+        self.memory[entry] = (place, z)
+        return self.line.back(signed(place + z))
+
+    def _difference(self, x: Any, remembered: tuple[int, int] | None, place: int) -> int:
+        if remembered is not None and remembered[0] == place:
+            y = remembered[1]
+            if self._bit("same"):
+                return y
+            if self._bit("close"):
                 v = 1
                 for _ in range(4):
                     v = 2 * v + self._bit("beside", v)
-                z = y - 8 + (v - 16)
-                self.memory[entry] = (place, z, 1)
-                return self.line.back(signed(place + z))
-        z = self._difference(x)
-        self.memory[entry] = (place, z, 1)
-        return self.line.back(signed(place + z))
-
-    def _difference(self, x: Any) -> int:
+                return y - 8 + (v - 16)
         limit = clamp(self.most - self.line.exponent(x), 0, 63)
-        near_zero = limit > self.line.mantissa
-        c, u = limit, 0
-        while c > 0:
-            if not (self._bit("near", c) if near_zero else self._bit("short", 16 * min(limit, 15) + min(u, 15))):
-                break
-            c, u = c - 1, u + 1
-        m, r = int(c > 0), max(c - 1, 0)
-        negative = None
-        if near_zero or u == 0 or limit <= 4:
-            negative = self._bit("sign", 4 * (4 if near_zero else min(limit, 3)) + min(c, 3))
-            j = 4 if near_zero else min(u, 3)
-            for _ in range(min(r, 4)):
-                m = 2 * m + self._bit("highest", 16 * j + m)
-                r -= 1
+        c = limit
+        while c > 0 and self._bit("shorter", 16 * min(limit, 15) + min(limit - c, 15)):
+            c -= 1
+        if c == 0:
+            return 0
+        m, r = 1, c - 1
         while r > 32:
             m = m << 32 | self.stored.take(32)
             r -= 32
-        if negative is None:
-            rest = self.stored.take(r + 1)
-            m, negative = m << r | rest >> 1, rest & 1
-        else:
-            m = m << r | self.stored.take(r)
-        return -1 - m if negative else m
+        last = self.stored.take(r + 1)
+        m = m << r | last >> 1
+        return -m if last & 1 else m
 
 
 def restore(piece: bytes, values: Values) -> Values:

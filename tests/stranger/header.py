@@ -87,7 +87,6 @@ class Header:
     points_channels: int
     layers: int
     tile: tuple[int, int]
-    fraction: int
     base: int  # 0 where coordinates are not quantised
     extent: float
     blocks: list[Block]
@@ -167,9 +166,8 @@ def read_header(payload: bytes) -> Header:
     kind = TYPES[fields.number("B")]
     points_channels, layers = fields.varint(), fields.varint()
     tile = fields.number("B")
-    how = fields.number("B")
-    base = fields.varint() if how == 16 else 0
-    if how == 16 and not 1 <= base < 2**24:
+    base = fields.varint()
+    if base >= 2**24:
         raise DamagedError("a base that no step has")
     extent = fields.f64()
     if flags & 64:
@@ -195,7 +193,6 @@ def read_header(payload: bytes) -> Header:
         points_channels=points_channels,
         layers=layers,
         tile=(tile & 15, tile >> 4),
-        fraction=0 if base else how,
         base=base,
         extent=extent,
         blocks=blocks,

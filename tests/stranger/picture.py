@@ -16,6 +16,9 @@ from tests.stranger.quantised import known_parts, step
 Values = NDArray[Any]
 Floats = NDArray[np.float64]
 
+#: Levels above those that are known are in eighths of a step.
+EIGHTHS = 8
+
 
 def known_part(magnitude: int, born: int, remaining: int) -> int:
     """The magnitude that is shown when so many passes of the unit remain."""
@@ -35,7 +38,6 @@ class Arrays:
         self.channel = channel
         self.level = level
         self.is_coordinate = channel < header.coordinates
-        self.fraction = header.fraction
         self.base = header.base if self.is_coordinate else 0
         self.grids = [grid for grid in levels.grids if grid.part >= 0 or self.is_coordinate]
         self.numbers: dict[int, Lines] = {}  # by the number of the grid among all
@@ -43,7 +45,7 @@ class Arrays:
             self.numbers[number] = np.zeros(grid.shape[level], np.int64)
 
     def put(self, unit: Unit, remaining: int, factor: int) -> None:
-        """The known part of a unit's coefficients."""
+        """The known part of a unit's coefficients, times a factor."""
         for band in unit.bands:
             numbers = self.numbers[band.grid]
             quantised = None
@@ -58,7 +60,7 @@ class Arrays:
                         shown = quantised[r][c]
                     if shown:
                         sign = band.sign[r + MARGIN][c + MARGIN]
-                        numbers[band.place[0] + r, band.place[1] + c] = sign * shown * factor
+                        numbers[band.place[0] + r, band.place[1] + c] = sign * min(shown * factor, 2**28)
 
     def to_points(self, whole: int) -> None:
         """Undoes all steps, where the levels up to `whole` are known."""
@@ -107,9 +109,9 @@ class Arrays:
 
     def _refine(self, numbers: Lines, grid: Grid, level: int, scaled: bool) -> None:
         if scaled:
-            limit, scale = 2 ** (27 - self.fraction), 2**self.fraction
+            limit = 2**27 // EIGHTHS
             coarser = numbers[: grid.shape[level - 1][0], : grid.shape[level - 1][1]]
-            coarser[:] = np.clip(coarser, -limit, limit) * scale
+            coarser[:] = np.clip(coarser, -limit, limit) * EIGHTHS
         if self.is_coordinate:
             self._make_side_details(numbers, grid, level)
         finer = numbers[: grid.shape[level][0], : grid.shape[level][1]]

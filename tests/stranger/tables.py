@@ -1,4 +1,4 @@
-"""The tables of the page, taken from the page itself: nobody copies a thousand numbers without a slip."""
+"""The tables of the page, taken from the page itself: nobody copies numbers without a slip."""
 
 from __future__ import annotations
 
@@ -20,7 +20,5 @@ def table(page: str, words: str, count: int) -> list[int]:
 
 _page = PAGE.read_text(encoding="utf-8")
 
-START_CHANCE = table(_page, "c of the contexts 0 to 546:", 547)
-START_SURENESS = table(_page, "s of the same:", 547)
 LOGISTIC = table(_page, "    L =", 33)
 TAPS = table(_page, "    h =", 10)

@@ -252,7 +252,7 @@ async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1
     before = await _settled(server)
     most = [before.resident]
     watching = asyncio.create_task(_sample(server.pid, most))
-    async with watched(server.url) as watching_health:
+    async with watched(server.url, server.pid) as watching_health:
         hostile = [
             asyncio.create_task(_behave(behave, place, random.Random(random_.random()), number / _ARRIVALS))
             for number in range(count)

@@ -25,7 +25,7 @@ from lodestream import formats
 from lodestream.container import Header as ContainerHeader
 from lodestream.container import read_index
 from lodestream.container.frames import section_extent
-from lodestream.container.sections import FOOTER_LENGTH, MAGIC
+from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
 from lodestream.errors import FormatWarning, InputError, LodestreamError, StreamError, UnsupportedVersionError
 from lodestream.messages import Bye, Credit, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
 from lodestream.plan import plan
@@ -160,7 +160,7 @@ def _containers() -> tuple[bytes, ...]:
 
 def _mend_container(data: bytes) -> bytes:
     """Every section's CRC as it should be, as far as the sections can be followed, and that of the footer."""
-    out, place = bytearray(data), len(MAGIC) + 1
+    out, place = bytearray(data), len(SIGNATURE)
     while len(out) - place > FOOTER_LENGTH:
         try:
             extent = section_extent(bytes(out[place : place + 10]), place)

@@ -10,13 +10,14 @@ from lodestream.errors import (
     CorruptStreamError,
     OptionError,
     StreamError,
+    TooLargeError,
     TruncatedStreamError,
     UnsupportedVersionError,
 )
 from lodestream.target import Target
 
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_target_options, target_of
-from .inputs import input_files
+from .inputs import input_files, named
 from .interrupts import interruptible
 from .outcome import Outcome, check_grid, check_out, note_unmet
 from .output import note, progress_bar
@@ -66,9 +67,11 @@ def run(args: argparse.Namespace) -> int:
             job.decode()
         except StreamError as error:
             if not args.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
-                raise
-            note(f"the container is cut or damaged: {error}")
+                raise named(error, args.container, _advice(args.partial, job, error)) from None
+            note(f"{named(error, args.container)}; this is the last whole layer before that")
             job.ended = "truncated"
+        except TooLargeError as error:
+            raise named(error, args.container) from None
     view = job.view or job.decoder.view()
     assert job.decoder.header is not None, "there is a view, so there is a header"
     note_unmet(target, job.ended, view.rms, view.max_error, job.decoder.header.extent)
@@ -85,6 +88,16 @@ def run(args: argparse.Namespace) -> int:
     outcome.write(args.out)
     outcome.report(args.json)
     return 0
+
+
+def _advice(partial: bool, job: _Job, error: StreamError) -> str:
+    """How more can be had of a container that is cut or damaged, if it can."""
+    if job.decoder.layers:
+        return "--partial writes the last whole layer before that"
+    if job.by_level and isinstance(error, TruncatedStreamError):
+        also = "" if partial else " with --partial"
+        return f"without --level and --order level,{also} the last whole layer is written, if there is one"
+    return ""
 
 
 class _Job:
@@ -107,6 +120,7 @@ class _Job:
         self.view: View | None = None  # where it ended, if more has been fed
         self.read_bytes = 0
         self.metadata: dict[str, object] | None = None
+        self.by_level = target.level is not None or target.order == "level"
         self._file = file
         self._out = out
         self._size = file.seek(0, 2)
@@ -123,7 +137,7 @@ class _Job:
             index = read_index(self._read, self._size, Capacity(self.decoder.capacity.max_vertices))
         except (CorruptStreamError, TruncatedStreamError):
             # Without its index a container still has its prefix, which is all that quality order needs.
-            if self._target.level is not None or self._target.order == "level":
+            if self.by_level:
                 raise
             self._decode_prefix()
         else:

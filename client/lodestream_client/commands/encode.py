@@ -47,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
         require_folder(Path(args.out))
 
     import lodestream as ls
-    from lodestream.formats.holes import note_attributes
 
     started = time.monotonic()
     with input_files(args.parser, args.files) as files:
@@ -71,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
             temporary.write_bytes(container)
     seconds = time.monotonic() - started
     blocks = surface.blocks
-    note_attributes(surface)
     note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks))
     raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
     if args.json:

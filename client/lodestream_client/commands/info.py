@@ -7,9 +7,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
+
 from .. import addresses
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
-from .inputs import input_files
+from .inputs import input_files, named
 from .output import cell, console, human_size, point_words, print_json
 
 __all__ = ["register", "run"]
@@ -71,7 +73,13 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
             file.seek(offset)
             return file.read(length)
 
-        return describe(read_index(read, size, Capacity(args.max_vertices)))
+        try:
+            return describe(read_index(read, size, Capacity(args.max_vertices)))
+        except (StreamError, TooLargeError) as error:
+            cut = isinstance(error, TruncatedStreamError)
+            raise named(
+                error, args.what, "lodestream decode --partial writes what is whole of it" if cut else ""
+            ) from None
 
 
 def _show(what: str, details: Mapping[str, Any]) -> None:

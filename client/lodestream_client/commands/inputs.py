@@ -11,7 +11,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Inputs", "input_files"]
+from lodestream.errors import LodestreamError
+
+__all__ = ["Inputs", "input_files", "named"]
+
+_STANDARD_INPUT = "standard input"
 
 
 @dataclass(frozen=True)
@@ -36,4 +40,11 @@ def input_files(parser: argparse.ArgumentParser, names: Sequence[str]) -> Iterat
     with tempfile.NamedTemporaryFile(prefix="lodestream-") as file:
         shutil.copyfileobj(sys.stdin.buffer, file)
         file.flush()
-        yield Inputs(tuple(Path(file.name if name == "-" else name) for name in names), "standard input")
+        yield Inputs(tuple(Path(file.name if name == "-" else name) for name in names), _STANDARD_INPUT)
+
+
+def named(error: LodestreamError, name: str, advice: str = "") -> LodestreamError:
+    """The same error, whose message begins with the file that it is about and ends with what to do."""
+    words = f"{_STANDARD_INPUT if name == '-' else name}: {error}" + (f"; {advice}" if advice else "")
+    error.args = (words, *error.args[1:])
+    return error

@@ -94,9 +94,7 @@ class Kept:
         Raises
         ------
         LodestreamError
-            When another program has it open.
-        OSError
-            When the folder cannot be written.
+            When another program has it open, or the folder cannot be written.
         """
         if identity.name is None or identity.size is None:
             self._why_not = "the server does not tell one version of the file from another"
@@ -106,6 +104,11 @@ class Kept:
             self.store = self._part = _opened(identity.name, identity.size)
         except LodestreamError as error:
             raise LodestreamError(f"{error}; wait for it, or do without --resume") from None
+        except OSError as error:
+            raise LodestreamError(
+                f"expected a folder for what comes (LODESTREAM_CACHE), got {_reason(error)}; "
+                "choose another, or do without --resume"
+            ) from None
         self.identity = identity
         if self._total:
             note(f"{human_size(self._total)} are here from before")

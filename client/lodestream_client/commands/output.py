@@ -124,7 +124,8 @@ def note_holes(holes: int, total: int) -> None:
 
 def note_details(details: Mapping[str, Any]) -> None:
     """Say what a server noted when it read a surface: what it left out or chose, and holes."""
-    for text in (details.get("metadata") or {}).get("notes") or ():
+    notes = (details.get("metadata") or {}).get("notes")
+    for text in notes if isinstance(notes, list) else ():  # in a container somebody may have put anything there
         note(str(text))
     if details.get("blocks"):
         note_holes(details.get("holes") or 0, _points(details))

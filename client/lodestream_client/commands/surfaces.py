@@ -17,6 +17,9 @@ from .output import cell, console, human_size, note, print_json
 
 __all__ = ["register", "run_list", "run_rm"]
 
+# Wider than any line: an address that is cut is none.
+_WIDTH = 1 << 20
+
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-commands."""
@@ -51,7 +54,9 @@ def run_list(args: argparse.Namespace) -> int:
         words = (surface.url, surface.state, shape, size, name, details.get("owner") or "", details.get("reason") or "")
         table.add_row(*map(cell, words))
     if surfaces:
-        console().print(table)
+        screen = console()
+        screen.width = _WIDTH
+        screen.print(table)
     else:
         note("no surfaces")
     return 0

@@ -42,9 +42,9 @@ class Rights:
 def confine(rights: Rights) -> tuple[str, ...]:
     """Give up everything else, for this process and all that it starts.
 
-    No sockets are opened, no other process is looked into or sent a signal, nothing is executed, no mode, owner or
-    time of a file is changed. What is open stays open. The process should have one thread: Landlock holds the thread
-    that calls this, and those that it starts.
+    No sockets are opened, no other process is looked into, sent a signal or given other limits, nothing is executed, no
+    mode, owner or time of a file is changed. What is open stays open. The process should have one thread: Landlock
+    holds the thread that calls this, and those that it starts.
 
     Returns
     -------

@@ -35,6 +35,7 @@ _X32 = 0x40000000
 _DENIED = """
     socket socketpair bind listen accept accept4 connect sendto sendmsg sendmmsg recvfrom recvmsg recvmmsg shutdown
     ptrace process_vm_readv process_vm_writev kcmp setpgid setsid unshare setns
+    setpriority ioprio_set sched_setparam sched_setscheduler sched_setattr
     shmget shmat shmctl shmdt semget semop semtimedop semctl msgget msgsnd msgrcv msgctl memfd_create
     mq_open mq_unlink mq_timedsend mq_timedreceive mq_notify mq_getsetattr
     chmod fchmod fchmodat chown lchown fchown fchownat utime utimes futimesat utimensat mknod mknodat truncate
@@ -49,6 +50,8 @@ _DENIED = """
 
 _START = ("fork", "vfork", "clone", "execve", "execveat")
 _SIGNALS = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo")
+#: Of which process, says the first argument; 0 is whoever calls.
+_LIMITS = ("prlimit64", "sched_setaffinity")
 
 #: From here on the numbers are the same everywhere.
 _COMMON = 424
@@ -61,6 +64,8 @@ _SAME_PARENT = 0x00008000
 _TRUNCATE, _ACCESS = os.O_TRUNC, os.O_ACCMODE
 _SHARED, _ANONYMOUS = 0x01, 0x20
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
+#: F_SETOWN, F_SETSIG, F_SETOWN_EX: to whom a pipe sends which signal, SIGKILL perhaps.
+_OWNERS = (8, 10, 15)
 
 _X86_64 = """
     mmap 9 shmget 29 shmat 30 shmctl 31 socket 41 connect 42 accept 43 sendto 44 recvfrom 45 sendmsg 46 recvmsg 47
@@ -72,6 +77,8 @@ _X86_64 = """
     settimeofday 164 mount 165 umount2 166 swapon 167 swapoff 168 reboot 169 sethostname 170 setdomainname 171 iopl 172
     ioperm 173 init_module 175 delete_module 176 quotactl 179 nfsservctl 180 setxattr 188 lsetxattr 189 fsetxattr 190
     removexattr 197 lremovexattr 198 fremovexattr 199 tkill 200 io_setup 206 io_submit 209 lookup_dcookie 212
+    fcntl 72 setpriority 141 sched_setparam 142 sched_setscheduler 144 sched_setaffinity 203 ioprio_set 251
+    prlimit64 302 sched_setattr 314
     semtimedop 220 clock_settime 227 tgkill 234 utimes 235 mbind 237 set_mempolicy 238 mq_open 240 mq_unlink 241
     mq_timedsend 242 mq_timedreceive 243 mq_notify 244 mq_getsetattr 245 kexec_load 246 add_key 248 request_key 249
     keyctl 250 inotify_init 253 inotify_add_watch 254 migrate_pages 256 openat 257 mknodat 259 fchownat 260
@@ -97,6 +104,8 @@ _AARCH64 = """
     fanotify_init 262 fanotify_mark 263 name_to_handle_at 264 open_by_handle_at 265 clock_adjtime 266 setns 268
     sendmmsg 269 process_vm_readv 270 process_vm_writev 271 kcmp 272 finit_module 273 seccomp 277 memfd_create 279
     bpf 280 execveat 281 userfaultfd 282 kexec_file_load 294
+    fcntl 25 ioprio_set 30 sched_setparam 118 sched_setscheduler 119 sched_setaffinity 122 setpriority 140 prlimit64 261
+    sched_setattr 274
 """
 
 
@@ -149,6 +158,10 @@ def _program(architecture: int, calls: Mapping[str, int], process: int, *, proce
             yield _instruction(_RETURN, _ERROR | errno.EPERM)
     for name in _SIGNALS[processes:]:
         yield from _unless(calls[name], 0, (_EQUAL, process))
+    for name in _LIMITS:
+        yield from _unless(calls[name], 0, (_EQUAL, 0), (_EQUAL, process))
+    for command in _OWNERS:
+        yield from _if(calls["fcntl"], 1, (_EQUAL, command))
     if processes:
         yield from _if(calls["clone"], 0, (_ANY_BIT, _NAMESPACES | _SAME_PARENT))
     # The first two versions of Landlock let files be cut that may only be read.
@@ -180,11 +193,12 @@ def _if(
     yield _instruction(_LOAD, _NUMBER)
 
 
-def _unless(number: int, argument: int, test: tuple[int, int]) -> Iterable[bytes]:
-    """Refuse a call whose argument fails the test."""
-    yield _instruction(_EQUAL, number, 0, 4)
+def _unless(number: int, argument: int, *tests: tuple[int, int]) -> Iterable[bytes]:
+    """Refuse a call whose argument fails all of the tests."""
+    yield _instruction(_EQUAL, number, 0, len(tests) + 3)
     yield _instruction(_LOAD, _ARGUMENTS[argument])
-    yield _instruction(*test, 1, 0)
+    for place, test in enumerate(tests):
+        yield _instruction(*test, len(tests) - place, 0)
     yield _instruction(_RETURN, _ERROR | errno.EPERM)
     yield _instruction(_LOAD, _NUMBER)
 

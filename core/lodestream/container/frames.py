@@ -13,7 +13,7 @@ from . import sections
 
 __all__ = ["Frame", "FrameReader", "section_extent", "section_lengths", "whole_section"]
 
-_START = len(sections.MAGIC) + 1
+_START = len(sections.SIGNATURE)
 _KNOWN = {
     sections.HEADER,
     sections.LAYER,
@@ -67,7 +67,7 @@ class FrameReader:
         CorruptStreamError
             Where the bytes are no container, or a section fails its CRC.
         UnsupportedVersionError
-            Where the container is newer than this program, or a section that must be understood is not known.
+            Where the container is of another version, or a section that must be understood is not known.
         """
         self._data += chunk
         while not self.ended and (frame := self._next()) is not None:
@@ -93,12 +93,9 @@ class FrameReader:
         return checked(bytes(frame), kind, offset, start)
 
     def _start(self) -> bool:
-        seen = self._data[:_START]
-        if not sections.MAGIC.startswith(bytes(seen[: len(sections.MAGIC)])):
-            raise CorruptStreamError(f"expected a Lodestream container, got {bytes(seen)!r}", 0)
-        if len(seen) < _START:
+        sections.check_signature(bytes(self._data[:_START]))
+        if len(self._data) < _START:
             return False
-        sections.check_version(seen[-1])
         if len(self._data) > _START and self._data[_START] != sections.HEADER:
             raise CorruptStreamError(f"expected the header section first, got kind {self._data[_START]}", _START)
         del self._data[:_START]

@@ -16,7 +16,7 @@ from ..quantiser import MOST_BASE, Quantiser
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .model import Header
-from .sections import HEADER, KEPT_MASKS, MAGIC, MASKS, VERSION, section
+from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
     LARGEST_SURFACE,
@@ -27,20 +27,15 @@ from .shape import (
     serialize_extras,
 )
 
-__all__ = ["LARGE_TILE_BITS", "MOST_FRACTION", "TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
+__all__ = ["TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
 
-#: Rows of a tile times columns, as an exponent of two; and of a large one.
+#: Rows of a tile times columns, as an exponent of two.
 TILE_BITS = 14
-LARGE_TILE_BITS = 20
-#: Most binary places between lattice steps.
-MOST_FRACTION = 6
 _RULES = ("affine", "decimal")
-# In place of the binary places.
-_QUANTISED = 16
 
 
 def serialize_header(header: Header) -> bytes:
-    """Magic, version, header section and, where there are holes, the section of masks."""
+    """Signature, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
     extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
     marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
@@ -49,10 +44,7 @@ def serialize_header(header: Header) -> bytes:
     out.varint(header.point_channels)
     out.varint(header.layer_count)
     out.byte(header.tile[0] | header.tile[1] << 4)
-    quantiser = header.quantiser
-    out.byte(header.fraction if quantiser is None else _QUANTISED)
-    if quantiser is not None:
-        out.varint(quantiser.base)
+    out.varint(0 if header.quantiser is None else header.quantiser.base)
     out.pack("d", header.extent)
     if header.arrangement is None:
         out.varint(header.shape[0])
@@ -72,7 +64,7 @@ def serialize_header(header: Header) -> bytes:
         for level, axis in fitted:
             if axis < CURVES or channel < header.geometric:
                 out.pack("bb", *(int(x) for x in predictors[level, axis]))
-    data = MAGIC + bytes([VERSION]) + section(HEADER, bytes(out.data))
+    data = SIGNATURE + section(HEADER, bytes(out.data))
     if not header.masked:
         return data
     return data + section(KEPT_MASKS if any(header.kept) else MASKS, _serialize_masks(header))
@@ -129,13 +121,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
     point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
-    exponents, how = fields.byte(), fields.byte()
+    exponents, base = fields.byte(), fields.varint(MOST_BASE)
     tile = exponents & 15, exponents >> 4
-    fraction, quantiser = how, None
-    if how == _QUANTISED:
-        fraction, quantiser = 0, Quantiser(fields.varint(MOST_BASE))
-        if quantiser.base == 0:
-            raise CorruptStreamError("expected steps of 1 or more, got 0", offset)
     (extent,) = fields.unpack("d")
     arrangement = None
     if flags & 64:
@@ -154,13 +141,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         )
     # Tiles across a narrow surface would be many, and nearly empty.
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
-    fits = TILE_BITS <= sum(tile) <= LARGE_TILE_BITS and min(tile) >= 1
-    if not fits or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
-        raise CorruptStreamError(
-            f"expected tiles of 2**14 to 2**20 coefficients, got exponents {tile[0]} and {tile[1]}", offset
-        )
-    if fraction > MOST_FRACTION:
-        raise CorruptStreamError(f"expected at most {MOST_FRACTION} binary places, got {fraction}", offset)
+    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
+        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
     if not (math.isfinite(extent) and extent >= 0):
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = []
@@ -191,7 +173,6 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         lattices=tuple(lattices),
         predictors=predictors,
         extent=extent,
-        fraction=fraction,
         empty=empty,
         tile=tile,
         exact=bool(flags & 8),
@@ -199,7 +180,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         layer_count=layer_count,
         plane=extras.plane,
         masked=bool(flags & 32),
-        quantiser=quantiser,
+        quantiser=Quantiser(base) if base else None,
         joint_changes=extras.joint_changes,
         length=length,
     )

@@ -83,8 +83,6 @@ class Header:
         The third step's (a, b) of the step from ``level`` to ``level + 1`` along each axis, see `predictors`.
     extent : float
         Range of the heights, or diagonal of the box of the points; what ``1e-3d`` refers to.
-    fraction : int
-        Binary places between lattice steps in which pictures of incomplete levels are computed.
     empty : tuple of int
         For each channel the levels, as bits, that have no coefficient other than 0.
     tile : (int, int)
@@ -127,7 +125,6 @@ class Header:
     lattices: tuple[Lattice, ...]
     predictors: NDArray[np.int8]
     extent: float
-    fraction: int
     empty: tuple[int, ...]
     tile: tuple[int, int]
     exact: bool

@@ -27,9 +27,11 @@ __all__ = [
     "MASKS",
     "METADATA",
     "OPTIONAL",
+    "SIGNATURE",
     "VERSION",
     "Entry",
-    "check_version",
+    "check_signature",
+    "is_container",
     "parse_footer",
     "parse_index",
     "parse_layer",
@@ -43,8 +45,11 @@ __all__ = [
     "serialize_pieces",
 ]
 
-VERSION = 3
-MAGIC = b"\x89LODE\r\n"  # a byte that is no text, the name, a line end that text transfer would damage
+VERSION = 0
+MAGIC = b"\xf5LODE\r\n"  # a byte that UTF-8 never has, the name, a line end that text transfer would damage
+SIGNATURE = MAGIC + bytes([VERSION])
+#: Containers began so while the format was made, with versions of their own; none was released.
+_EARLIER_MAGIC = b"\x89LODE\r\n"
 HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS = 1, 2, 3, 4, 5, 6, 7
 #: Kinds from here on may be skipped by a reader that does not know them.
 OPTIONAL = 128
@@ -296,9 +301,30 @@ def parse_footer(data: bytes, offset: int) -> ByteRange:
     return ByteRange(int(place), int(length))
 
 
-def check_version(version: int) -> None:
-    """Refuse what is newer than this program."""
-    if version != VERSION:
+def is_container(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a container, of whichever version."""
+    return head.startswith((MAGIC, _EARLIER_MAGIC))
+
+
+def check_signature(start: bytes) -> None:
+    """Refuse what does not begin like a container of this version.
+
+    Parameters
+    ----------
+    start : bytes
+        The first bytes, as many as have come, at most those of `SIGNATURE`: the version is looked at once it is there.
+
+    Raises
+    ------
+    CorruptStreamError
+        When no container begins so.
+    UnsupportedVersionError
+        When it is of another version; both are named.
+    """
+    if not any(magic.startswith(start[: len(magic)]) for magic in (MAGIC, _EARLIER_MAGIC)):
+        raise CorruptStreamError(f"expected a Lodestream container, got {start!r}", 0)
+    if len(start) == len(SIGNATURE) and start != SIGNATURE:
+        earlier = "" if start.startswith(MAGIC) else " of an earlier numbering"
         raise UnsupportedVersionError(
-            f"expected a container of version {VERSION}, the one this program reads, got version {version}"
+            f"expected a container of version {VERSION}, the one this program reads, got version {start[-1]}{earlier}"
         )

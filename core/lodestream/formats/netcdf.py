@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -40,6 +41,9 @@ _READ = (
     *("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned"),
     *("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms"),
 )
+
+#: What h5py says where HDF5 has told it nothing, as happens where memory is short.
+_UNSAID = re.compile(r"unspecified error|failed to walk error stack", re.IGNORECASE)
 
 _CLASSIC = (b"CDF\x01", b"CDF\x02")
 _CDF5 = b"CDF\x05"
@@ -98,12 +102,17 @@ def _opened(source: Source) -> Iterator[Any]:
                 path, decode_cf=False, create_default_indexes=False, cache=False, **options
             ) as dataset:
                 yield dataset
-    except InputError:
+    except (InputError, UnavailableError):
         raise
     except MemoryError:
         raise TooLargeError("expected a NetCDF that fits into memory, got one that promises more") from None
     except Exception as error:  # none of these libraries says what it may raise
-        reason = " ".join(str(error).replace(path, "the file").split()) or type(error).__name__
+        reason = " ".join(str(error).replace(path, "the file").split())
+        if not reason or isinstance(error, SystemError) or _UNSAID.search(reason):
+            raise UnavailableError(
+                f"expected the libraries of NetCDF to read the file or to say why not, got {type(error).__name__}: "
+                "they may have had too little memory"
+            ) from None
         raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None
 
 

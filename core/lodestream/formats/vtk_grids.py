@@ -94,9 +94,10 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     Raises
     ------
     UnavailableError
-        When VTK is not installed, or the process in which it runs was ended.
+        When VTK is not installed, or the process in which it runs ended before it had answered: somebody ended it, or
+        it had not enough memory or time here. It says nothing of the bytes.
     FormatError
-        When it cannot read a file as structured grids; with its reason.
+        When VTK refuses a file; with its reason.
     """
     if importlib.util.find_spec("vtkmodules") is None:
         raise UnavailableError(f"expected VTK for {format_name}, which is not installed: install lodestream[vtk]")
@@ -142,30 +143,32 @@ def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
         try:
             assert process.stdout is not None  # it was asked for
             line = process.stdout.readline()
-            answer = json.loads(line) if line.endswith(b"\n") else None
-            if answer is None and _was_ended(process):
-                raise UnavailableError("expected VTK to read the file, got a process that somebody ended")
-            if answer is None:
-                raise FormatError(
-                    f"expected structured grids that VTK reads, got a file that ended its reader (damaged, or made to "
-                    f"take more than {number(budget >> 20)} MiB or {number(seconds)} seconds)"
-                )
+            if not line.endswith(b"\n"):
+                raise _ended(process, budget, seconds)
+            answer = json.loads(line)
             if "error" in answer:
                 raise FormatError(f"expected structured grids that VTK reads, got {_printable(answer['error'])}")
             if not answer["grids"]:
                 raise FormatError("expected structured grids that VTK reads, got none")
-            yield answer["grids"], process.stdout
+            try:
+                yield answer["grids"], process.stdout
+            except EOFError:
+                raise _ended(process, budget, seconds) from None
         finally:
             process.kill()
 
 
-def _was_ended(process: subprocess.Popen[bytes]) -> bool:
-    """Whether somebody else ended a process, as a machine does that is short of memory, and not what it read."""
+def _ended(process: subprocess.Popen[bytes], budget: int, seconds: int) -> UnavailableError:
+    """The error of a reader that has ended before its answer did: it has refused nothing, whatever ended it."""
     try:
         code = process.wait(_LAST_SECONDS)
+        how = f"exit code {code}" if code >= 0 else signal.strsignal(-code) or f"signal {-code}"
     except subprocess.TimeoutExpired:
-        return False
-    return code in (-signal.SIGKILL, -signal.SIGTERM)
+        how = "it says nothing any more"
+    return UnavailableError(
+        f"expected VTK to read the file, got a process that ended before it had answered ({how}); it may take "
+        f"{number(budget >> 20)} MiB and {number(seconds)} seconds of a processor"
+    )
 
 
 def _printable(text: str) -> str:
@@ -212,7 +215,7 @@ def _received(output: IO[bytes], dtype: np.dtype[Any], shape: tuple[int, ...]) -
     while rest:
         got = output.read(min(len(rest), 1 << 20))
         if not got:
-            raise FormatError("expected the points of a grid from VTK, got a file that ended its reader")
+            raise EOFError
         rest[: len(got)] = got
         rest = rest[len(got) :]
     return values

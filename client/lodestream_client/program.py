@@ -1,0 +1,92 @@
+"""The command ``lodestream``: its parser, and what becomes of errors."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+
+import lodestream
+from lodestream.errors import LodestreamError
+
+from .commands import decode, demo, encode, formats, info, pull, push, retry, surfaces
+from .commands.arguments import Subparsers, add_command
+from .commands.interrupts import exit_code, unwrapping
+from .commands.output import Parser, clean_warnings, note
+from .starting import EndingAtOnce
+
+__all__ = ["build_parser", "main"]
+
+_MODULES = (demo, encode, decode, info, push, retry, pull, surfaces, formats)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line, with the sub-commands that other packages add through ``lodestream.commands``."""
+    parser: argparse.ArgumentParser = Parser(
+        prog="lodestream",
+        description="Send structured surfaces coarsest first, refine them, stop early, and know the error.",
+        epilog="A path - is standard input or output. Exit code: 0 done, 1 it could not be done, 2 wrong command line.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for module in _MODULES:
+        module.register(subparsers)
+    # By name: a second, stale installation on the path may announce the same.
+    found = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
+    for name in sorted(found):
+        _register(found[name], subparsers)
+    return parser
+
+
+def _register(entry: EntryPoint, subparsers: Subparsers) -> None:
+    try:
+        register = entry.load()
+    except ImportError as error:
+        reason = str(error)
+
+        def refuse(args: argparse.Namespace) -> int:
+            raise LodestreamError(f"the command {entry.name} is not fully installed: {reason}")
+
+        add_command(subparsers, entry.name, refuse, "(not fully installed)")
+    else:
+        register(subparsers)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str or None
+        The arguments without the program's name; the process's own when None.
+
+    Raises
+    ------
+    SystemExit
+        From argparse, with 2, when the command line is wrong, and with 0 for ``--help`` and ``--version``.
+    """
+    try:
+        with EndingAtOnce():
+            args = build_parser().parse_args(argv)
+        with clean_warnings(), unwrapping():
+            code: int = args.run(args)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read our output has seen enough. What is still buffered would raise again when Python exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt as interrupt:
+        return exit_code(interrupt)
+    except (LodestreamError, OSError) as error:
+        note(_words(error))
+        return 1
+    return code
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error) or type(error).__name__

@@ -1,0 +1,41 @@
+"""What the operator is told of a container that turns out to be damaged while it is read."""
+
+from __future__ import annotations
+
+import logging
+
+from lodestream.errors import StreamError
+
+from .logs import event
+from .storage import Storage
+
+__all__ = ["tell"]
+
+_log = logging.getLogger(__name__)
+
+_MOST_NAMES = 5
+
+
+def tell(storage: Storage, sha256: str, error: StreamError) -> None:
+    """Log that a container is damaged, of which surfaces, and what to do; repetitions are counted (`repeats`).
+
+    ``lodestream_errors_total`` has each of them as ``damaged``, where it is answered.
+
+    Parameters
+    ----------
+    storage : Storage
+    sha256 : str
+        The container's name.
+    error : StreamError
+        What is wrong with it. It may differ from time to time, hence it is a field and not part of the line.
+    """
+    surfaces = storage.surfaces_of(sha256)
+    named = ", ".join(surfaces[:_MOST_NAMES]) or "none"
+    more = f" and {len(surfaces) - _MOST_NAMES} more" if len(surfaces) > _MOST_NAMES else ""
+    event(
+        _log,
+        f"{storage.place_of(sha256)} is damaged, the container of surface {named}{more}: stop the server and run "
+        f"lodestream fsck --repair {storage.root}, which builds it again from its upload",
+        logging.ERROR,
+        problem=str(error),
+    )

@@ -1,0 +1,83 @@
+"""Work that can wait: a few pieces of it in each turn of the event loop.
+
+A turn of the loop runs everything that is ready, and a request needs several turns. Of a thousand connections that have
+something to do at the same time each does a millisecond, and a turn takes a second. So whatever may come in such
+numbers is done here, in the order in which it came, and a turn stays short. Probes do not wait: an operator must not
+take a server for dead that is busy and well.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from contextvars import Context, copy_context
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+__all__ = ["PIECES_A_TURN", "Pace", "Paced"]
+
+#: A piece takes at most some milliseconds, most take a tenth of one.
+PIECES_A_TURN = 8
+
+_PROBES = {"/healthz", "/readyz"}
+
+
+class Pace:
+    """Does what can wait; only within the event loop."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[Callable[[], object], Context]] = deque()
+
+    def later(self, work: Callable[[], object]) -> None:
+        """Call this in one of the next turns.
+
+        Parameters
+        ----------
+        work : callable
+            Takes a few milliseconds at the most; what it raises goes to the loop's handler of exceptions.
+        """
+        if not self._waiting:
+            asyncio.get_running_loop().call_soon(self._some, context=Context())
+        self._waiting.append((work, copy_context()))
+
+    async def turn(self) -> None:
+        """Wait until it is this task's turn."""
+        turn = asyncio.get_running_loop().create_future()
+
+        def begin() -> None:
+            if not turn.done():  # nor is the task gone
+                turn.set_result(None)
+
+        self.later(begin)
+        await turn
+
+    def _some(self) -> None:
+        loop = asyncio.get_running_loop()
+        for _ in range(min(PIECES_A_TURN, len(self._waiting))):
+            work, context = self._waiting.popleft()
+            loop.call_soon(work, context=context)
+        if self._waiting:
+            loop.call_soon(self._some, context=Context())
+
+
+class Paced:
+    """ASGI middleware: requests begin in turn, probes at once.
+
+    Parameters
+    ----------
+    app : ASGI application
+    pace : Pace
+    """
+
+    def __init__(self, app: ASGIApp, pace: Pace) -> None:
+        self._app = app
+        self._pace = pace
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through in its turn."""
+        if scope["type"] in ("http", "websocket"):
+            path: str = scope["path"]
+            if path.removeprefix(scope.get("root_path", "")) not in _PROBES:
+                await self._pace.turn()
+        await self._app(scope, receive, send)
