@@ -82,6 +82,22 @@ def slowly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
 
 
+@pytest.fixture
+def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The levels for which somebody waits, as they came; when ``two`` comes, levels are made."""
+    levels: list[int] = []
+    wait = level_queue.LevelQueue._wait
+
+    async def noted(self: level_queue.LevelQueue, key: Key, caller: str) -> Lease:
+        levels.append(key.level)
+        if caller == key_of("two"):
+            (tmp_path / "go").touch()
+        return await wait(self, key, caller)
+
+    monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)
+    return levels
+
+
 # What the server holds.
 
 
@@ -167,7 +183,7 @@ def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: N
         assert len(list((tmp_path / "levels").iterdir())) == 1
 
 
-def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: None) -> None:
+def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: None, line: list[int]) -> None:
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
         answers: list[httpx.Response] = []
@@ -180,6 +196,7 @@ def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: No
         with asking(url, finest(surface)):  # who goes while others wait disturbs nobody
             for thread in threads:
                 thread.start()
+            eventually(lambda: len(line) == 7, "all to wait for the level")
             eventually(lambda: begun(tmp_path), "the level to begin")
         (tmp_path / "go").touch()
         for thread in threads:
@@ -217,22 +234,6 @@ def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly
             assert problem(eventually(busy, "the queue to be full")) == (503, "busy")
         # All have gone: nothing counts any more.
         assert eventually(lambda: _taken(other, f"{surface['url']}/levels/0"), "a turn").status_code == 200
-
-
-@pytest.fixture
-def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The levels for which somebody waits, as they came; when another than ``one`` comes, levels are made."""
-    levels: list[int] = []
-    wait = level_queue.LevelQueue._wait
-
-    async def noted(self: level_queue.LevelQueue, key: Key, caller: str) -> Lease:
-        levels.append(key.level)
-        if caller != key_of("one"):
-            (tmp_path / "go").touch()
-        return await wait(self, key, caller)
-
-    monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)
-    return levels
 
 
 @pytest.mark.parametrize("also", [(), (0,)], ids=["for itself", "for both"])
