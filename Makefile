@@ -16,7 +16,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
-demo: $(STAMP) ## serve real surfaces to itself over a slow link, stop early, show what came
+demo: $(STAMP) ## stream a million points over a slow link, stop early, and show what came
 	@$(BIN)/lodestream demo $(ARGS)
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says.

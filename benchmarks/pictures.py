@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client.demo.render import Camera, Patch, draw
 
 from .arrays import ROOT
+from .render import Camera, Patch, draw
 
 PICTURE = ROOT / "docs" / "blocks.png"
 DATA = ROOT.parent / "shared" / "data"

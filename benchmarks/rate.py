@@ -9,7 +9,8 @@ import numpy as np
 
 import lodestream
 from lodestream.container import read_index
-from lodestream.plan import Mark, plan
+from lodestream.plan import plan
+from lodestream.plans import Mark
 
 from .arrays import Array, load
 from .measure import note, table

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 import lodestream
 from lodestream.container import read_index
-from lodestream.plan import Mark, plan
+from lodestream.plan import plan
+from lodestream.plans import Mark
 
 from .trial import TARGETS, Trial
 

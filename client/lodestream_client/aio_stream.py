@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -232,7 +232,7 @@ class Stream(BaseStream):
 
 
 def connect(
-    url: str | Sequence[str],
+    url: str,
     *,
     target: Target | None = None,
     token: str | None = None,

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from lodestream.errors import (
-    CorruptStreamError,
     FormatError,
     InputError,
     LodestreamError,
@@ -17,7 +16,6 @@ from lodestream.errors import (
     RemoteProtocolError,
     TooLargeError,
     TruncatedStreamError,
-    UnsupportedVersionError,
 )
 from lodestream.messages import CODES
 
@@ -25,7 +23,7 @@ from . import addresses
 from .answers import parse
 from .errors import SilenceError, UnreachableError
 
-__all__ = ["NoStreamError", "blocks_sockets", "elsewhere", "from_code", "from_connection", "from_response", "passes"]
+__all__ = ["NoStreamError", "blocks_sockets", "from_code", "from_connection", "from_response", "passes"]
 
 _LONGEST = 1000
 
@@ -94,11 +92,6 @@ def passes(error: LodestreamError) -> bool:
     if isinstance(error, RemoteError):
         return error.code in _PASSING
     return isinstance(error, UnreachableError | SilenceError | TruncatedStreamError) or _broke_off(error)
-
-
-def elsewhere(error: LodestreamError) -> bool:
-    """Whether the same attempt may go well at another address."""
-    return not isinstance(error, OptionError | CorruptStreamError | TooLargeError | UnsupportedVersionError)
 
 
 def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:

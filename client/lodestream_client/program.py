@@ -26,8 +26,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The whole command line, with the sub-commands that other packages add through ``lodestream.commands``."""
     parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
-        description="Send structured surfaces coarsest first, refine them, stop early, and know the error.",
-        epilog="A path - is standard input or output. Exit code: 0 done, 1 it could not be done, 2 wrong command line.",
+        description="Stream structured surfaces progressively: coarse first, then finer, the error known at each step.",
+        epilog="A path - is standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")

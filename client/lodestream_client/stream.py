@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from lodestream.download import Download, Ended
@@ -23,7 +23,7 @@ from lodestream.errors import (
     TruncatedStreamError,
 )
 from lodestream.messages import MAX_MESSAGE, MIN_WINDOW, SUBPROTOCOL
-from lodestream.opening import OPENED, to_address
+from lodestream.opening import to_address
 from lodestream.range_download import RangeDownload
 from lodestream.reception import Reception, Sink, Store
 from lodestream.target import Region, Target
@@ -72,7 +72,7 @@ class BaseStream:
 
     def __init__(
         self,
-        url: str | Sequence[str],
+        url: str,
         target: Target | None,
         *,
         token: str | None,
@@ -89,7 +89,7 @@ class BaseStream:
         sink: Sink | None,
         max_vertices: int | None,
     ) -> None:
-        self._roads = Roads([url] if isinstance(url, str) else url, transport, deadline)
+        self._roads = Roads(url, transport, deadline)
         self.silence = silence
         self._token = token
         self._close_timeout = close_timeout
@@ -101,7 +101,7 @@ class BaseStream:
         self.target = self._reception.target
         self._progress = progress
         self._download: Download | None = None
-        self._parts: dict[str, RangeDownload] = {}
+        self._parts: RangeDownload | None = None
         self._views: deque[View] = deque()
         # The download is told things by whoever iterates and by whoever stops, which may be two threads.
         self._lock = threading.RLock()
@@ -117,8 +117,8 @@ class BaseStream:
 
     @property
     def url(self) -> str:
-        """The address that it comes from: of several the one in use."""
-        return self._roads.place.url
+        """The address that it comes from."""
+        return self._roads.url
 
     @property
     def silence(self) -> float:
@@ -147,8 +147,8 @@ class BaseStream:
         container, size = self._reception.container, self._reception.size
         if container is not None:
             return Identity(container, container, size)
-        download = self._parts.get(self.url)
-        return identity_of_file(self.url, download.version if download is not None else None, size)
+        version = self._parts.version if self._parts is not None else None
+        return identity_of_file(self.url, version, size)
 
     @property
     def planned(self) -> int | None:
@@ -173,7 +173,7 @@ class BaseStream:
     @property
     def transport(self) -> str:
         """The road in use: ``ws`` or ``http``."""
-        return self._roads.place.road
+        return self._roads.road
 
     @property
     def connections(self) -> int:
@@ -242,7 +242,7 @@ class BaseStream:
         while True:
             before, self._withheld = self._reception.held.total, ""
             try:
-                yield from self._by_socket() if self._roads.place.road == "ws" else self._by_parts()
+                yield from self._by_socket() if self._roads.road == "ws" else self._by_parts()
                 return
             except LodestreamError as error:
                 if isinstance(error, RemoteError | InputError | NotFoundError):
@@ -266,20 +266,21 @@ class BaseStream:
             turns, self._download = self._turns, None
             download = Download(window=self._window, reception=self._reception)
         began = time.monotonic()
-        subprotocol = yield self._dial(addresses.stream_url(self.url, to_address(download.opening)))
+        opening = to_address(download.opening)
+        subprotocol = yield self._dial(addresses.stream_url(self.url, opening))
         self._connections += 1
-        if subprotocol not in (OPENED, SUBPROTOCOL):
+        if subprotocol != SUBPROTOCOL:
             raise problems.NoStreamError(
                 f"expected {self.url} to speak {SUBPROTOCOL}, got {subprotocol or 'no subprotocol'}"
             )
-        if subprotocol == OPENED:
+        if opening is not None:
             download.opened(began)
         with self._lock:
             self._download = download
             if self._stopped:
                 download.stop()
             elif self._turns != turns:
-                download.focus(self._reception.region)
+                download.turn()
         self._roads.met = True
         while self.ended is None:
             left = self._tick()
@@ -296,9 +297,9 @@ class BaseStream:
         yield self._leave()
 
     def _by_parts(self) -> Way:
-        url = self.url
-        download = self._parts.setdefault(url, RangeDownload(self._reception))
-        address = addresses.container_url(url)
+        if self._parts is None:
+            self._parts = RangeDownload(self._reception)
+        download, address = self._parts, addresses.container_url(self.url)
         while True:
             # First: what was asked to stop has stopped, even if all that there is has come.
             left = self._tick_parts(download)
@@ -422,7 +423,7 @@ class BaseStream:
 
     def _socket_options(self) -> dict[str, Any]:
         options: dict[str, Any] = {
-            "subprotocols": [OPENED, SUBPROTOCOL],
+            "subprotocols": [SUBPROTOCOL],
             "compression": None,  # what travels is coded already
             "max_size": MAX_MESSAGE,
             "max_queue": _MAX_QUEUE,

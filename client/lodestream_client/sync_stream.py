@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -224,7 +224,7 @@ class Stream(BaseStream):
 
 
 def connect(
-    url: str | Sequence[str],
+    url: str,
     *,
     target: Target | None = None,
     token: str | None = None,
@@ -247,9 +247,8 @@ def connect(
 
     Parameters
     ----------
-    url : str or sequence of str
-        The surface's address, ``http(s)://HOST/v1/surfaces/ID``, or that of a container's file on any web server. Of
-        several addresses of one surface, the next is taken when a connection fails.
+    url : str
+        The surface's address, ``http(s)://HOST/v1/surfaces/ID``, or that of a container's file on any web server.
     target : Target or None
         Where to stop, and the order on the way there; None for the whole surface.
     token : str or None

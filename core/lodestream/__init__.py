@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from . import paper
     from .decoder import Decoder, decode
     from .encoder import encode
     from .errors import (
@@ -93,12 +94,15 @@ __all__ = [
     "decode",
     "encode",
     "hierarchy",
+    "paper",
     "read",
     "write",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "paper":
+        return importlib.import_module(".paper", __name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

@@ -25,7 +25,8 @@ _BEGINNING = (sections.HEADER, sections.MASKS, sections.KEPT_MASKS, sections.LAY
 
 def in_file_order(target: Target) -> bool:
     """Whether what the target needs is a prefix of the file, and its metadata."""
-    return target.order == "quality" and target.level is None and target.region is None and target.attributes is None
+    elsewhere = (target.level, target.region, target.attributes, target.first)
+    return target.order == "quality" and all(each is None for each in elsewhere)
 
 
 def sure(target: Target, decoder: Decoder, position: int, run: int, read: Callable[[int, int], bytes]) -> int:

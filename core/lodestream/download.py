@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .errors import RemoteError, TruncatedStreamError
-from .messages import CODES, MAX_HELD, Bye, Credit, End, Error, Focus, Header, Layer, Open, Segments, Stop
+from .messages import CODES, MAX_HELD, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
 from .protocol import Connection, Side, State
 from .reception import Ended, Reception
 from .target import Region, Target
@@ -59,19 +59,12 @@ class Download:
         self.layer: Layer | None = None
         self._connection = Connection(Side.CLIENT)
         self._opened: float | None = None
+        self._turning = False  # this end has stopped in order to open again
         # Of a container that is not known by name, nothing can be said to be held.
         known = self.reception.container is not None
-        opening = Open(
-            self.reception.target,
-            self.window.size,
-            _largest(self.reception) if known else (),
-            self.reception.container,
-        )
-        self.opening = self._connection.send(opening)
+        held = _largest(self.reception) if known else ()
+        self.opening = self._open(held, self.reception.container)
         self._outbox = [self.opening]
-        if self.reception.turned:
-            self._outbox.append(self._connection.send(Focus(self.reception.region)))
-        self.window.grant(self.window.size)
 
     @property
     def target(self) -> Target:
@@ -129,6 +122,12 @@ class Download:
         if isinstance(event, Layer):
             self.layer = event
         elif isinstance(event, End):
+            if event.why == "stopped" and self._turning:
+                self._turning = False
+                # The server knows what it has sent, and that nothing more of the last grants will come.
+                self.window.restart()
+                self._outbox.append(self._open())
+                return []
             self._outbox.append(self._connection.send(Bye()))
             return [self.reception.end(event.why)]
         elif isinstance(event, Error):
@@ -141,7 +140,7 @@ class Download:
         return messages
 
     def opened(self, now: float) -> None:
-        """Tell that the server has taken `opening` with the handshake: it is not to be sent again.
+        """Tell that `opening` stood in the address of the handshake: it is not to be sent again.
 
         Parameters
         ----------
@@ -154,6 +153,8 @@ class Download:
     def focus(self, region: Region | None) -> None:
         """Ask for what a region needs before the rest, or for the target's own order again; at any time.
 
+        The server is told to stop and, once it has, opened again: what is under way comes first.
+
         Parameters
         ----------
         region : ((int, int), (int, int)) or None
@@ -164,9 +165,15 @@ class Download:
         OptionError
             When it is known already that the surface has no such region; the server refuses it otherwise.
         """
-        self.reception.focus(region)
+        if region != self.reception.target.first:
+            self.reception.focus(region)
+            self.turn()
+
+    def turn(self) -> None:
+        """End this connection's order and open again with that of the reception, which has changed."""
         if self._connection.state in (State.OPENED, State.STREAMING):
-            self._outbox.append(self._connection.send(Focus(region)))
+            self._turning = True
+            self._outbox.append(self._connection.send(Stop()))
 
     def stop(self, why: str = "stopped") -> None:
         """Ask for no more; at once, whatever is under way. Again, or after the end, it does nothing.
@@ -176,9 +183,11 @@ class Download:
         why : "stopped" or "seconds"
             What `Ended` is to say when the server has obeyed.
         """
-        if self._connection.state in (State.OPENED, State.STREAMING):
+        if self._turning or self._connection.state in (State.OPENED, State.STREAMING):
             self.reception.stopped_for = why
+        if self._connection.state in (State.OPENED, State.STREAMING):
             self._outbox.append(self._connection.send(Stop()))
+        self._turning = False
 
     def tick(self, now: float) -> float | None:
         """Tell the time, in seconds of any clock that does not go back; `stop` when the target's seconds are over.
@@ -229,6 +238,10 @@ class Download:
             f"expected an end message, got {self.reception.data_bytes} bytes before the connection {closed}"
         )
 
+    def _open(self, held: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
+        self.window.grant(self.window.size)
+        return self._connection.send(Open(self.reception.target, self.window.size, held, container))
+
     def _begin(self, event: Header, now: float | None) -> list[DownloadEvent]:
         self.header = event
         if now is not None and self._opened is not None:
@@ -238,6 +251,7 @@ class Download:
 
     def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
         stopped = self._connection.state is State.STOPPING
+        shown = not stopped or self._turning
         views = self.reception.take(event.offset, event.data)
         self.window.arrive(len(event.data), now)
         grant = self.window.size - self._connection.credit
@@ -245,7 +259,7 @@ class Download:
         if not stopped and grant > 0 and grant * 4 >= self.window.size:
             self._outbox.append(self._connection.send(Credit(grant)))
             self.window.grant(grant, now)
-        return [] if stopped else [*views]
+        return [*views] if shown else []
 
 
 def _largest(reception: Reception) -> tuple[tuple[int, int], ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
 from .errors import RemoteProtocolError
-from .target import Region, Target, check_spans
+from .target import Target
 
 __all__ = [
     "CODES",
@@ -28,7 +28,6 @@ __all__ = [
     "End",
     "Error",
     "Event",
-    "Focus",
     "Header",
     "Layer",
     "MessageError",
@@ -73,8 +72,8 @@ class Code:
 CODES: Mapping[str, Code] = {
     "bad-message": Code(4400, "Not a message of this protocol"),
     "out-of-turn": Code(4400, "A message that is not allowed now"),
-    "no-token": Code(4401, "A token or a ticket is needed"),
-    "bad-token": Code(4403, "A token or ticket that is not known, or no longer"),
+    "no-token": Code(4401, "A token is needed"),
+    "bad-token": Code(4403, "A token that is not known, or no longer, or that does not allow it"),
     "not-found": Code(4404, "No such surface"),
     "idle": Code(4408, "Nothing was heard or taken for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
@@ -110,7 +109,7 @@ class MessageError(RemoteProtocolError):
 
 @dataclass(frozen=True)
 class Open:
-    """Client: what it wants, what it holds, and how much may be sent at once.
+    """Client: what it wants, what it holds, and how much may be sent at once; at the start, and again after an `End`.
 
     Attributes
     ----------
@@ -119,11 +118,12 @@ class Open:
     credit : int
         First credit, in bytes of `Segments.data`.
     held : tuple of (offset, length)
-        Slices of the container that the client holds already, at most `MAX_HELD`.
+        Slices of the container that the client holds already, at most `MAX_HELD`. With neither them nor `container`,
+        after an `End`, those that were sent over this connection.
     container : str or None
         SHA-256 of the container that they are slices of.
-    ticket : str or None
-        What allows reading where a token does and the client cannot send a header, as in a browser.
+    token : str or None
+        For a client that cannot send a header with the handshake, as in a browser; never in an address.
     """
 
     type: ClassVar[str] = "open"
@@ -131,7 +131,7 @@ class Open:
     credit: int = MAX_CREDIT
     held: tuple[tuple[int, int], ...] = ()
     container: str | None = None
-    ticket: str | None = field(default=None, repr=False)
+    token: str | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -140,24 +140,6 @@ class Credit:
 
     type: ClassVar[str] = "credit"
     bytes: int
-
-
-@dataclass(frozen=True)
-class Focus:
-    """Client: of what is still to be sent, what this region needs first.
-
-    Attributes
-    ----------
-    region : ((int, int), (int, int)) or None
-        Rows and columns, half-open, in full-resolution indices; None: the target's own order again.
-    """
-
-    type: ClassVar[str] = "focus"
-    region: Region | None = None
-
-    def __post_init__(self) -> None:
-        if self.region is not None:
-            check_spans(self.region)
 
 
 @dataclass(frozen=True)
@@ -220,8 +202,8 @@ class Layer:
     """Server: with what has been sent so far, a layer (quality order) or a level (level order) is complete.
 
     ``number`` counts layers or levels from 0; ``bytes``, ``rms`` and ``max`` are those of the container's own record.
-    Under a focus it is complete in the region first, then everywhere; while more is held than belongs to it, ``rms``
-    and ``max`` are NaN, and ``bytes`` are what is held.
+    Where a region comes first it is complete there first, then everywhere; while more is held than belongs to it,
+    ``rms`` and ``max`` are NaN, and ``bytes`` are what is held.
     """
 
     type: ClassVar[str] = "layer"
@@ -250,4 +232,4 @@ class Error:
     detail: str
 
 
-Event: TypeAlias = Open | Credit | Focus | Stop | Bye | Header | Segments | Layer | End | Error
+Event: TypeAlias = Open | Credit | Stop | Bye | Header | Segments | Layer | End | Error

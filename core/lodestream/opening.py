@@ -1,19 +1,15 @@
 """The client's first message in the address of the handshake: the server's first answer then comes a round trip sooner.
 
-It is the very message, in the alphabet of addresses. Whether the server has read it there is told by the subprotocol
-that it picks; one that has not is sent the message as ever.
+It is the very message, in the alphabet of addresses.
 """
 
 from __future__ import annotations
 
 from base64 import b64decode, urlsafe_b64encode
 
-from .messages import SUBPROTOCOL, MessageError
+from .messages import MessageError
 
-__all__ = ["MAX_OPENING", "OPENED", "PARAMETER", "from_address", "to_address"]
-
-#: The subprotocol that a server picks, where it is offered, once it has taken the message from the address.
-OPENED = f"{SUBPROTOCOL}.opened"
+__all__ = ["MAX_OPENING", "PARAMETER", "from_address", "to_address"]
 
 #: Where it stands in the query of the address.
 PARAMETER = "open"

@@ -9,6 +9,7 @@ independent of each other, and the tests hold both against dense least squares.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from .axis import AxisStep, axis_step
 from .errors import InputError, OptionError
-from .paper_kernels import ALPHA, combine, solve_columns, solve_rows
 from .surface import Closed
 
 __all__ = [
@@ -30,6 +30,12 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
+#: Reciprocal of the constant pivot: the factors of A'_p have 1/alpha = 3 + 2 sqrt 2 on the diagonal.
+_ALPHA = 3.0 - 2.0 * math.sqrt(2.0)
+#: Root of c^2 + 6 c + 1 = 0 inside the unit circle; the inverse of A_p decays by it from one entry to the next.
+_DECAY = -_ALPHA
+#: Sums around a closed axis stop here: the next power of c is below 1e-36, out of reach of float64.
+_CLOSED_TERMS = 48
 #: Sixteen times a value, the centre of the stencil of Lemma 1, must not overflow, nor its sums; this leaves ample room.
 _LARGEST = 2.0**1000
 
@@ -72,10 +78,9 @@ def solve(right_hand_sides: ArrayLike, terms: int = 20) -> Floats:
     >>> solve([6.0, 8.0, 8.0, 6.0])
     array([1., 1., 1., 1.])
     """
-    values, terms = _numbers(right_hand_sides), _positive(terms)
-    solution = values.reshape(values.shape[0], -1).copy()
-    solve_columns(solution, _pivots(values.shape[0], terms, False), terms, False)
-    return solution.reshape(values.shape)
+    solution = _numbers(right_hand_sides).copy()
+    _solve(solution, _positive(terms))
+    return solution
 
 
 def solve_closed(right_hand_sides: ArrayLike) -> Floats:
@@ -103,10 +108,9 @@ def solve_closed(right_hand_sides: ArrayLike) -> Floats:
     series around the axis, sum over j < p of c^j b_{-j}, divided by 1 - c^p. For p = 2 both neighbours are the other
     unknown (entries 6 and 2), for p = 1 the unknown itself (entry 8).
     """
-    values = _numbers(right_hand_sides)
-    solution = values.reshape(values.shape[0], -1).copy()
-    solve_columns(solution, _pivots(values.shape[0], 1, True), 1, True)
-    return solution.reshape(values.shape)
+    solution = _numbers(right_hand_sides).copy()
+    _solve_closed(solution)
+    return solution
 
 
 def curve_right_hand_sides(points: ArrayLike, closed: bool = False) -> Floats:
@@ -136,9 +140,7 @@ def curve_right_hand_sides(points: ArrayLike, closed: bool = False) -> Floats:
     Lemma 1 for curves. Half the gradient of sum_k (x_{2k} - z_k)^2 + sum_k (x_{2k+1} - (z_k + z_{k+1})/2)^2, times 4.
     """
     values = _numbers(points)
-    grid = values.reshape(values.shape[0], 1, -1)
-    sides = _right_hand_sides(grid, axis_step(grid.shape[0], bool(closed)), axis_step(1))
-    return sides.reshape(sides.shape[0], *values.shape[1:])
+    return np.array(_right_hand_sides(values, axis_step(values.shape[0], bool(closed))))
 
 
 def surface_right_hand_sides(points: ArrayLike, closed: Closed = (False, False)) -> Floats:
@@ -169,9 +171,9 @@ def surface_right_hand_sides(points: ArrayLike, closed: Closed = (False, False))
     times 16.
     """
     values, flags = _surface(points), _flags(closed)
-    grid = values.reshape(*values.shape[:2], -1)
-    sides = _right_hand_sides(grid, axis_step(grid.shape[0], flags[0]), axis_step(grid.shape[1], flags[1]))
-    return sides.reshape(*sides.shape[:2], *values.shape[2:])
+    sides = _right_hand_sides(values, axis_step(values.shape[0], flags[0]))
+    sides = _right_hand_sides(sides.swapaxes(0, 1), axis_step(values.shape[1], flags[1])).swapaxes(0, 1)
+    return np.array(sides, order="C")
 
 
 def coarsen(points: ArrayLike, closed: Closed = (False, False), terms: int = 20) -> Floats:
@@ -205,8 +207,7 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False), terms: int = 20)
     Theorem 1: Lemma 1, then the systems along axis 0, then those along axis 1.
     """
     values, flags = _surface(points), _flags(closed)
-    coarse = _coarsen(values.reshape(*values.shape[:2], -1), flags, _positive(terms))
-    return coarse.reshape(*coarse.shape[:2], *values.shape[2:])
+    return _coarsen(values, flags, _positive(terms))
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False), terms: int = 20) -> list[Floats]:
@@ -237,38 +238,81 @@ def hierarchy(points: ArrayLike, closed: Closed = (False, False), terms: int = 2
     Theorem 2. The optimum is nested: level by level, not of every level against the input.
     """
     values, flags, terms = _surface(points), _flags(closed), _positive(terms)
-    levels, grid = [values], values.reshape(*values.shape[:2], -1)
-    while (coarse := _coarsen(grid, flags, terms)).shape != grid.shape:
-        levels.append(coarse.reshape(*coarse.shape[:2], *values.shape[2:]))
-        grid = coarse
+    levels = [values]
+    while (coarse := _coarsen(levels[-1], flags, terms)).shape != levels[-1].shape:
+        levels.append(coarse)
     return levels[::-1]
 
 
-def _coarsen(grid: Floats, closed: Closed, terms: int) -> Floats:
-    steps = axis_step(grid.shape[0], closed[0]), axis_step(grid.shape[1], closed[1])
-    values = _right_hand_sides(grid, *steps)
-    rows, columns = steps
-    if rows.midpoints:
-        flat = values.reshape(values.shape[0], -1)
-        solve_columns(flat, _pivots(rows.run, terms, rows.wraps), terms, rows.wraps)
-    if columns.midpoints:
-        solve_rows(values, _pivots(columns.run, terms, columns.wraps), terms, columns.wraps)
-    return values
+def _coarsen(points: Floats, closed: Closed, terms: int) -> Floats:
+    rows, columns = axis_step(points.shape[0], closed[0]), axis_step(points.shape[1], closed[1])
+    along_rows = _coarsen_axis(points, rows, terms)
+    return _coarsen_axis(along_rows.swapaxes(0, 1), columns, terms).swapaxes(0, 1).copy()
 
 
-def _right_hand_sides(grid: Floats, rows: AxisStep, columns: AxisStep) -> Floats:
-    sides = np.empty((rows.coarse, columns.coarse, grid.shape[2]))
-    combine(grid, sides, rows.run, rows.midpoints, rows.wraps, columns.run, columns.midpoints, columns.wraps)
+def _coarsen_axis(points: Floats, step: AxisStep, terms: int) -> Floats:
+    """Lemma 1, then Lemma 2, along axis 0."""
+    # The sweeps go along axis 0, so that its neighbours have to be whole rows in memory.
+    sides = np.ascontiguousarray(_right_hand_sides(points, step))
+    if step.wraps:
+        _solve_closed(sides[: step.run])
+    elif step.midpoints:
+        _solve(sides[: step.run], terms)
     return sides
 
 
-def _pivots(size: int, terms: int, closed: bool) -> Floats:
+def _right_hand_sides(points: Floats, step: AxisStep) -> Floats:
+    """Lemma 1 along axis 0."""
+    if not step.midpoints:
+        return points
+    midpoints = points[1 : 2 * step.midpoints : 2]
+    sides = 4.0 * points[: 2 * step.run : 2]
+    sides[: step.midpoints] += 2.0 * midpoints
+    if step.wraps:
+        sides += 2.0 * np.roll(midpoints, 1, axis=0)
+    else:
+        sides[1:] += 2.0 * midpoints
+    return np.concatenate([sides, points[-1:]]) if step.tail else sides
+
+
+def _solve(z: Floats, terms: int) -> None:
+    """Lemma 2 along axis 0 (p, ...), in place: both sweeps take all right-hand sides of a row at once."""
+    size = z.shape[0]
+    pivots = _pivots(size, terms)
+    for i in range(1, size):
+        z[i] -= pivots[i - 1] * z[i - 1]
+    z[-1] *= pivots[-1]
+    for i in range(size - 2, -1, -1):
+        z[i] = pivots[i] * (z[i] - z[i + 1])
+    if size < terms:
+        return
+    powers = (_DECAY ** np.arange(1, terms + 1)).reshape(-1, *[1] * (z.ndim - 1))
+    first, last = z[0].copy(), (0.5 + math.sqrt(0.5)) * z[-1]
+    z[:terms] -= powers * first
+    z[size - terms :] -= powers[::-1] * last
+
+
+def _solve_closed(z: Floats) -> None:
+    """The circulant systems along axis 0 (p, ...), in place."""
+    size = z.shape[0]
+    powers = _DECAY ** np.arange(1, min(size, _CLOSED_TERMS))
+    around = 1.0 - _DECAY**size
+    z[0] = (z[0] + np.tensordot(powers, z[: size - len(powers) - 1 : -1], axes=1)) / around
+    for i in range(1, size):
+        z[i] -= _ALPHA * z[i - 1]
+    z[-1] = (z[-1] + np.tensordot(powers, z[: len(powers)], axes=1)) * _ALPHA / around
+    for i in range(size - 2, -1, -1):
+        z[i] = _ALPHA * (z[i] - z[i + 1])
+
+
+def _pivots(size: int, terms: int) -> list[float]:
     """Reciprocals of the pivots: all alpha where Lemma 2 applies, the exact ones of A_p where p < k."""
-    pivots = np.full(size, ALPHA)
-    if size < terms and not closed:
-        above = 0.0
-        for i in range(size):
-            above = pivots[i] = 1.0 / (6.0 - (i == 0) - (i == size - 1) - above)
+    if size >= terms:
+        return [_ALPHA] * size
+    pivots: list[float] = []
+    for i in range(size):
+        above = pivots[-1] if pivots else 0.0
+        pivots.append(1.0 / (6.0 - (i == 0) - (i == size - 1) - above))
     return pivots
 
 

@@ -6,88 +6,19 @@ share this piece of logic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 from itertools import groupby
-from typing import Literal
 
 from .container.model import ByteRange, Index
 from .errors import OptionError
+from .plans import Ended, Mark, Plan
 from .ranges import RangeSet
+from .region_first import region_first
 from .selection import select, wish_of
 from .target import Target
 
 __all__ = ["Ended", "Mark", "Plan", "plan"]
-
-#: Why a stream ends; `plan` knows the first five, the others happen on the way.
-Ended = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A state that the receiver reaches when it has ``sent`` bytes of the plan's ranges.
-
-    ``number`` is that of the layer (quality order) or level (level order); ``bytes`` what is held of the container.
-    """
-
-    sent: int
-    number: int
-    level: int
-    bytes: int
-    rms: float
-    max_error: float
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Slices of a container in sending order, less what is held.
-
-    Attributes
-    ----------
-    before : tuple of ByteRange
-        Service slices that must come first: the index, where segments travel without the tables of their layers.
-    ranges : tuple of ByteRange
-        The surface. Their sum and what is held of them make the state's ``bytes``.
-    after : tuple of ByteRange
-        The metadata.
-    marks : tuple of Mark
-        States on the way, the last one being the state at the end; those with a ``sent`` of 0 are held.
-    ended : str
-        Why the plan ends where it does.
-    prefix : bool
-        The whole of ``ranges`` would be a prefix of the file, and needs no index.
-    """
-
-    before: tuple[ByteRange, ...]
-    ranges: tuple[ByteRange, ...]
-    after: tuple[ByteRange, ...]
-    marks: tuple[Mark, ...]
-    ended: Ended
-    prefix: bool = False
-
-    @property
-    def slices(self) -> tuple[ByteRange, ...]:
-        """All slices, in order."""
-        return (*self.before, *self.ranges, *self.after)
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of the surface's slices, sent or held."""
-        return self.marks[-1].bytes
-
-    @property
-    def level(self) -> int:
-        """Finest level with a decoded segment at the end."""
-        return self.marks[-1].level
-
-    @property
-    def rms(self) -> float:
-        """RMS error at the end."""
-        return self.marks[-1].rms
-
-    @property
-    def max_error(self) -> float:
-        """Maximum error at the end."""
-        return self.marks[-1].max_error
 
 
 def plan(
@@ -100,9 +31,11 @@ def plan(
     Raises
     ------
     OptionError
-        When there is no such level, or not even the first layer fits into the bytes allowed.
+        When there is no such level or region, or not even the first layer fits into the bytes allowed.
     """
     chosen = _whole(index, target)
+    if target.first is not None:
+        chosen = region_first(index, chosen, target.first)
     return _less(chosen, held) if held else chosen
 
 
@@ -290,6 +223,9 @@ def _less(chosen: Plan, held: RangeSet) -> Plan:
         tuple(gap for place in part for gap in _missing(place, held)) for part in (chosen.before, chosen.after)
     )
     ranges = tuple(gap for _, gaps in missing for gap in gaps)
+    # What is held beyond a state that has no figures of its own counts too.
+    ahead = chosen.bytes - sent
+    marks = [replace(mark, bytes=ahead + mark.sent) if math.isnan(mark.rms) else mark for mark in marks]
     return replace(chosen, before=before, ranges=ranges, after=after, marks=tuple(marks))
 
 

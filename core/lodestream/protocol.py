@@ -6,11 +6,12 @@ knows turns, credit and ends; it knows neither sockets nor clocks nor what the b
 The machine
 -----------
 The client opens, the server answers with a header, then sends slices and figures as far as credit goes, then ends; the
-client says bye; the server closes. Two things make it more than a list of steps:
+client opens again, for something else of the same surface, or says bye; the server closes. Two things make it more than
+a list of steps:
 
-- *Messages cross.* A ``credit``, ``focus`` or ``stop`` may be under way while the server ends by itself, and slices
-  are under way when the client stops. So each side has its own table: after its own ``stop`` the client still takes
-  what comes until ``end``; after its own ``end`` the server still takes these three until ``bye``.
+- *Messages cross.* A ``credit`` or ``stop`` may be under way while the server ends by itself, and slices are under way
+  when the client stops. So each side has its own table: after its own ``stop`` the client still takes what comes until
+  ``end``; after its own ``end`` the server still takes these two until ``open`` or ``bye``.
 - *Stop takes effect at once.* Once the server has heard ``stop``, its table allows ``end`` and nothing else. A client
   that has stopped is in one of two states, since it may stop before the header has come, and must not take two.
 
@@ -32,7 +33,6 @@ from .messages import (
     End,
     Error,
     Event,
-    Focus,
     Header,
     Layer,
     MessageError,
@@ -75,11 +75,11 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
             {Error: State.FAILED},
         ),
         State.OPENED: (
-            {Credit: State.OPENED, Focus: State.OPENED, Stop: State.WITHDRAWN},
+            {Credit: State.OPENED, Stop: State.WITHDRAWN},
             {Header: State.STREAMING, Error: State.FAILED},
         ),
         State.STREAMING: (
-            {Credit: State.STREAMING, Focus: State.STREAMING, Stop: State.STOPPING},
+            {Credit: State.STREAMING, Stop: State.STOPPING},
             {Segments: State.STREAMING, Layer: State.STREAMING, End: State.ENDED, Error: State.FAILED},
         ),
         State.WITHDRAWN: (
@@ -91,7 +91,7 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
             {Segments: State.STOPPING, Layer: State.STOPPING, End: State.ENDED, Error: State.FAILED},
         ),
         State.ENDED: (
-            {Bye: State.CLOSED},
+            {Open: State.OPENED, Bye: State.CLOSED},
             {Error: State.FAILED},
         ),
         State.CLOSED: ({}, {Error: State.FAILED}),
@@ -104,11 +104,11 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.OPENED: (
             {Header: State.STREAMING, Error: State.FAILED},
-            {Credit: State.OPENED, Focus: State.OPENED, Stop: State.STOPPING},
+            {Credit: State.OPENED, Stop: State.STOPPING},
         ),
         State.STREAMING: (
             {Segments: State.STREAMING, Layer: State.STREAMING, End: State.ENDED, Error: State.FAILED},
-            {Credit: State.STREAMING, Focus: State.STREAMING, Stop: State.STOPPING},
+            {Credit: State.STREAMING, Stop: State.STOPPING},
         ),
         State.STOPPING: (
             {End: State.ENDED, Error: State.FAILED},
@@ -116,7 +116,7 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.ENDED: (
             {Error: State.FAILED},
-            {Credit: State.ENDED, Focus: State.ENDED, Stop: State.ENDED, Bye: State.CLOSED},
+            {Open: State.OPENED, Credit: State.ENDED, Stop: State.ENDED, Bye: State.CLOSED},
         ),
         State.CLOSED: ({}, {}),
         State.FAILED: (
@@ -124,7 +124,6 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
             {
                 Open: State.FAILED,
                 Credit: State.FAILED,
-                Focus: State.FAILED,
                 Stop: State.FAILED,
                 Bye: State.FAILED,
             },
@@ -169,6 +168,7 @@ class Connection:
         if isinstance(event, Segments):
             self._spend(len(event.data))
         elif isinstance(event, Open):
+            self.credit = 0  # what was left of the last one's ended with it
             self._grant(event.credit, least=0)
         elif isinstance(event, Credit):
             self._grant(event.bytes, least=1)

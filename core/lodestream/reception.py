@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from .errors import RemoteError, RemoteProtocolError, TooLargeError, TruncatedStreamError
 from .messages import MAX_DATA
 from .metadata import check_length
 from .ranges import RangeSet
-from .target import Region, Target, check_spans
+from .target import Region, Target
 
 if TYPE_CHECKING:
     from .container import Index
     from .decoder import Decoder, View
-    from .plan import Plan
+    from .plans import Plan
 
 __all__ = ["DownloadEvent", "Ended", "MemoryStore", "Reception", "Sink", "Store"]
 
@@ -129,10 +129,6 @@ class Reception:
         Its bytes, once they are known.
     planned : int or None
         Bytes of the surface that the target needs, once they are known.
-    turned : bool
-        There was a focus, and slices come in an order of their own.
-    region : ((int, int), (int, int)) or None
-        What the focus is on, if on anything.
     index : Index or None
         The container's, if the road or the order needs it and once it has come.
     plan : Plan or None
@@ -167,8 +163,6 @@ class Reception:
         self.container = container
         self.size = size
         self.planned: int | None = None
-        self.turned = False
-        self.region: Region | None = None
         self.index: Index | None = None
         self.plan: Plan | None = None
         self.received = 0
@@ -181,10 +175,13 @@ class Reception:
         self._aside = MemoryStore()
         self._fed = RangeSet()
         self._order: deque[tuple[int, int]] | None = None
+        self._learning = False  # the order has changed, and the index is needed to know it
         self._surface: RangeSet | None = None
         self._wanted: RangeSet | None = None
         self._service: tuple[tuple[int, int], ...] = ()
         self._deadline: float | None = None
+        if self.target.first is not None:
+            self.decoder.focus(self.target.first)
         self._kept = 0
 
     def identify(self, container: str | None, size: int) -> None:
@@ -225,30 +222,34 @@ class Reception:
         OptionError
             When the container has nothing that meets the target.
         """
+        self._plan(index)
+        return self._advance()
+
+    def _plan(self, index: Index) -> None:
         from .plan import plan
 
         chosen = plan(index, self.target)
-        self.index = index
+        self.index, self._learning = index, False
         self._service = tuple((place.offset, place.length) for place in (index.index, index.metadata))
         self.planned, self.plan = chosen.bytes, chosen
         parts = (chosen.ranges, chosen.before, chosen.after)
         self._follow(*([(place.offset, place.length) for place in part] for part in parts))
-        self._reorder()
-        return self._advance()
 
     def focus(self, region: Region | None) -> None:
-        """What a region needs is to come first, or the target's own order is to go on.
+        """Change what comes first: `Target.first`.
 
         Raises
         ------
         OptionError
-            When it has no point, or it is known already that the surface has no such region.
+            When the region has no point, or it is known already that the surface has no such region.
         """
-        if region is not None:
-            check_spans(region)
+        target = replace(self.target, first=region)
         self.decoder.focus(region)
-        self.turned, self.region = True, region
-        self._reorder()
+        self.target = target
+        if self.index is not None:
+            self._plan(self.index)
+        else:
+            self._learning = region is not None
 
     def take(self, offset: int, data: bytes) -> list[View]:
         """Take bytes of the container; the views that they complete.
@@ -343,13 +344,6 @@ class Reception:
         if self._store is not None:
             self._order = deque(gap for place in (*before, *surface, *after) for gap in self._fed.missing(*place))
 
-    def _reorder(self) -> None:
-        if self.turned and self.index is not None and self.plan is not None and self._store is not None:
-            from .focus import focused
-
-            slices, _ = focused(self.index, self.plan, self._fed, self.region)
-            self._order = deque((place.offset, place.length) for place in slices)
-
     def _count(self, offset: int, length: int) -> None:
         """Add to `received` what of a range belongs to the surface, once that is known."""
         if self.planned is None:
@@ -373,7 +367,7 @@ class Reception:
             return []
         if self._order is None and not self._service:
             return self._begin()
-        if self._order is None or (self.turned and self.plan is None):
+        if self._order is None or self._learning:
             learned = self._learn()
             if self._order is None or learned is not None:
                 return learned or []

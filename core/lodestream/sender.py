@@ -7,25 +7,17 @@ from collections.abc import Sequence
 
 from .container import ByteRange, Index
 from .errors import CorruptStreamError, OptionError
-from .focus import focused
-from .messages import CODES, MAX_DATA, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
-from .plan import Mark, Plan, plan
+from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+from .plan import plan
+from .plans import Mark
 from .protocol import Connection, Side, State
 from .ranges import RangeSet
-from .selection import Wish
-from .target import Region, Target
 
 __all__ = ["Sender"]
 
 # A message takes a quarter of the most credit that there was, but not so little that its framing counts.
 _SHARES = 4
 _LEAST = 4096
-
-# A change of order takes milliseconds, and asking for it a few bytes: so many are free, the others are earned. One
-# among many pieces takes longer, and counts for several.
-_FREE_TURNS = 16
-_BYTES_A_TURN = 4096
-_PIECES_A_TURN = 1024
 
 
 class Sender:
@@ -49,7 +41,7 @@ class Sender:
     layers : int
         Layers or levels that have been handed out; from the first one on there is something to draw.
     held : RangeSet
-        Bytes of the container that the client holds already, as its `open` says.
+        Bytes of the container that the client held when it opened last.
     why : str or None
         Why the stream ended, once it has.
     """
@@ -63,15 +55,10 @@ class Sender:
         self._container = container
         self._connection = Connection(Side.SERVER)
         self._outbox: deque[Event] = deque()
-        self._target = Target()
         self._slices: deque[ByteRange] = deque()
         self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
         self._provided = 0
-        self._given: list[tuple[int, int]] = []  # what has been provided, as runs of (offset, length)
-        self._focus: Region | None = None
-        self._changed = False  # the focus, and the order has not followed yet
-        self._turns = 0
-        self._whole: Plan | None = None  # of the target alone: orders are made of it
+        self._given: list[tuple[int, int]] = []  # what has been sent, as runs of (offset, length)
         self._window = 0
         self._ended = "complete"
 
@@ -81,13 +68,8 @@ class Sender:
         return self._connection.state
 
     @property
-    def turning(self) -> bool:
-        """Whether the next `wanted` makes a new order first, since the focus has changed."""
-        return self._changed and self._ready() and self._turns < _FREE_TURNS + self._provided // _BYTES_A_TURN
-
-    @property
     def pieces(self) -> int:
-        """How many pieces an order is made of, which is how long it takes to make one."""
+        """How many pieces a plan is made of, which is how long it takes to make one."""
         return len(self._index.segments) + len(self.held) + len(self._given)
 
     def receive(self, message: bytes) -> Event:
@@ -103,8 +85,6 @@ class Sender:
         event = self._connection.receive(message)
         if isinstance(event, Open):
             self._plan(event)
-        elif isinstance(event, Focus):
-            self._turn(event)
         elif isinstance(event, Stop) and self.state is State.STOPPING:
             # A header in the outbox is dropped too: a client that has stopped takes an end without one.
             self._outbox = deque([End("stopped")])
@@ -127,6 +107,7 @@ class Sender:
         event = self._outbox.popleft()
         if isinstance(event, Segments):
             self.sent += len(event.data)
+            self._give(event.offset, len(event.data))
         elif isinstance(event, Layer):
             self.layers += 1
         elif isinstance(event, End):
@@ -137,9 +118,6 @@ class Sender:
         """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
         if not self._ready():
             return None
-        if self.turning:
-            # Not before now: of many changes, only the last one costs anything.
-            self._reorder()
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
         until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
         # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
@@ -154,7 +132,7 @@ class Sender:
         return self.state is State.STREAMING and not self._outbox and bool(self._slices and self._connection.credit)
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
-        """Hand over the bytes of a slice that `wanted` has named; after a stop, or a change of order, they are dropped.
+        """Hand over the bytes of a slice that `wanted` has named; after a stop they are dropped.
 
         Raises
         ------
@@ -172,14 +150,16 @@ class Sender:
         if slice_.length > wanted.length:
             self._slices.appendleft(ByteRange(wanted.end, slice_.length - wanted.length))
         self._outbox.append(Segments(wanted.offset, data))
-        start, length = self._given[-1] if self._given else (wanted.offset, 0)
-        if start + length == wanted.offset:
-            self._given[-1:] = [(start, length + wanted.length)]
-        else:
-            self._given.append((wanted.offset, wanted.length))
         self._provided += wanted.length
         self._mark()
         self._end_if_done()
+
+    def _give(self, offset: int, length: int) -> None:
+        start, before = self._given[-1] if self._given else (offset, 0)
+        if start + before == offset:
+            self._given[-1:] = [(start, before + length)]
+        else:
+            self._given.append((offset, length))
 
     def _plan(self, event: Open) -> None:
         index = self._index
@@ -188,7 +168,7 @@ class Sender:
             chosen = plan(index, event.target, self.held)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
-        self._target = event.target
+        self.why = None
         self._follow(chosen.slices, chosen.marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
@@ -204,29 +184,15 @@ class Sender:
         )
         self._end_if_done()
 
-    def _turn(self, event: Focus) -> None:
-        try:
-            Wish(event.region).check(self._index.header)
-        except OptionError as error:
-            raise MessageError("bad-target", str(error)) from None
-        self._changed = self._changed or event.region != self._focus
-        self._focus = event.region
-
-    def _reorder(self) -> None:
-        self._changed = False
-        self._turns += 1 + self.pieces // _PIECES_A_TURN
-        known = RangeSet((*self.held, *self._given))
-        if self._whole is None:
-            self._whole = plan(self._index, self._target)
-        slices, marks = focused(self._index, self._whole, known, self._focus)
-        self._follow(slices, marks, 0)
-
     def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:
         self._slices = deque(slice_ for slice_ in slices if slice_.length)
         # Of the states that what is held makes already, there is nothing to say.
         self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
 
     def _said(self, event: Open) -> RangeSet:
+        """What the client holds, as it says, or as it was sent over this connection."""
+        if not event.held and event.container is None:
+            return RangeSet((*self.held, *self._given))
         if event.held and event.container is None:
             raise MessageError("bad-held", "expected open.container with open.held, got none")
         if event.container not in (None, self._container):

@@ -86,6 +86,8 @@ class Target:
         Only this window: rows and columns, half-open, in full-resolution indices.
     attributes : tuple of str or None
         Only the attributes of these names beside the points; None: all.
+    first : ((int, int), (int, int)) or None
+        Of all that is sent, what this region needs comes before the rest; rows and columns as those of `region`.
     """
 
     level: int | None = None
@@ -96,6 +98,7 @@ class Target:
     order: Order = "quality"
     region: Region | None = None
     attributes: tuple[str, ...] | None = None
+    first: Region | None = None
 
     def __post_init__(self) -> None:
         limits = (self.until_rms, self.until_max, self.max_bytes, self.seconds)
@@ -113,3 +116,5 @@ class Target:
             if self.level is not None:
                 raise OptionError("expected either a level or a region, got both")
             check_spans(self.region)
+        if self.first is not None:
+            check_spans(self.first)

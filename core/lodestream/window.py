@@ -62,6 +62,12 @@ class Window:
             self._grants.append((self._granted, now))
         self._granted += size
 
+    def restart(self) -> None:
+        """What was granted and has not come will not come any more."""
+        self._granted = self._arrived
+        self._grants.clear()
+        self._round = None
+
     def arrive(self, size: int, now: float | None = None) -> None:
         """So many bytes have come and been used."""
         self._arrived += size

@@ -25,7 +25,6 @@ from .messages import (
     End,
     Error,
     Event,
-    Focus,
     Header,
     Layer,
     MessageError,
@@ -138,6 +137,7 @@ _TARGET: Mapping[str, _Read] = {
     "order": _text,
     "region": _region,
     "attributes": _names,
+    "first": _region,
 }
 
 
@@ -154,9 +154,8 @@ def _target(value: Any) -> Target:
 
 
 _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
-    Open: {"target": _target, "credit": _integer, "held": _held, "container": _digest, "ticket": _text},
+    Open: {"target": _target, "credit": _integer, "held": _held, "container": _digest, "token": _text},
     Credit: {"bytes": _positive},
-    Focus: {"region": _region},
     Stop: {},
     Bye: {},
     Header: {
@@ -177,7 +176,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
-_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "ticket"), (Focus, "region")}
+_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "token")}
 #: What is left out where it is not known.
 _UNKNOWN = {(Layer, "rms"), (Layer, "max")}
 

@@ -1,4 +1,4 @@
-"""Who may do what: tokens, tickets, and whoever sits at this very machine.
+"""Who may do what: tokens, and whoever sits at this very machine.
 
 Without a token one may read where `Settings.public_reads` says so, and do anything where nobody else can be asking:
 the socket and the Host are this machine's, nothing says that a proxy is in between, and no page of another site asks.
@@ -19,8 +19,7 @@ from lodestream.errors import LodestreamError
 
 from .problems import BadTokenError, ForeignOriginError, NoTokenError, SmallScopeError
 from .settings import Settings
-from .tickets import Tickets
-from .tokens import Token, Tokens
+from .tokens import Tokens
 
 __all__ = ["Access", "Caller", "anybody", "is_loopback", "key_of"]
 
@@ -30,7 +29,6 @@ _ADDRESS = "address "
 # Origins that the page of any site can have: one in a frame of a certain kind is called null.
 _ANY_SITE = {"*", "null"}
 
-_NO_LONGER = "expected a token that is still valid, got one that was revoked or has expired"
 
 _AUTHORITY = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^\s:/@\[\]]+))(?::(\d{1,5}))?", re.ASCII)
 _DEFAULT_PORTS = {"http": "80", "https": "443"}
@@ -80,7 +78,6 @@ class Access:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.tickets = Tickets(settings.ticket_seconds)
         self._settings = settings
         self._tokens = Tokens(settings.tokens)
         if not (settings.insecure or self._tokens.used or is_loopback(settings.host)):
@@ -129,19 +126,14 @@ class Access:
         text = _bearer(connection)
         # A server without tokens cannot tell a good one from a bad one, and whoever sends one gets no more for it.
         if text is not None and self._tokens.used:
-            token = self._tokens.find(text)
-            if token is None:
-                raise BadTokenError("expected a token that this server knows, got one that it does not, or no longer")
-            if not token.allows(scope):
-                raise SmallScopeError(f"expected a token that allows to {scope}, got one for {', '.join(token.scopes)}")
-            return _holder_of(token)
+            return self._holder(text, scope)
         hindrance = self._hindrance(connection, scope)
         if hindrance is not None:
             raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none, and {hindrance}")
         return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
-        """Who opens a stream; None when they have to show a ticket.
+        """Who opens a stream; None when their ``open`` has to hold a token.
 
         Raises
         ------
@@ -153,31 +145,17 @@ class Access:
         except NoTokenError:
             return None
 
-    def ticket(self, caller: Caller) -> str:
-        """A ticket for whoever asks; it is worth nothing any more once their token is not."""
-        return self.tickets.issue(caller.token or caller.key)
-
-    def redeem(self, ticket: str | None) -> Caller:
-        """Who shows a ticket.
+    def reader_with(self, text: str | None) -> Caller:
+        """Who shows a token in ``open``, where reading needs one.
 
         Raises
         ------
-        NoTokenError, BadTokenError
-            When there is none, or it is not, or no longer, valid.
+        NoTokenError, BadTokenError, SmallScopeError
+            When there is none, or it is not known, or does not allow to read.
         """
-        if ticket is None:
-            raise NoTokenError("expected a token with the handshake or a ticket in open, got neither")
-        holder = self.tickets.holder(ticket)
-        if holder is None:
-            raise BadTokenError(
-                f"expected a ticket that this server gave in the last {self.tickets.seconds:g} s, got another"
-            )
-        if holder.startswith(_ADDRESS):
-            return Caller(holder, holder.removeprefix(_ADDRESS))
-        token = self._tokens.known(holder)
-        if token is None:
-            raise BadTokenError(_NO_LONGER)
-        return _holder_of(token)
+        if text is None or not self._tokens.used:
+            raise NoTokenError("expected a token with the handshake or in open as the first message, got neither")
+        return self._holder(text, "read")
 
     def check(self, caller: Caller) -> None:
         """Look whether somebody who was let in earlier still may be here.
@@ -188,7 +166,15 @@ class Access:
             When their token was revoked or has expired.
         """
         if caller.token is not None and self._tokens.known(caller.token) is None:
-            raise BadTokenError(_NO_LONGER)
+            raise BadTokenError("expected a token that is still valid, got one that was revoked or has expired")
+
+    def _holder(self, text: str, scope: str) -> Caller:
+        token = self._tokens.find(text)
+        if token is None:
+            raise BadTokenError("expected a token that this server knows, got one that it does not, or no longer")
+        if not token.allows(scope):
+            raise SmallScopeError(f"expected a token that allows to {scope}, got one for {', '.join(token.scopes)}")
+        return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
     def _hindrance(self, connection: HTTPConnection, scope: str) -> str | None:
         # Why somebody without a token may not do this; None when they may.
@@ -199,10 +185,6 @@ class Access:
         if self._settings.insecure:
             return None
         return next(_signs_of_others(connection, self._settings), None)
-
-
-def _holder_of(token: Token) -> Caller:
-    return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
 
 def _signs_of_others(connection: HTTPConnection, settings: Settings) -> Iterator[str]:

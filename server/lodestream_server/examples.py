@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "TICKET", "UPLOAD", "answer"]
+__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "UPLOAD", "answer"]
 
 CONTAINER_TYPE = "application/vnd.lodestream.container"
 
@@ -23,7 +23,6 @@ QUEUED: dict[str, Any] = {
     "container": None,
 }
 
-TICKET: dict[str, Any] = {"ticket": "4pXnJ2bQ...", "seconds": 60.0}
 
 _FIGURES: dict[str, Any] = {
     "shape": [344, 403],

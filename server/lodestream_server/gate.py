@@ -59,7 +59,7 @@ class Gate:
 
 
 def caller_of(connection: HTTPConnection) -> Caller | None:
-    """Who asks; None on a route that is open to everybody, and for a stream that has to show a ticket."""
+    """Who asks; None on a route that is open to everybody, and for a stream whose ``open`` has to hold a token."""
     found: Caller | None = connection.scope[_CALLER]
     return found
 

@@ -40,7 +40,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lodestream.capacity import memory_limit
 from lodestream.errors import InputError, TooLargeError
 
 from . import results, worker
@@ -54,16 +53,13 @@ from .shares import Turns
 from .storage import Storage
 from .uploads import check_upload
 
-__all__ = ["Builder", "default_memory"]
+__all__ = ["Builder"]
 
 _log = logging.getLogger(__name__)
 
 _DEATHS = 2
 _ENDINGS = 3
 _CRASHES = 3
-
-# Python, the libraries and the kernels alone take a third of it.
-_LEAST_MEMORY = 512 << 20
 
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
 _ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -132,7 +128,7 @@ class Builder:
         self._storage = storage
         self._settings = settings
         self._finished = finished
-        self._memory = settings.build_memory or default_memory(settings.workers)
+        self._memory = settings.memory_of_build
         self.fork_server = ForkServer(worker.warm)
         self._pool = Pool(settings.workers, self.fork_server)
         self._turns = Turns(settings.workers, _REMEMBERED)
@@ -457,7 +453,7 @@ class Builder:
         return "waiting"
 
     def _out_of_memory(self) -> str:
-        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_BUILD_MEMORY)"
+        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
 
     def _job(self, record: Record, folder: Path) -> worker.Job:
         options = dict(record.options)
@@ -473,11 +469,6 @@ class Builder:
             folder=folder,
             allowed=self._settings.formats,
         )
-
-
-def default_memory(workers: int) -> int:
-    """Bytes for each of so many builds: together half of the memory, so that levels and the server have theirs."""
-    return max(memory_limit() // 2 // workers, _LEAST_MEMORY)
 
 
 def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:

@@ -343,12 +343,12 @@ class LevelQueue:
         advice = "ask for a coarser level, or stream the surface"
         seconds = self._settings.level_seconds
         try:
-            call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings.level_memory))
+            call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings.memory_of_levels))
             made: MadeLevel | RefusedLevel = await self._pool.run(call)
         except TimeoutError:
             raise TooLargeError(f"expected a level that is made within {seconds:g} s; {advice}") from None
         except MemoryError:
-            most = self._settings.level_memory >> 20
+            most = self._settings.memory_of_levels >> 20
             raise TooLargeError(f"expected a level that needs at most {most} MiB of memory; {advice}") from None
         except UnforeseenError as error:
             if error.kind == "FileNotFoundError":

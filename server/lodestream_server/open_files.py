@@ -35,7 +35,7 @@ def raise_file_limit(settings: Settings) -> None:
     if allowed < needed:
         _log.warning(
             "%d connections may need %d open files and this process may open %d, enough for %d: raise the limit "
-            "(ulimit -n) or lower LODESTREAM_MAX_CONNECTIONS",
+            "(ulimit -n)",
             wanted,
             needed,
             allowed,

@@ -9,7 +9,6 @@ import lodestream
 
 from . import examples
 from .documentation import render
-from .gate import caller_of
 from .html_page import html_page
 from .routing import Parts, readable
 from .scopes import needs
@@ -93,21 +92,6 @@ async def readyz(parts: Parts) -> Response:
 async def metrics(parts: Parts) -> Response:
     """What the server has counted and measured since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
-
-
-@router.post(
-    "/v1/tickets",
-    status_code=201,
-    summary="Get a ticket for a stream",
-    responses={201: examples.answer("A ticket, and the seconds for which it is valid", examples.TICKET)},
-)
-@needs("read")
-async def ticket(request: Request, parts: Parts) -> Response:
-    """Give what a browser puts in a stream's ``open``, since it can send no header with a WebSocket."""
-    caller = caller_of(request)
-    assert caller is not None  # the gate asks for one here
-    content = {"ticket": parts.access.ticket(caller), "seconds": parts.access.tickets.seconds}
-    return JSONResponse(content, 201, {"cache-control": "no-store"})
 
 
 def _root(request: Request) -> str:

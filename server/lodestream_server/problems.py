@@ -89,7 +89,7 @@ class NoTokenError(LodestreamError):
 
 
 class BadTokenError(LodestreamError):
-    """A token or a ticket came that is not known, or no longer."""
+    """A token came that is not known, or no longer."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="invalid_token"'}
 

@@ -1,4 +1,4 @@
-"""The settings of a server: the table's values, checked, from the environment or from whoever makes a server."""
+"""The settings of a server: the table's values, checked, from the environment or from whoever makes it; its bounds."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
 
+from lodestream.capacity import memory_limit
+
+from .bounds import Bounds
 from .table import FORMATS, PREFIX, TABLE
 
 __all__ = ["Settings"]
@@ -21,10 +30,22 @@ def _field(name: str) -> Any:
     return Field(description=setting.meaning, **default)
 
 
-class Settings(BaseSettings):
-    """Settings of a server; each is an environment variable with the prefix ``LODESTREAM_`` too.
+_LEAST_LEVEL_MEMORY = 1 << 30
+# Python, the libraries and the kernels alone take a third of it.
+_LEAST_BUILD_MEMORY = 512 << 20
 
-    `lodestream_server.table` says what each of them means.
+
+class _Environment(EnvSettingsSource):
+    """The environment, as far as the operator's settings go."""
+
+    def __call__(self) -> dict[str, Any]:
+        """Values by name."""
+        return {name: value for name, value in super().__call__().items() if name in TABLE}
+
+
+class Settings(BaseSettings, Bounds):
+    """Settings of a server. Those of `lodestream_server.table` are environment variables too, with the prefix
+    ``LODESTREAM_``; the others are its `Bounds`.
     """
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
@@ -38,35 +59,27 @@ class Settings(BaseSettings):
     token_file: Path | None = _field("token_file")
     public_reads: bool = _field("public_reads")
     origins: Annotated[tuple[str, ...], NoDecode] = _field("origins")
-    ticket_seconds: float = _field("ticket_seconds")
     formats: Annotated[tuple[str, ...], NoDecode] = _field("formats")
     upload_bytes: int = _field("upload_bytes")
-    upload_files: int = _field("upload_files")
-    max_uploads: int = _field("max_uploads")
-    max_vertices: int = _field("max_vertices")
-    max_surfaces: int = _field("max_surfaces")
     keep_free: int | None = _field("keep_free")
-    owner_bytes: int | None = _field("owner_bytes")
-    max_connections: int | None = _field("max_connections")
-    max_streams: int = _field("max_streams")
-    max_client_streams: int = _field("max_client_streams")
-    max_level_requests: int = _field("max_level_requests")
-    max_client_level_requests: int = _field("max_client_level_requests")
-    level_memory: int = _field("level_memory")
-    level_disk: int | None = _field("level_disk")
-    max_builds: int = _field("max_builds")
     workers: int = _field("workers")
-    build_memory: int | None = _field("build_memory")
-    build_seconds: float = _field("build_seconds")
-    level_seconds: float = _field("level_seconds")
-    idle_seconds: float = _field("idle_seconds")
-    upload_rate: int = _field("upload_rate")
-    head_seconds: float = _field("head_seconds")
-    bye_seconds: float = _field("bye_seconds")
+    memory: int | None = _field("memory")
     log_format: str = _field("log_format")
     log_level: str = _field("log_level")
 
-    @field_validator("*", mode="before")
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Ask whoever makes a server, then the environment."""
+        return init_settings, _Environment(settings_cls)
+
+    @field_validator(*TABLE, mode="before")
     @classmethod
     def _take(cls, value: Any, info: Any) -> Any:
         return TABLE[info.field_name].take(value)
@@ -89,3 +102,18 @@ class Settings(BaseSettings):
     def tokens(self) -> Path:
         """The file of token hashes, whether or not there is one."""
         return self.data / "tokens.json" if self.token_file is None else self.token_file
+
+    @property
+    def memory_of_build(self) -> int:
+        """Bytes of memory that one build may take."""
+        each = max(self._memory // self.workers, _LEAST_BUILD_MEMORY)
+        return each if self.build_memory is None else self.build_memory
+
+    @property
+    def memory_of_levels(self) -> int:
+        """Bytes of memory that the process may take that makes levels."""
+        return max(self._memory // 2, _LEAST_LEVEL_MEMORY) if self.level_memory is None else self.level_memory
+
+    @property
+    def _memory(self) -> int:
+        return memory_limit() // 2 if self.memory is None else self.memory

@@ -19,7 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 from lodestream.container import ByteRange
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
-from lodestream.opening import OPENED, PARAMETER, from_address
+from lodestream.opening import PARAMETER, from_address
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
@@ -39,6 +39,7 @@ from .problems import (
     NoTokenError,
     NotReadyError,
     PostponedError,
+    SmallScopeError,
     TooManyError,
 )
 from .routing import Parts
@@ -77,19 +78,21 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         if SUBPROTOCOL not in offered:
             await _refuse_handshake(socket)
             return
-        opening = socket.query_params.get(PARAMETER) if OPENED in offered else None
-        await socket.accept(subprotocol=SUBPROTOCOL if opening is None else OPENED)
+        opening = socket.query_params.get(PARAMETER)
+        await socket.accept(subprotocol=SUBPROTOCOL)
     except OSError:  # the client is gone before it was answered
         return
     caller = caller_of(socket)
     try:
         with parts.limits.stream((caller or anybody(socket)).key):
             first = None if opening is None else from_address(opening)
+            if first is not None and _token(first) is not None:
+                raise MessageError("bad-message", "expected no token in an address, where logs keep it")
             if caller is None:
-                # Nothing is told of the surface, not even whether it exists, before the ticket was seen.
+                # Nothing is told of the surface, not even whether it exists, before the token was seen.
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
-                caller = parts.access.redeem(_ticket(first))
+                caller = parts.access.reader_with(_token(first))
             record = ready(parts, surface)
             container = await asyncio.to_thread(parts.containers.open, record.container or "")
             await _stream(_Session(socket, container, parts, first, caller), surface, caller)
@@ -140,11 +143,11 @@ async def _message(socket: WebSocket) -> bytes:
     return data
 
 
-def _ticket(message: bytes) -> str | None:
+def _token(message: bytes) -> str | None:
     first = parse(message)
     if not isinstance(first, Open):
         raise MessageError("out-of-turn", f"expected open, got {first.type}")
-    return first.ticket
+    return first.token
 
 
 class _SilentError(LodestreamError):
@@ -247,14 +250,18 @@ class _Session:
             data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
             async with self._mine:
-                if self._sender.state is State.IDLE and self._long(len(data) // _BYTES_OF_A_PIECE):
+                if self._takes_long(data):
                     await self._plan(self._sender.receive, data)
                 else:
                     self._sender.receive(data)
             self._heard.set()
 
-    def _long(self, more: int = 0) -> bool:
-        return self._sender.pieces + more > _PIECES_AT_ONCE
+    def _takes_long(self, data: bytes) -> bool:
+        if self._sender.state is State.ENDED:
+            # Somebody who opens again and again does it in turn with others.
+            return isinstance(parse(data), Open)
+        pieces = self._sender.pieces + len(data) // _BYTES_OF_A_PIECE
+        return self._sender.state is State.IDLE and pieces > _PIECES_AT_ONCE
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Do what takes long beside the event loop, which serves the others meanwhile."""
@@ -267,8 +274,6 @@ class _Session:
             message = self._sender.next_message()
             if message is not None:
                 return message, None
-            if self._sender.turning and self._long():
-                return None, await self._plan(self._sender.wanted)
             return None, self._sender.wanted()
 
     async def _send(self) -> None:
@@ -297,13 +302,13 @@ class _Session:
 
     async def _hear(self) -> None:
         if self._sender.state is State.ENDED:
-            patience, what = self._settings.bye_seconds, "bye"
+            patience, what = self._settings.bye_seconds, "bye or another open"
         else:
             patience, what = (
                 self._settings.idle_seconds,
                 "open" if self._sender.state is State.IDLE else "credit or stop",
             )
-        # Messages that change nothing, such as a focus without credit, do not set the clock back.
+        # Messages that change nothing, such as a credit of nothing new, do not set the clock back.
         waited = time.monotonic() - self._progress
         await _within(patience, self._heard.wait(), what, waited)
 
@@ -352,6 +357,7 @@ def _code(error: Exception) -> str:
         (MissingError, "missing"),
         (NoTokenError, "no-token"),
         (BadTokenError, "bad-token"),
+        (SmallScopeError, "bad-token"),
         (TooManyError, "too-many"),
         (BusyError, "busy"),
         (StreamError, "damaged"),

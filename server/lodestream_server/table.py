@@ -124,7 +124,6 @@ def _choice(*words: str) -> Kind:
 
 _TEXT = Kind("text", "TEXT", str)
 _INTEGER = Kind("an integer", "N", int)
-_SECONDS = Kind("seconds", "S", float, lambda value: f"{value:g}")
 _SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", _size, _show_size)
 _SWITCH = Kind("yes or no", "", _switch, lambda value: "yes" if value else "no")
 _PATH = Kind("a path", "PATH", _path)
@@ -148,8 +147,6 @@ class Setting:
         Key of `GROUPS`.
     least, most : number or None
         Limits, themselves allowed.
-    above : number or None
-        Limit, itself not allowed.
     metavar : str
         What stands for the value on the command line; the kind's own if empty.
     usual : str
@@ -163,7 +160,6 @@ class Setting:
     group: str
     least: float | None = None
     most: float | None = None
-    above: float | None = None
     metavar: str = ""
     usual: str = ""
 
@@ -185,8 +181,6 @@ class Setting:
     @property
     def limits(self) -> str:
         """The limits, in words; empty if there are none."""
-        if self.above is not None:
-            return f"more than {self.kind.show(self.above)}"
         if not self.least and self.most is None:
             return ""
         least = self.kind.show(self.least)
@@ -212,21 +206,11 @@ class Setting:
 
     def _within(self, value: float) -> bool:
         # Written so that NaN is outside.
-        return (
-            (self.least is None or value >= self.least)
-            and (self.most is None or value <= self.most)
-            and (self.above is None or self.above < value < float("inf"))
-        )
+        return (self.least is None or value >= self.least) and (self.most is None or value <= self.most)
 
 
 def _processors() -> int:
     return max(1, (os.cpu_count() or 1) - 1)
-
-
-def _quarter_of_the_memory() -> int:
-    from lodestream.capacity import memory_limit
-
-    return max(memory_limit() // 4, 1 << 30)
 
 
 #: The groups of settings, and what they are about.
@@ -234,7 +218,6 @@ GROUPS: Mapping[str, str] = {
     "network": "where the server listens, and how it is reached",
     "access": "who may do what",
     "limits": "how much is taken",
-    "time": "how long is waited",
     "operation": "what the operator sees",
 }
 
@@ -288,7 +271,6 @@ _SETTINGS = (
         metavar="A,B",
         usual="none",
     ),
-    Setting("ticket_seconds", _SECONDS, 60.0, "how long a ticket for a browser's stream is valid", "access", above=0),
     Setting(
         "formats",
         _FORMATS,
@@ -298,10 +280,6 @@ _SETTINGS = (
         usual=f"all but {', '.join(_LEFT_OUT)}",
     ),
     Setting("upload_bytes", _SIZE, 4 << 30, "most bytes of one upload", "limits", 1),
-    Setting("upload_files", _INTEGER, 64, "most files of one upload", "limits", 1),
-    Setting("max_uploads", _INTEGER, 64, "most uploads at the same time", "limits", 1),
-    Setting("max_vertices", _INTEGER, 1 << 28, "most vertices of one surface", "limits", 1),
-    Setting("max_surfaces", _INTEGER, 100_000, "most surfaces", "limits", 1),
     Setting(
         "keep_free",
         _SIZE,
@@ -312,62 +290,6 @@ _SETTINGS = (
         usual="1GiB, or a twentieth of the disk if that is less",
     ),
     Setting(
-        "owner_bytes",
-        _SIZE,
-        None,
-        "most bytes on the disk, of uploads and containers, of one owner: of one token's name, or of all those without "
-        "a token together",
-        "limits",
-        1,
-        usual="as much as stays free beside them; no limit where only this machine can write",
-    ),
-    Setting(
-        "max_connections",
-        _INTEGER,
-        None,
-        "most connections of all kinds at the same time",
-        "limits",
-        1,
-        usual="5000, or as many as the limit of open files is enough for (ulimit -n)",
-    ),
-    Setting("max_streams", _INTEGER, 2000, "most streams at the same time", "limits", 1),
-    Setting(
-        "max_client_streams",
-        _INTEGER,
-        1000,
-        "most streams at the same time of one client: of one token, or without one of one address",
-        "limits",
-        1,
-    ),
-    Setting("max_level_requests", _INTEGER, 32, "most requests for levels that wait at the same time", "limits", 1),
-    Setting(
-        "max_client_level_requests",
-        _INTEGER,
-        16,
-        "most requests for levels of one client at the same time, counted until the answer has been read",
-        "limits",
-        1,
-    ),
-    Setting(
-        "level_memory",
-        _SIZE,
-        _quarter_of_the_memory,
-        "most memory of the process that makes levels as files, one at a time",
-        "limits",
-        256 << 20,
-        usual="a quarter of the memory there is",
-    ),
-    Setting(
-        "level_disk",
-        _SIZE,
-        None,
-        "disk space for levels as files, of which one may take a quarter",
-        "limits",
-        2 << 20,
-        usual="4GiB, or a twentieth of the disk if that is less",
-    ),
-    Setting("max_builds", _INTEGER, 1000, "most builds that wait or run", "limits", 1),
-    Setting(
         "workers",
         _INTEGER,
         _processors,
@@ -377,35 +299,13 @@ _SETTINGS = (
         usual="one less than there are processors",
     ),
     Setting(
-        "build_memory",
+        "memory",
         _SIZE,
         None,
-        "most memory of one build",
+        "most memory of all builds together; beside them, the process that makes levels as files may take half as much",
         "limits",
         256 << 20,
-        usual="half of the memory there is, divided by the builds at the same time",
-    ),
-    Setting("build_seconds", _SECONDS, 3600.0, "longest time of one build, and most processor time", "time", above=0),
-    Setting("level_seconds", _SECONDS, 120.0, "longest time in which one level is made", "time", above=0),
-    Setting(
-        "idle_seconds",
-        _SECONDS,
-        60.0,
-        "longest silence of a client, in a stream, an upload or an answer that it does not take",
-        "time",
-        above=0,
-    ),
-    Setting(
-        "upload_rate",
-        _SIZE,
-        1024,
-        "least bytes a second of an upload, over each stretch of idle_seconds; 0 for no such limit",
-        "time",
-        0,
-    ),
-    Setting("head_seconds", _SECONDS, 20.0, "longest time in which the head of a request has to come", "time", above=0),
-    Setting(
-        "bye_seconds", _SECONDS, 10.0, "longest wait for a client's bye after the end of a stream", "time", above=0
+        usual="half of the memory there is",
     ),
     Setting("log_format", _choice("text", "json"), "text", "how the log is written to standard error", "operation"),
     Setting(

@@ -32,28 +32,27 @@ _INTRODUCTION = """\
 
 This page is `--help` of every command, written by `python -m tests.client.manual` and checked by a test.
 
-- Results go to standard output; progress, notes and errors to standard error. With `--json`, standard output is one
+- Results go to standard output; progress, notes and errors go to standard error. With `--json`, standard output is one
   JSON object.
-- Notes on standard error name what does not come along: what a file has and a surface has not, values of attributes
-  at holes, what a format has no place for. Those of a server's build come back with `push`, and stand in the
-  surface's `notes`.
-- Exit code 0: done. 1: it could not be done, and one line says why. 2: the command line alone is wrong. 130:
-  interrupted by Ctrl-C, without a word where nothing had begun; 143: ended by SIGTERM.
-- A path `-` is standard input or output. A file is written beside its name and renamed when it is whole.
-- `decode` and `pull` with `--json` print `bytes` (held of the surface, comparable with the layers of `info`),
-  `wire_bytes` (all that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
+- Notes on standard error name what is not kept: what the surface of a file cannot hold, values of attributes at holes,
+  what the format of OUT cannot hold. Notes of a server's build come back with `push` and are in the surface's `notes`.
+- Exit codes: 0 success, 1 failure (one line says why), 2 wrong command line, 130 interrupted by Ctrl-C, 143 ended by
+  SIGTERM.
+- The path `-` is standard input or output. Files are written under a temporary name and renamed when they are complete.
+- `decode` and `pull` with `--json` print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes`
+  (everything that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
   bytes, seconds, stopped or truncated.
-- A `pull` that is interrupted, or whose server is gone for good, writes OUT from what came, as after an early stop. Its
-  exit code is then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer there is no OUT, and one
-  that was there stays as it was. What came is kept, whether `--resume` was given or not, also of a `pull` that is
-  killed; the next one with `--resume` asks only for the rest. A `pull` that ends as it should removes what it kept,
-  with `--resume` only when it has the whole surface. Where nothing can be kept, a `pull` without `--resume` goes on.
-- A limit that is out of reach gives the complete surface, with a note.
-- `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the whole surface, `--attributes speed,kind`
-  these attributes beside the points, `--attributes none` the points alone; both go with each other and with the limits,
-  but a window not with `--level`. What only the rest needs is not asked for. `rms` and `max` of a window are null until
-  it is complete.
-- Clients take a token from `--token` or the environment variable `LODESTREAM_TOKEN`.
+- A `pull` that is interrupted, or whose server does not come back, writes OUT from what was received. Its exit code is
+  then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer OUT is not touched. What was received
+  is kept on disk, with or without `--resume` and even if the `pull` is killed; the next `pull --resume` asks only for
+  the rest. A `pull` that succeeds deletes it,
+  with `--resume` only when it has the whole surface. If it cannot be kept, a `pull` without `--resume` goes on.
+- If a limit cannot be reached, the result is the complete surface, with a note.
+- `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind` takes
+  only these attributes, `--attributes none` the points alone. Both can be combined with each other and with the limits,
+  but a window not with `--level`. Only what they need is sent. `rms` and `max` of a window are null until it is
+  complete.
+- Clients take a token from `--token` or from the environment variable `LODESTREAM_TOKEN`.
 """
 
 

@@ -11,7 +11,6 @@ import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tenacity import wait_random_exponential
 
 import lodestream as ls
 from lodestream.errors import OptionError
@@ -27,7 +26,8 @@ Heights = NDArray[np.int16]
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads, "_WAIT", wait_random_exponential(multiplier=0.002, max=0.05))
+    monkeypatch.setattr(roads, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(roads, "_LONGEST_PAUSE", 0.05)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from websockets.sync.server import ServerConnection
 
@@ -182,27 +181,3 @@ def test_no_colours_and_no_bars_where_there_is_no_terminal(container_file: Path,
     assert b"\x1b" not in done.stdout + done.stderr
     assert done.stdout == b""
     assert done.stderr.count(b"\n") == 1
-
-
-def test_the_demo(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="the demo draws with matplotlib")
-    # As the command does it, over a link that is ten times as fast.
-    code = (
-        "import importlib, sys; from lodestream_client.__main__ import main;"
-        "importlib.import_module('lodestream_client.demo.show')._LINK *= 10; sys.exit(main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, "demo", "--out", str(tmp_path / "demo"), "--json"]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=120, check=False)
-    assert done.returncode == 0, done.stderr.decode()
-    shown = json.loads(done.stdout)
-    assert [it["name"] for it in shown["surfaces"]] == ["jacksboro", "torus"]
-    for surface in shown["surfaces"]:
-        assert f"{surface['rms']:.9g}" == f"{surface['rms_found']:.9g}"
-        assert f"{surface['max']:.9g}" == f"{surface['max_found']:.9g}"
-        assert surface["bytes"] < surface["raw_bytes"] / 2
-    assert shown["surfaces"][1]["ended"] == "rms"
-    assert shown["surfaces"][1]["bytes"] < shown["surfaces"][1]["whole_bytes"] / 10
-    assert (tmp_path / "demo" / "moments.png").read_bytes().startswith(b"\x89PNG")
-    torus = lodestream.read(tmp_path / "demo" / "torus.obj")
-    assert torus.shape == (384, 192)
-    assert np.isfinite(torus.points).all()

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tenacity import wait_random_exponential
 
 import lodestream as ls
 import lodestream_client as client
+from lodestream.reception import MemoryStore
 from lodestream_client import cache, roads, sync
 from lodestream_client.stream import BaseStream
 from tests.links import Fault, Link, linked
@@ -38,10 +38,11 @@ LATER = Fault(cut_down=0)
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waits between attempts that are in proportion to a link within one machine."""
-    monkeypatch.setattr(roads, "_WAIT", wait_random_exponential(multiplier=0.002, max=0.05))
+    monkeypatch.setattr(roads, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(roads, "_LONGEST_PAUSE", 0.05)
 
 
-def follow(url: str | list[str], asynchronous: bool, **options: Any) -> tuple[list[ls.View], BaseStream]:
+def follow(url: str, asynchronous: bool, **options: Any) -> tuple[list[ls.View], BaseStream]:
     options = {"close_timeout": 0.5, **options}
     if not asynchronous:
         with sync.connect(url, **options) as stream:
@@ -92,26 +93,17 @@ def test_every_target_survives(surface: str, asynchronous: bool, target: ls.Targ
     assert nothing_twice(stream)
 
 
-def test_another_server_goes_on(surface: str, terrain: Terrain, asynchronous: bool) -> None:
-    def first_only(number: int) -> Fault:
-        return Fault(cut_down=5000) if number == 0 else LATER
-
-    with linked(surface, first_only) as one, linked(surface, Fault()) as other:
-        views, stream = follow([one.url, other.url], asynchronous, window=2000)
+def test_another_address_goes_on_with_what_is_held(surface: str, terrain: Terrain, asynchronous: bool) -> None:
+    store = MemoryStore()
+    with linked(surface, breaks_after(5000)) as one, pytest.raises(ls.TruncatedStreamError):
+        follow(one.url, asynchronous, window=2000, store=store, deadline=0, transport="ws")
+    details = sync.describe(surface).details
+    container, size = str(details["container"]), int(details["bytes"])
+    with linked(surface, Fault()) as other:
+        views, stream = follow(other.url, asynchronous, store=store, container=container, size=size)
     assert np.array_equal(views[-1].points, terrain)
-    assert other.connections == 1
-    assert stream.url == other.url
-    assert nothing_twice(stream)
-
-
-def test_of_several_addresses_some_may_be_wrong(
-    surface: str, server: str, terrain: Terrain, asynchronous: bool
-) -> None:
-    wrong = ["http://127.0.0.1:9/v1/surfaces/ab", f"{server}/v1/surfaces/0123456789abcdef0123"]
-    views, _ = follow([*wrong, surface], asynchronous)
-    assert np.array_equal(views[-1].points, terrain)
-    with pytest.raises(ls.NotFoundError):
-        follow(wrong[1:], asynchronous)
+    assert 0 < stream.data_bytes < size - 2000
+    assert stream.data_bytes < stream._reception.held.total
 
 
 def test_a_connection_that_falls_silent_is_replaced(surface: str, terrain: Terrain, asynchronous: bool) -> None:
@@ -146,7 +138,7 @@ def test_where_nobody_listens_it_is_told_soon(asynchronous: bool) -> None:
 
 
 def test_stopping_while_there_is_no_connection(surface: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads, "_WAIT", wait_random_exponential(multiplier=30.0, min=20.0))
+    monkeypatch.setattr("random.uniform", lambda least, most: 500.0)
     with linked(surface, lambda number: Fault(cut_down=5000) if number == 0 else LATER) as link:
         with sync.connect(link.url, deadline=1000, window=2000, close_timeout=0.2, transport="ws") as stream:
             next(stream)
@@ -204,7 +196,7 @@ def test_a_wish_that_cannot_be_met_is_told_at_once(surface: str, asynchronous: b
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"transport": "carrier pigeon"}, "auto, ws or http"), ({"deadline": -1.0}, "deadline"), ({"url": []}, "address")],
+    [({"transport": "carrier pigeon"}, "auto, ws or http"), ({"deadline": -1.0}, "deadline")],
 )
 def test_options_that_do_not_exist(surface: str, options: dict[str, Any], words: str) -> None:
     with pytest.raises(ls.OptionError, match=words):
@@ -367,10 +359,15 @@ def test_a_pull_from_a_server_that_falls_silent_ends(run: Run, surface: str, tmp
     assert "has sent nothing for 0.4 seconds" in stderr
 
 
-def test_replicas_and_retry_of_the_command(run: Run, surface: str, tmp_path: Path, terrain: Terrain) -> None:
-    with linked(surface, lambda number: Fault(cut_down=5000) if number == 0 else LATER) as link:
-        code, _, stderr = run("pull", link.url, tmp_path / "o.npy", "--replica", surface, "--retry", "20")
+def test_resume_at_another_address_and_retry_of_the_command(
+    run: Run, surface: str, folder: Path, tmp_path: Path, terrain: Terrain
+) -> None:
+    # The first connection asks what there is, the second is the stream.
+    with linked(surface, lambda number: Fault(cut_down=9000) if number < 2 else LATER) as link:
+        assert run("pull", link.url, tmp_path / "o.npy", "--resume", "--retry", "0.5")[0] == 1
+    code, stdout, stderr = run("pull", surface, tmp_path / "o.npy", "--resume", "--json")
     assert code == 0, stderr
+    assert json.loads(stdout)["wire_bytes"] < int(sync.describe(surface).details["bytes"]) - 2000
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
     for retry in ("-1", "soon", "inf"):
         assert run("pull", surface, tmp_path / "o.npy", "--retry", retry)[0] == 2

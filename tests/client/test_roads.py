@@ -1,4 +1,4 @@
-"""Which address is tried next, by which road, and after how long."""
+"""Which road is tried next, and after how long."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from websockets.http11 import Response
 
 import lodestream as ls
 from lodestream.errors import LodestreamError, RemoteError
-from lodestream_client import roads
 from lodestream_client.errors import SilenceError, UnreachableError
 from lodestream_client.roads import Roads, Transport
 
-ONE, TWO, FILE = "http://one/v1/surfaces/ab", "http://two/v1/surfaces/ab", "http://three/ab.lode"
+ONE, FILE = "http://one/v1/surfaces/ab", "http://three/ab.lode"
 LOST = UnreachableError("no connection")
 
 
@@ -29,15 +28,15 @@ def refused(status: int, body: bytes) -> LodestreamError:
 
 @pytest.fixture(autouse=True)
 def without_chance(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads, "_WAIT", lambda state: 0.1 * 2**state.attempt_number)
+    monkeypatch.setattr("random.uniform", lambda least, most: most / 2)
 
 
 def road(made: Roads) -> str:
-    return made.place.road
+    return made.road
 
 
-def met(*urls: str, deadline: float = 60.0) -> Roads:
-    made = Roads(urls, "auto", deadline)
+def met(url: str, deadline: float = 60.0) -> Roads:
+    made = Roads(url, "auto", deadline)
     made.met = True
     made.start(0.0)
     return made
@@ -48,15 +47,6 @@ def test_waits_grow_until_something_comes() -> None:
     assert [made.failed(LOST, 0.0, progressed=False) for _ in range(3)] == [0.2, 0.4, 0.8]
     assert made.failed(LOST, 5.0, progressed=True) == 0.2
     assert made.failed(LOST, 5.0, progressed=False) == 0.4
-
-
-def test_addresses_take_turns() -> None:
-    made = met(ONE, TWO, FILE)
-    seen = []
-    for _ in range(4):
-        seen.append(made.place.url)
-        made.failed(LOST, 0.0, progressed=True)
-    assert seen == [ONE, TWO, FILE, ONE]
 
 
 def test_a_road_that_leads_nowhere_is_left_for_the_other() -> None:
@@ -72,12 +62,12 @@ def test_a_road_that_leads_nowhere_is_left_for_the_other() -> None:
 def test_only_the_roads_that_are_allowed() -> None:
     only: tuple[Transport, ...] = ("ws", "http")
     for transport in only:
-        made = Roads([ONE], transport, 60.0)
+        made = Roads(ONE, transport, 60.0)
         made.met = True
         for _ in range(3):
             assert road(made) == transport
             made.failed(LOST, 0.0, progressed=False)
-    made = Roads([FILE], "auto", 60.0)
+    made = Roads(FILE, "auto", 60.0)
     assert road(made) == "http"
 
 
@@ -95,7 +85,7 @@ def test_the_deadline_counts_from_the_loss() -> None:
 
 @pytest.mark.parametrize("body", [b"", b"<html>", b"[]"])
 def test_a_proxy_that_refuses_sockets_is_gone_around_at_once(body: bytes) -> None:
-    made = Roads([ONE], "auto", 60.0)
+    made = Roads(ONE, "auto", 60.0)
     assert made.failed(refused(501, body), 0.0, progressed=False) == 0
     assert road(made) == "http"
     with pytest.raises(RemoteError, match=r"gone wrong \(and by WebSocket: no\)"):
@@ -103,7 +93,7 @@ def test_a_proxy_that_refuses_sockets_is_gone_around_at_once(body: bytes) -> Non
 
 
 def test_what_the_server_itself_says_is_final() -> None:
-    made = Roads([ONE], "auto", 60.0)
+    made = Roads(ONE, "auto", 60.0)
     with pytest.raises(RemoteError):
         made.failed(refused(403, b'{"code": "bad-token"}'), 0.0, progressed=False)
     made = met(ONE)
@@ -116,7 +106,7 @@ def test_a_handshake_that_breaks_tells_nothing_once_another_did_not() -> None:
     made = met(ONE)
     made.failed(caused(UnreachableError("broke"), caused_by_end()), 0.0, progressed=True)
     assert road(made) == "ws"
-    made = Roads([ONE], "auto", 60.0)
+    made = Roads(ONE, "auto", 60.0)
     assert made.failed(broken, 0.0, progressed=False) == 0
     assert road(made) == "http"
 
@@ -128,7 +118,7 @@ def caused_by_end() -> Exception:
 
 
 def test_before_anybody_answered_there_are_three_attempts() -> None:
-    made = Roads([ONE], "ws", 60.0)
+    made = Roads(ONE, "ws", 60.0)
     made.start(0.0)
     made.failed(LOST, 0.0, progressed=False)
     made.failed(LOST, 0.0, progressed=False)
@@ -136,15 +126,10 @@ def test_before_anybody_answered_there_are_three_attempts() -> None:
         made.failed(LOST, 0.0, progressed=False)
 
 
-def test_another_address_may_have_what_one_has_not() -> None:
-    made = Roads([ONE, TWO], "ws", 60.0)
-    assert made.failed(ls.NotFoundError("not here"), 0.0, progressed=False) == 0
-    assert made.place.url == TWO
-    with pytest.raises(ls.NotFoundError):
-        made.failed(ls.NotFoundError("nor here"), 0.0, progressed=False)
-    made = Roads([ONE, TWO], "ws", 60.0)
-    with pytest.raises(ls.OptionError):
-        made.failed(ls.OptionError("no such level"), 0.0, progressed=False)
+def test_what_no_other_attempt_mends_is_final() -> None:
+    for error in (ls.NotFoundError("not here"), ls.OptionError("no such level")):
+        with pytest.raises(type(error)):
+            Roads(ONE, "ws", 60.0).failed(error, 0.0, progressed=False)
 
 
 @pytest.mark.parametrize("code", ["restarting", "idle", "busy", "too-many", "internal", "http-502", "http-503"])

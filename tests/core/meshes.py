@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lodestream.mesh import Mesh, faces_of
+from lodestream.formats.mesh_output import output_of
+from lodestream.mesh import Mesh
 from lodestream.surface import Surface
 
 #: Faces as lists of vertices.
@@ -94,9 +95,24 @@ def without_sense(faces: Iterable[Sequence[Any]]) -> Counter[tuple[Any, ...]]:
     )
 
 
+class Drawn(NamedTuple):
+    """The mesh that the formats for meshes write."""
+
+    vertices: NDArray[Any]
+    quads: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    attributes: dict[str, NDArray[Any]]
+
+
+def drawn(surface: Surface) -> Drawn:
+    """The mesh of a surface, vertices as rows of x, y and z."""
+    output = output_of(surface)
+    return Drawn(np.stack(output.coordinates, axis=-1), output.quads, output.triangles, output.attributes)
+
+
 def faces_out(surface: Surface) -> tuple[FaceList, dict[str, NDArray[Any]]]:
     """Faces of a surface's mesh, and its vertices' attributes."""
-    mesh = faces_of(surface)
+    mesh = drawn(surface)
     return [*mesh.quads.tolist(), *mesh.triangles.tolist()], mesh.attributes
 
 

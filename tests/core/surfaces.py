@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.container import Index, read_index
 from lodestream.decoder import Decoder, View
-from lodestream.plan import Plan
+from lodestream.plans import Plan
 
 __all__ = ["SAMPLES", "contained", "errors", "figures", "follow", "index_of", "terrain", "torus"]
 

@@ -6,6 +6,7 @@ import hashlib
 import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from random import Random
 from types import FrameType
@@ -20,8 +21,7 @@ import lodestream as ls
 from lodestream.container import Header, Index, read_index
 from lodestream.download import Download, Ended
 from lodestream.errors import OptionError
-from lodestream.focus import focused
-from lodestream.messages import MAX_DATA, MAX_HELD, Focus, Layer, MessageError, Open, Segments
+from lodestream.messages import MAX_DATA, MAX_HELD, Layer, MessageError, Open, Segments, Stop
 from lodestream.plan import plan
 from lodestream.ranges import RangeSet
 from lodestream.reception import MemoryStore, Reception
@@ -287,27 +287,6 @@ def test_what_the_server_says_of_layers_is_what_the_client_sees(target: ls.Targe
     assert [layer.bytes for layer in link.layers] == sorted(layer.bytes for layer in link.layers)
 
 
-def test_many_changes_cost_as_much_as_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def counted(*arguments: object) -> object:
-        calls.append(arguments)
-        return focused(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("lodestream.sender.focused", counted)
-    server = Sender(index("integers"), hashlib.sha256(container("integers")).hexdigest())
-    server.receive(serialize(Open(credit=0)))
-    assert server.next_message() is not None
-    for number in range(1000):
-        server.receive(serialize(Focus(((number % 300, 350), (0, 10)))))
-        assert server.next_message() is None
-        assert server.wanted() is None
-    assert not calls
-    server._connection.credit = MAX_DATA
-    assert server.wanted() is not None
-    assert len(calls) == 1
-
-
 def test_a_view_does_not_look_again_for_the_tiles_of_the_region(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
 
@@ -324,25 +303,6 @@ def test_a_view_does_not_look_again_for_the_tiles_of_the_region(monkeypatch: pyt
     link.run()
     assert len(link.views) > views + 3
     assert not looked
-
-
-def test_changes_without_end_are_earned_by_taking_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def counted(*arguments: object) -> object:
-        calls.append(arguments)
-        return focused(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("lodestream.sender.focused", counted)
-    link = Link("integers", ls.Target(), 20)
-    for number in range(200):
-        link.focus(((0, 1 + number), (0, 10)))
-        link.run(until=link.reception.data_bytes + 10)
-    assert 15 < len(calls) <= 16 + link.reception.data_bytes // 4096
-    before = len(calls)
-    link.run()
-    assert before < len(calls), "the last one is obeyed in the end"
-    check_end(link.reception, "integers", ls.Target())
 
 
 def steps_of(work: Callable[[], object]) -> int:
@@ -378,30 +338,9 @@ def test_the_work_of_a_plan_grows_as_what_it_is_made_of(target: ls.Target) -> No
         while server.next_message() is not None:
             pass
         opening = steps_of(lambda server=server: plan(found, target, server.held))  # type: ignore[misc]
-        server.receive(serialize(Focus(NEAR)))
-        turning = steps_of(server.wanted)
+        turning = steps_of(lambda server=server: plan(found, replace(target, first=NEAR), server.held))  # type: ignore[misc]
         assert opening < 12 * server.pieces
         assert turning < 29 * server.pieces
-
-
-def test_changes_among_many_pieces_are_earned_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def counted(*arguments: object) -> object:
-        calls.append(arguments)
-        return focused(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("lodestream.sender.focused", counted)
-    sha256 = hashlib.sha256(container("floats")).hexdigest()
-    server = Sender(index("floats"), sha256)
-    server.receive(serialize(Open(held=crumbs("floats", MAX_HELD), container=sha256)))
-    while server.next_message() is not None:
-        pass
-    for number in range(200):
-        server.receive(serialize(Focus(((0, 1 + number), (0, 10)))))
-        assert server.wanted() is not None
-    assert 1 <= len(calls) <= 4
-    assert not server.turning
 
 
 def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
@@ -411,7 +350,7 @@ def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
         link.serve()
     link.focus(FAR)
     link.hear()
-    assert link.server.wanted() != wanted
+    assert link.server.wanted() is None
     link.server.provide(wanted, container("integers")[wanted.offset : wanted.end])
     link.run()
     check_end(link.reception, "integers", ls.Target())
@@ -424,7 +363,7 @@ def test_a_region_outside_is_refused_on_either_side(region: Region) -> None:
     with pytest.raises(OptionError, match=r"expected (rows|columns) within"):
         link.client.focus(region)
     with pytest.raises(MessageError, match=r"expected (rows|columns) within") as refused:
-        link.server.receive(serialize(Focus(region)))
+        Sender(index("integers"), "ab" * 32).receive(serialize(Open(ls.Target(first=region))))
     assert refused.value.code == "bad-target"
     link.run()
     check_end(link.reception, "integers", ls.Target())
@@ -435,7 +374,34 @@ def test_a_region_without_a_point_is_refused_before_anything_is_known(region: Re
     with pytest.raises(OptionError, match="at least one row and column"):
         Reception().focus(region)
     with pytest.raises(OptionError, match="at least one row and column"):
-        Focus(region)
+        ls.Target(first=region)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("target", TARGETS, ids=repr)
+def test_a_region_that_comes_first_from_the_beginning(kind: str, target: ls.Target) -> None:
+    link = Link(kind, replace(target, first=NEAR), 3000)
+    link.run()
+    check_end(link.reception, kind, target)
+
+
+def test_looking_elsewhere_opens_again_on_the_same_connection() -> None:
+    link = Link("integers", ls.Target(), 4000)
+    link.run(until=20_000)
+    for region in (NEAR, FAR, None):
+        link.focus(region)
+        link.focus(region)  # the same again is nothing new
+        assert [parse(message) for message in link.to_server] == [Stop()]
+        link.hear()
+        while link.serve() or link.to_client:
+            while link.to_client:
+                link.take()
+        opened = parse(link.to_server[-1])
+        assert isinstance(opened, Open)
+        assert (opened.target.first, opened.held, opened.container) == (region, (), None)
+        link.run(until=link.reception.data_bytes + 5000)
+    link.run()
+    check_end(link.reception, "integers", ls.Target())
 
 
 def test_a_focus_after_the_end_does_nothing() -> None:
@@ -456,12 +422,7 @@ def test_an_index_that_came_in_part_does_not_stand_in_the_way_of_metadata() -> N
         first.run(until=first.reception.data_bytes + 1)
     assert not first.reception.held.covers(place.offset, place.length)
     second = Link("integers", target, MAX_DATA, first.reception)
-    second.hear()  # the focus is under way until all has been sent
-    while second.serve():
-        while second.to_client:
-            second.take()
-    while second.to_server:
-        second.hear()
+    second.focus(None)
     second.run()
     check_end(first.reception, "integers", target)
     assert first.reception.decoder.metadata is not None

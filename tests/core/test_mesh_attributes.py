@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream.mesh import CornerAttribute, Mesh, faces_of, weld
+from lodestream.mesh import CornerAttribute, Mesh, weld
 from lodestream.mesh.recognise import recognise
 from lodestream.surface import Surface
 
-from .meshes import FaceList, collapse, cut_in_two, grid_faces
+from .meshes import FaceList, collapse, cut_in_two, drawn, grid_faces
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -74,7 +74,7 @@ def corners_of(faces: FaceList, numbers: NDArray[Any], values: NDArray[Any]) -> 
 def assert_same_corners(
     surface: Surface, faces: FaceList, texture: list[list[tuple[Any, ...]]], name: str = "uv"
 ) -> None:
-    mesh = faces_of(surface)
+    mesh = drawn(surface)
     out = corners_of([*mesh.quads.tolist(), *mesh.triangles.tolist()], mesh.attributes["number"], mesh.attributes[name])
     expected: Counter[Any] = Counter()
     for face, places in zip(faces, texture, strict=True):

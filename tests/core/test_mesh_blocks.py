@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lodestream.errors import FormatError
-from lodestream.mesh import Mesh, faces_of, weld
+from lodestream.mesh import Mesh, weld
 from lodestream.mesh.recognise import recognise
 from lodestream.surface import Block, Surface
 
-from .meshes import FaceList, assert_same_faces, collapse, cut_in_two, grid_faces, mesh_of, scrambled, star
+from .meshes import FaceList, assert_same_faces, collapse, cut_in_two, drawn, grid_faces, mesh_of, scrambled, star
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -118,7 +118,7 @@ def test_coincident_vertices_of_one_grid_stay_apart() -> None:
     points[:, 5] = points[:, 0]  # closed to the eye, open to the faces
     surface = recognise(Mesh.of(points.reshape(-1, 3), grid_faces(7, 6))).surface()
     assert surface.shape == (7, 6)
-    assert len(faces_of(surface).vertices) == 42
+    assert len(drawn(surface).vertices) == 42
 
 
 def test_points_of_two_blocks_are_welded_whatever_their_direction() -> None:
@@ -153,33 +153,33 @@ def test_a_collapsed_side_of_a_block_becomes_triangles() -> None:
     points = np.random.default_rng(0).random((4, 5, 3))
     points[0] = points[0, 0]
     other = points + 5
-    welded = faces_of(Surface(blocks=[Block(points), Block(other)]))
+    welded = drawn(Surface(blocks=[Block(points), Block(other)]))
     assert (len(welded.quads), len(welded.triangles)) == (16, 8)
-    single = faces_of(Surface(points))  # repeated vertices stay as they are
+    single = drawn(Surface(points))  # repeated vertices stay as they are
     assert (len(single.quads), len(single.triangles), len(single.vertices)) == (12, 0, 20)
 
 
 def test_cells_at_holes_have_no_face() -> None:
     points = np.random.default_rng(0).random((5, 6, 3))
     points[2, 3, 1] = np.nan
-    mesh = faces_of(Surface(points))
+    mesh = drawn(Surface(points))
     assert (len(mesh.vertices), len(mesh.quads)) == (29, 16)
     assert np.isfinite(mesh.vertices).all()
 
 
 def test_heights_and_planar_points_have_places() -> None:
     heights = np.arange(6, dtype=np.int16).reshape(2, 3)
-    mesh = faces_of(Surface(heights))
+    mesh = drawn(Surface(heights))
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 1], [2, 0, 2], [0, 1, 3], [1, 1, 4], [2, 1, 5]]
-    placed = faces_of(Surface(heights, metadata={"geotransform": [100.0, 10.0, 1.0, 500.0, 2.0, -20.0]}))
+    placed = drawn(Surface(heights, metadata={"geotransform": [100.0, 10.0, 1.0, 500.0, 2.0, -20.0]}))
     assert placed.vertices[3].tolist() == [106.5, 471.0, 3.0]
-    flat = faces_of(Surface(np.ones((2, 2, 2), np.float32)))
+    flat = drawn(Surface(np.ones((2, 2, 2), np.float32)))
     assert flat.vertices.tolist() == [[1, 1, 0]] * 4
 
 
 def test_channels_beyond_the_third_are_attributes() -> None:
     points = np.random.default_rng(0).random((3, 3, 5))
-    mesh = faces_of(Surface(points))
+    mesh = drawn(Surface(points))
     assert mesh.vertices.shape == (9, 3)
     np.testing.assert_array_equal(mesh.attributes["attribute_1"], points[..., 4].reshape(-1))
 
@@ -199,7 +199,7 @@ def test_channels_beyond_the_third_are_attributes() -> None:
 def test_metadata_that_say_nothing_sensible_about_meshes_are_refused(metadata: dict[str, object]) -> None:
     blocks = [Block(np.random.default_rng(0).random((3, 3, 3))) for _ in range(2)]
     with pytest.raises(ValueError, match=r"expected .* in the metadata"):
-        faces_of(Surface(blocks=blocks, metadata=metadata))
+        drawn(Surface(blocks=blocks, metadata=metadata))
 
 
 @settings(deadline=None)
@@ -229,7 +229,7 @@ def test_a_window_of_a_sphere_has_no_pole() -> None:
     numbers = {vertex: index for index, vertex in enumerate(sorted({corner for face in faces for corner in face}))}
     surface = recognise(mesh_of([[numbers[corner] for corner in face] for face in faces], 41)).surface()
     window = Surface(surface.points[2:, :5], metadata=surface.metadata)
-    mesh = faces_of(window)
+    mesh = drawn(window)
     assert (len(mesh.vertices), len(mesh.quads), len(mesh.triangles)) == (20, 12, 0)
 
 

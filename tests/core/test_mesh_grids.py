@@ -8,11 +8,11 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from lodestream.errors import FormatError
-from lodestream.mesh import Mesh, faces_of
+from lodestream.mesh import Mesh
 from lodestream.mesh.recognise import recognise
 from lodestream.surface import Surface
 
-from .meshes import assert_same_faces, collapse, cut_in_two, grid_faces, mesh_of, scrambled
+from .meshes import assert_same_faces, collapse, cut_in_two, drawn, grid_faces, mesh_of, scrambled
 
 CLOSED = [(False, False), (True, False), (False, True), (True, True)]
 SEEDS = st.integers(0, 2**32 - 1)
@@ -109,7 +109,7 @@ def test_quads_that_name_the_pole_twice_come_back_so() -> None:
     faces = [[max(corner - 7, 0) for corner in face] for face in grid_faces(5, 8, (False, True))]
     surface = surface_of(mesh_of(faces, 33))
     assert surface.metadata["poles"] == [{"block": 0, "side": "first_row", "kind": "degenerate"}]
-    mesh = faces_of(surface)
+    mesh = drawn(surface)
     assert len(mesh.triangles) == 0
     assert {tuple(sorted(face)) for face in mesh.attributes["number"][mesh.quads].tolist()} == {
         tuple(sorted(face)) for face in faces
@@ -149,7 +149,7 @@ def test_holes_and_single_faces_that_are_missing_in_a_grid() -> None:
     assert surface.mask is not None
     assert int((~surface.mask).sum()) == 1
     assert "98 vertices; 1 hole" in surface.metadata["recognised"]
-    assert len(faces_of(surface).quads) == len(faces) == 75
+    assert len(drawn(surface).quads) == len(faces) == 75
 
 
 @pytest.mark.parametrize("closed", CLOSED)
@@ -168,7 +168,7 @@ def test_a_surface_written_and_read_again_keeps_its_grid(
 ) -> None:
     rng = np.random.default_rng(seed)
     first = surface_of(mesh_of(scrambled(grid_faces(rows, columns, closed), rows * columns, rng), rows * columns, rng))
-    mesh = faces_of(first)
+    mesh = drawn(first)
     again = surface_of(Mesh.of(mesh.vertices, mesh.quads))
     assert again.closed == first.closed
     np.testing.assert_array_equal(again.points, first.points)

@@ -17,8 +17,9 @@ from plyfile import PlyData
 
 from lodestream import formats
 from lodestream.errors import FormatError, FormatWarning
-from lodestream.mesh import faces_of
 from lodestream.surface import Block, Surface
+
+from .meshes import drawn
 
 SUFFIXES = ["obj", "ply", "glb", "vts"]
 CLOSED = [(False, False), (True, False), (False, True), (True, True)]
@@ -88,7 +89,7 @@ def triangles_in_space(points: NDArray[Any], faces: set[frozenset[int]]) -> set[
 
 
 def expected_faces(surface: Surface, split: bool) -> set[frozenset[tuple[float, ...]]]:
-    mesh = faces_of(surface)
+    mesh = drawn(surface)
     quads = [tuple(quad) for quad in mesh.quads.tolist()]
     if split:
         halves = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]

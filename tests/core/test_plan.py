@@ -7,7 +7,8 @@ import pytest
 
 from lodestream import OptionError, Target, Tolerance
 from lodestream.container import Index
-from lodestream.plan import Plan, plan
+from lodestream.plan import plan
+from lodestream.plans import Plan
 from lodestream.ranges import RangeSet
 from lodestream.target import Order
 

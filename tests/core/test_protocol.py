@@ -19,7 +19,6 @@ from lodestream.messages import (
     End,
     Error,
     Event,
-    Focus,
     Header,
     Layer,
     MessageError,
@@ -34,7 +33,6 @@ HEADER = Header("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
 SAMPLES: dict[type[Event], Event] = {
     Open: Open(credit=100),
     Credit: Credit(50),
-    Focus: Focus(((0, 3), (4, 7))),
     Stop: Stop(),
     Bye: Bye(),
     Header: HEADER,
@@ -101,7 +99,7 @@ def test_every_state_is_reached_and_every_end_is_silent() -> None:
 def test_what_one_side_may_send_the_other_side_knows() -> None:
     kinds = {side: {kind for sends, _ in TRANSITIONS[side].values() for kind in sends} for side in Side}
     heard = {side: {kind for _, receives in TRANSITIONS[side].values() for kind in receives} for side in Side}
-    assert kinds[Side.CLIENT] == heard[Side.SERVER] == {Open, Credit, Focus, Stop, Bye}
+    assert kinds[Side.CLIENT] == heard[Side.SERVER] == {Open, Credit, Stop, Bye}
     assert kinds[Side.SERVER] == heard[Side.CLIENT] == {Header, Segments, Layer, End, Error}
 
 
@@ -186,6 +184,18 @@ def test_a_client_may_stop_before_the_header() -> None:
     assert client.state is State.ENDED
 
 
+def test_what_was_left_of_the_credit_ends_with_the_stream() -> None:
+    client, server = opened(credit=100)
+    end = server.send(End("complete"))
+    server.receive(client.send(Credit(5)))
+    client.receive(end)
+    server.receive(client.send(Open(credit=7)))
+    assert client.credit == server.credit == 7
+    client.receive(server.send(HEADER))
+    client.receive(server.send(Segments(0, b"again")))
+    assert client.credit == server.credit == 2
+
+
 def test_two_headers_are_refused_even_after_a_stop() -> None:
     client, server = opened()
     client.send(Stop())
@@ -194,11 +204,10 @@ def test_two_headers_are_refused_even_after_a_stop() -> None:
     assert server.state is State.STREAMING
 
 
-def test_credit_focus_and_stop_may_cross_the_end() -> None:
+def test_credit_and_stop_may_cross_the_end() -> None:
     client, server = opened()
     end = server.send(End("complete"))
     server.receive(client.send(Credit(5)))
-    server.receive(client.send(Focus()))
     server.receive(client.send(Stop()))
     client.receive(end)
     server.receive(client.send(Bye()))
@@ -252,9 +261,9 @@ def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: i
         if client.state in (State.OPENED, State.STREAMING):
             if client.credit < window:
                 choices.append("grant")
-            choices += ["stop", "focus"]
+            choices.append("stop")
         if client.state is State.ENDED:
-            choices.append("bye")
+            choices += ["bye", "open again"]
         if server.state is State.OPENED:
             choices.append("header")
         if server.state is State.STREAMING and left and server.credit:
@@ -266,8 +275,6 @@ def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: i
         # Stopping is rare, so that whole streams are seen too.
         if "stop" in choices and len(choices) > 1 and random.randrange(31):
             choices.remove("stop")
-        if "focus" in choices and len(choices) > 1 and random.randrange(10):
-            choices.remove("focus")
         match random.choice(choices):
             case "deliver to server":
                 server.receive(to_server.popleft())
@@ -276,8 +283,10 @@ def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: i
                 if isinstance(event, Segments):
                     received += len(event.data)
                     after_stop += len(event.data) if stopped_at is not None else 0
-            case "focus":
-                to_server.append(client.send(SAMPLES[Focus]))
+            case "open again":
+                assert not to_client, "nothing follows an end"
+                stopped_at, after_stop = None, 0
+                to_server.append(client.send(Open(credit=random.randint(0, window))))
             case "grant":
                 to_server.append(client.send(Credit(random.randint(1, window - client.credit))))
             case "stop":
@@ -294,7 +303,9 @@ def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: i
             case "end":
                 why = "stopped" if server.state is State.STOPPING else "complete"
                 to_client.append(server.send(End(why)))
-        assert 0 <= server.credit <= client.credit <= window
+        # What a server has left of an end is worth nothing: the next open says how much there is.
+        assert server.state is State.ENDED or 0 <= server.credit <= client.credit
+        assert 0 <= client.credit <= window
         assert sent - received <= window
     assert client.state is server.state is State.CLOSED
     assert received == sent

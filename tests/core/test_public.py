@@ -14,9 +14,10 @@ SOURCE = Path(ls.__file__)
 
 
 def test_every_public_name_is_there_sorted_and_from_where_it_is_said_to_be() -> None:
-    assert sorted(ls.__all__, key=str.lower) == sorted(ls._HOMES, key=str.lower)
+    assert sorted(ls.__all__, key=str.lower) == sorted([*ls._HOMES, "paper"], key=str.lower)
     assert len(set(ls.__all__)) == len(ls.__all__)
-    for name in ls.__all__:
+    assert ls.paper is importlib.import_module("lodestream.paper")
+    for name in ls._HOMES:
         home = importlib.import_module(f"lodestream.{ls._HOMES[name]}")
         assert name in home.__all__
         assert getattr(ls, name) is getattr(home, name)
@@ -26,7 +27,7 @@ def test_what_type_checkers_see_is_what_is_loaded() -> None:
     tree = ast.parse(SOURCE.read_text())
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level == 1]
     seen = {alias.name: node.module for node in imports for alias in node.names}
-    assert seen == ls._HOMES
+    assert seen == {**ls._HOMES, "paper": None}
 
 
 @pytest.mark.parametrize("path", sorted(SOURCE.parent.glob("*.py")), ids=lambda path: path.stem)

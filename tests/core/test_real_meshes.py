@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from lodestream import formats
 from lodestream.errors import FormatError
-from lodestream.mesh import faces_of
 from lodestream.seams import restore
 from lodestream.surface import Surface
+
+from .meshes import drawn
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
@@ -87,7 +88,7 @@ def test_what_is_recognised(name: str) -> None:
 @pytest.mark.parametrize("name", READ)
 def test_the_mesh_is_the_same(name: str) -> None:
     points, faces = plain_mesh(path_of(name))
-    mesh = faces_of(restore(surface_of(name)))
+    mesh = drawn(restore(surface_of(name)))
     out = [*mesh.quads.tolist(), *mesh.triangles.tolist()]
     assert len(mesh.vertices) == len(points)
     assert at_places(mesh.vertices, out) == at_places(points, faces)
@@ -113,7 +114,7 @@ def test_in_another_order(name: str, tmp_path: Path) -> None:
     surface = formats.read(path)
     if len(surface.blocks) < 10:  # where lines stop at each other, it is the order that decides which do
         assert shapes(surface) == shapes(surface_of(name))
-    mesh = faces_of(restore(surface))
+    mesh = drawn(restore(surface))
     out = [*mesh.quads.tolist(), *mesh.triangles.tolist()]
     assert at_places(mesh.vertices, out) == at_places(points, faces)
 
@@ -163,7 +164,7 @@ def test_meshes_of_trimesh(export: str, tmp_path: Path) -> None:
         mesh.export(path)  # type: ignore[attr-defined]
         surface = formats.read(path)
         assert words in surface.metadata["recognised"]
-        back = faces_of(surface)
+        back = drawn(surface)
         again = trimesh.Trimesh(back.vertices, back.triangles, process=False)
         assert again.is_watertight
         assert again.is_winding_consistent

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container import Header
-from lodestream.mesh.weld import faces_of
 from lodestream.parts import part_positions
 from lodestream.sides import LatticeBlock
 
 from .layouts import layouts, overlapping, tubes
+from .meshes import drawn
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
@@ -150,7 +150,7 @@ def test_overlaps_and_tubes_stay_together(blocks: list[LatticeBlock]) -> None:
 
 def boundary(surface: ls.Surface) -> int:
     """Edges of the welded mesh that belong to one face only, as trimesh sees them."""
-    faces = faces_of(surface)
+    faces = drawn(surface)
     triangles = np.concatenate([faces.triangles, faces.quads[:, [0, 1, 2]], faces.quads[:, [0, 2, 3]]])
     mesh = trimesh.Trimesh(faces.vertices, triangles, process=False, validate=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=None)

@@ -206,8 +206,8 @@ def _token(work: Operation) -> None:
             return
         token = json.loads(made.text())["token"]
     headers = {"authorization": f"Bearer {token}"}
-    work.talk.ask("POST", "/v1/tickets", (201,), headers=headers)
-    work.talk.ask("POST", "/v1/tickets", (201,))  # and the others are as they were
+    work.talk.ask("GET", "/v1/surfaces", (200,), headers=headers)
+    work.talk.ask("GET", "/v1/surfaces", (200,))  # and the others are as they were
 
 
 def _revoke(work: Operation) -> None:
@@ -220,8 +220,8 @@ def _revoke(work: Operation) -> None:
     with work.armed():
         revoked = work.programs.run("token", "revoke", name, *place)
     if _ended(work, revoked.code, revoked.text()) or work.programs.run("token", "revoke", name, *place).code == 0:
-        work.talk.ask("POST", "/v1/tickets", (403,), headers=headers)
-    work.talk.ask("POST", "/v1/tickets", (201,))
+        work.talk.ask("GET", "/v1/surfaces", (403,), headers=headers)
+    work.talk.ask("GET", "/v1/surfaces", (200,))
 
 
 def _ended(work: Operation, code: int | None, text: str) -> bool:

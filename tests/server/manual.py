@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lodestream_server.bounds import Bounds
 from lodestream_server.table import GROUPS, TABLE, Setting
 
 PATH = Path(__file__).parents[2] / "docs" / "settings.md"
@@ -11,7 +12,8 @@ PATH = Path(__file__).parents[2] / "docs" / "settings.md"
 _INTRODUCTION = """\
 # Settings of the server
 
-This page is the table `lodestream_server.table`, written by `python -m tests.server.manual` and checked by a test.
+This page is `lodestream_server.table` and `lodestream_server.bounds`, written by `python -m tests.server.manual` and
+checked by a test.
 
 - Each setting is a variable of the environment, an option of `lodestream serve`, and a field of
   `lodestream_server.Settings`. An option wins over the variable; an empty variable counts as none.
@@ -32,6 +34,24 @@ def _row(setting: Setting) -> str:
     return f"| `{setting.variable}` | `{setting.option}` | {default} | {meaning} |"
 
 
+_BOUNDS = """\
+## What follows from the machine and these
+
+Nobody has to choose these. A program that starts a server by itself (`create_app`, `running_server`) may give others.
+
+| bound | at most, unless the text says otherwise |
+| --- | --- |
+"""
+
+
+def _bounds() -> str:
+    rows = []
+    for name, field in Bounds.model_fields.items():
+        value = "" if field.default is None else f"{field.default:,g}: "
+        rows.append(f"| `{name}` | {value}{field.description} |\n")
+    return _BOUNDS + "".join(rows)
+
+
 def render() -> str:
     """The whole page."""
     parts = [_INTRODUCTION]
@@ -39,7 +59,7 @@ def render() -> str:
         rows = "\n".join(_row(setting) for setting in TABLE.values() if setting.group == group)
         title = f"{meaning[0].upper()}{meaning[1:]}"
         parts.append(f"## {title}\n\n| variable | option | default | meaning |\n| --- | --- | --- | --- |\n{rows}\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, _bounds()])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""Access over real sockets: streams and tickets, the client's token, and what leads out of the folder."""
+"""Access over real sockets: streams, the client's token, and what leads out of the folder."""
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import socket
@@ -21,8 +20,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
 from lodestream.errors import RemoteError
-from lodestream.messages import CODES, SUBPROTOCOL, End, Error, Header, Open, Stop
-from lodestream.opening import OPENED, to_address
+from lodestream.messages import CODES, End, Error, Header, Open, Stop
+from lodestream.opening import to_address
 from lodestream.wire import serialize
 from lodestream_client import sync
 from lodestream_server import running_server, streams
@@ -55,15 +54,6 @@ def served(keys: Keys) -> Iterator[Served]:
 def http(served: Served) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=served.url, trust_env=False, timeout=60) as client:
         yield client
-
-
-def ticket(http: httpx.Client, keys: Keys) -> str:
-    answer = http.post("/v1/tickets", headers=keys.header("read"))
-    assert answer.status_code == 201
-    assert answer.headers["cache-control"] == "no-store"
-    assert answer.json()["seconds"] == 60.0
-    text: str = answer.json()["ticket"]
-    return text
 
 
 def refused(stream: Raw) -> str:
@@ -107,67 +97,69 @@ def test_the_page_of_another_site_opens_no_stream(served: Served, http: httpx.Cl
         assert caught.value.response.status_code == 403
         assert json.loads(caught.value.response.body or b"")["code"] == "foreign-origin"
     with raw_stream(served.surface, origin=served.url) as stream:
-        stream.send(Open(ticket=ticket(http, served.keys)))
+        stream.send(Open(token=served.keys.tokens["read"]))
         assert isinstance(stream.until_end()[0], Header)
 
 
-def test_a_ticket_does_what_a_header_would(served: Served, http: httpx.Client) -> None:
-    text = ticket(http, served.keys)
-    for _ in range(2):
+def test_a_token_in_open_does_what_a_header_would(served: Served) -> None:
+    for scope in SCOPES:
         with raw_stream(served.surface) as stream:
-            stream.send(Open(ticket=text))
+            stream.send(Open(token=served.keys.tokens[scope]))
             assert isinstance(stream.until_end()[0], Header)
 
 
 def opening(message: Open, **options: Any) -> Any:
-    return {"query": f"?{to_address(serialize(message))}", "subprotocols": [OPENED, SUBPROTOCOL], **options}
+    return {"query": f"?{to_address(serialize(message))}", **options}
 
 
-def test_an_open_in_the_address_needs_as_much_as_a_message(
+def test_an_open_in_the_address_holds_no_token(
     served: Served, http: httpx.Client, caplog: pytest.LogCaptureFixture
 ) -> None:
-    text = ticket(http, served.keys)
+    text = served.keys.tokens["read"]
     missing = served.url + "/v1/surfaces/" + "0" * 20
+    header = served.keys.header("read")
     with caplog.at_level("DEBUG", "lodestream_server"):
-        with raw_stream(served.surface, **opening(Open(ticket=text))) as stream:
-            assert isinstance(stream.until_end()[0], Header)
-        with raw_stream(served.surface, **opening(Open(), additional_headers=served.keys.header("read"))) as stream:
+        with raw_stream(served.surface, **opening(Open(), additional_headers=header)) as stream:
             assert isinstance(stream.until_end()[0], Header)
         for address in (served.surface, missing):
-            for shown, code in ((None, "no-token"), ("x" * 1000, "bad-token")):
-                with raw_stream(address, **opening(Open(ticket=shown))) as stream:
-                    assert refused(stream) == code
-        with raw_stream(missing, **opening(Open(ticket=text))) as stream:
+            with raw_stream(address, **opening(Open())) as stream:
+                assert refused(stream) == "no-token"
+            for shown in (text, "x" * 1000):
+                for headers in ({}, header):
+                    with raw_stream(address, **opening(Open(token=shown), additional_headers=headers)) as stream:
+                        assert refused(stream) == "bad-message"
+        with raw_stream(missing, **opening(Open(), additional_headers=header)) as stream:
             assert refused(stream) == "not-found"
-        with pytest.raises(InvalidStatus), raw_stream(served.surface, **opening(Open(ticket=text), origin="null")):
+        with pytest.raises(InvalidStatus), raw_stream(served.surface, **opening(Open(), origin="null")):
             pass
     told = [repr(vars(record)) for record in caplog.records]
     assert any("stream ended" in line for line in told)
-    query = to_address(serialize(Open(ticket=text))) or text
+    query = to_address(serialize(Open(token=text))) or text
     assert not any(text in line or query[-40:] in line or "open=" in line for line in told)
 
 
-def test_without_token_and_ticket_nothing_is_told(served: Served, http: httpx.Client) -> None:
-    text = ticket(http, served.keys)
-    changed = base64.urlsafe_b64encode(base64.urlsafe_b64decode(text)[:-1] + b"?").decode()
+def test_without_a_token_nothing_is_told(served: Served) -> None:
+    tokens = served.keys.tokens
     for address in (served.surface, served.url + "/v1/surfaces/" + "0" * 20):
-        for shown, code in ((None, "no-token"), (changed, "bad-token"), ("x" * 1000, "bad-token"), ("", "bad-token")):
+        for shown, code in (
+            (None, "no-token"),
+            (tokens["revoked"], "bad-token"),
+            (tokens["expired"], "bad-token"),
+            ("x" * 1000, "bad-token"),
+            ("", "bad-token"),
+        ):
             with raw_stream(address) as stream:
-                stream.send(Open(ticket=shown))
+                stream.send(Open(token=shown))
                 assert refused(stream) == code
     with raw_stream(served.url + "/v1/surfaces/" + "0" * 20) as stream:
-        stream.send(Open(ticket=text))
+        stream.send(Open(token=tokens["read"]))
         assert refused(stream) == "not-found"
 
 
-def test_a_ticket_that_is_too_old_is_refused(tmp_path: Path) -> None:
-    text, _ = TokenFile(tmp_path / "tokens.json").create("one", ("read",))
-    with running_server(tmp_path, workers=1, ticket_seconds=1e-9) as url:
-        answer = httpx.post(f"{url}/v1/tickets", headers={"authorization": f"Bearer {text}"}, trust_env=False)
+def test_a_first_message_that_is_none_is_refused(tmp_path: Path) -> None:
+    TokenFile(tmp_path / "tokens.json").create("one", ("read",))
+    with running_server(tmp_path, workers=1) as url:
         address = url + "/v1/surfaces/" + "0" * 20
-        with raw_stream(address) as stream:
-            stream.send(Open(ticket=answer.json()["ticket"]))
-            assert refused(stream) == "bad-token"
         with raw_stream(address) as stream:
             stream.socket.send("open, please")
             assert refused(stream) == "bad-message"
@@ -185,26 +177,25 @@ def test_the_streams_of_a_token_end_with_it(
     assert streams._TOKEN_SECONDS + streams._CLOSE_SECONDS < 10, "what is promised"
     monkeypatch.setattr(streams, "_TOKEN_SECONDS", 0.3)
     file = TokenFile(served.keys.folder / "tokens.json")
-    header = {
-        name: {"authorization": f"Bearer {file.create(name, ('read',), days)[0]}"}
+    tokens = {
+        name: file.create(name, ("read",), days)[0]
         for name, days in (("leaving", None), ("staying", None), ("short", 1))
     }
-    tickets = {name: http.post("/v1/tickets", headers=header[name]).json()["ticket"] for name in header}
+    header = {name: {"authorization": f"Bearer {token}"} for name, token in tokens.items()}
     with ExitStack() as held:
 
         def begun(message: Open, **options: Any) -> Raw:
             stream = held.enter_context(raw_stream(served.surface, **options))
-            if OPENED not in options.get("subprotocols", ()):
+            if "query" not in options:
                 stream.send(message)
             assert isinstance(stream.receive(), Header)
             return stream
 
         def of(name: str) -> list[Raw]:
-            shown = Open(credit=1, ticket=tickets[name])
             return [
                 begun(Open(credit=1), additional_headers=header[name]),
-                begun(shown),
-                begun(shown, **opening(shown)),
+                begun(Open(credit=1, token=tokens[name])),
+                begun(Open(credit=1), **opening(Open(credit=1), additional_headers=header[name])),
                 # All is sent, and the client does not say bye.
                 begun(Open(), additional_headers=header[name]),
             ]
@@ -217,7 +208,7 @@ def test_the_streams_of_a_token_end_with_it(
             assert last_error(stream) == "bad-token"
         for name in ("leaving", "short"):
             with raw_stream(served.surface) as stream:
-                stream.send(Open(ticket=tickets[name]))
+                stream.send(Open(token=tokens[name]))
                 assert refused(stream) == "bad-token"
         for stream in staying[:3]:
             stream.send(Stop())

@@ -115,7 +115,7 @@ def test_a_build_that_needs_too_much_memory_waits(tmp_path: Path, monkeypatch: p
     with running(tmp_path / "data", build_memory=1 << 30) as http:
         surface = settled(http, post(http, 1))
         assert surface["state"] == "waiting"
-        assert "more memory than one may have, 1024 MiB (LODESTREAM_BUILD_MEMORY), 2 times" in surface["reason"]
+        assert "more memory than one may have, 1024 MiB (LODESTREAM_MEMORY), 2 times" in surface["reason"]
         monkeypatch.undo()
         assert settled(http, post(http, 1))["state"] == "ready"
 

@@ -117,8 +117,8 @@ def test_a_variable_of_the_environment_that_cannot_be_used_is_named(
         ["--port", "x"],
         ["--port", "70000"],
         ["--upload-bytes", "4 pounds"],
-        ["--idle-seconds", "nan"],
-        ["--idle-seconds", "0"],
+        ["--memory", "1MiB"],
+        ["--idle-seconds", "1"],
         ["--log-format", "xml"],
         ["--nonsense"],
         ["extra"],
@@ -131,10 +131,10 @@ def test_a_wrong_command_line_exits_with_2(arguments: list[str]) -> None:
 
 
 def test_a_variable_of_the_environment_sets_what_the_command_line_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LODESTREAM_IDLE_SECONDS", "7")
+    monkeypatch.setenv("LODESTREAM_WORKERS", "7")
     monkeypatch.setenv("LODESTREAM_PORT", "1234")
     settings = Settings(port=0)
-    assert (settings.idle_seconds, settings.port) == (7.0, 0)
+    assert (settings.workers, settings.port) == (7, 0)
 
 
 def test_a_folder_that_another_server_has_is_refused(tmp_path: Path) -> None:

@@ -267,15 +267,6 @@ def _ready(http: httpx.Client) -> dict[str, Any] | None:
     return answer.json() if answer.status_code == 200 else None
 
 
-def test_all_builds_together_leave_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    for there in (64 << 30, 4 << 30):
-        monkeypatch.setattr(jobs, "memory_limit", lambda there=there: there)
-        for workers in (1, 2, 3, 4):
-            assert jobs.default_memory(workers) * workers <= there // 2
-    # No build gets along with less, whatever the machine.
-    assert jobs.default_memory(1000) == 512 << 20
-
-
 def test_real_formats_are_built_confined(http: httpx.Client, tmp_path: Path) -> None:
     import lodestream as ls
 

@@ -17,7 +17,7 @@ import pytest
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from lodestream.messages import Focus, Open
+from lodestream.messages import Credit, Open
 from lodestream.wire import serialize
 from lodestream_server.cuts import REASONS, Allowance, Cuts
 from lodestream_server.metrics import Metrics
@@ -52,7 +52,7 @@ class Flood:
 FLOODS = {
     "pings": Flood("frames", True, frame(serialize(Open(credit=1000))), frame(bytes(125), PING) * 2000),
     "empty fragments": Flood("frames", True, frame(b"", last=False), frame(b"", CONTINUATION, last=False) * 40_000),
-    "tiny messages": Flood("frames", True, frame(serialize(Open(credit=1))), frame(serialize(Focus(None))) * 10_000),
+    "tiny messages": Flood("frames", True, frame(serialize(Open(credit=1))), frame(serialize(Credit(1))) * 10_000),
     "chunks": Flood("small-chunks", False, chunked(), CHUNKS),
     "extensions": Flood("small-chunks", False, chunked(), (b"1;" + b"x" * 4000 + b"\r\na\r\n") * 50),
     "refused chunks": Flood("refused-body", False, chunked(b"POST /nothing"), CHUNKS),

@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 import lodestream as ls
-from lodestream.messages import Credit, End, Error, Focus, Open
+from lodestream.messages import Credit, End, Error, Open
 from lodestream.wire import serialize
 from lodestream_server import frames, running_server
 from tests.server.helpers import PATIENCE, Keys, hills, npy, push, raw_stream
@@ -54,7 +54,7 @@ def test_pongs_that_nobody_takes_are_counted_in_bytes(
     monkeypatch.setattr(frames, "_FRAMES", (1e9, 0.0))
     monkeypatch.setattr(frames, "_OTHER_FRAMES", (1e9, 0.0))
     pings = frame(bytes(125), PING) * 500
-    # Somebody without a token, whose ticket is waited for.
+    # Somebody without a token, whose open is waited for.
     settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json"}
     with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}") as connection:
         assert cut_by(connection, [pings] * 2000)
@@ -90,12 +90,11 @@ def test_a_client_that_answers_everything_in_fragments_is_never_cut(server: str,
             event = stream.receive()
 
 
-def test_changes_of_focus_that_were_held_up_come_all_at_once(server: str, surface: dict[str, Any]) -> None:
+def test_grants_that_were_held_up_come_all_at_once(server: str, surface: dict[str, Any]) -> None:
     with raw_stream(server + surface["url"]) as stream:
-        stream.send(Open(credit=1000))
-        for number in range(1500):
-            stream.send(Focus(((0, 1 + number % 400), (0, 10))))
-        stream.send(Credit(1000))
+        stream.send(Open(credit=0))
+        for _ in range(1500):
+            stream.send(Credit(1))
         assert not isinstance(stream.receive(), Error)
 
 
@@ -120,25 +119,18 @@ def test_pings_do_not_prolong_the_wait_for_open(tmp_path: Path, keys: Keys) -> N
         assert event.code == "idle"
 
 
-@pytest.mark.parametrize(
-    ("target", "message"),
-    [(None, Focus(((0, 5), (0, 5)))), (ls.Target(level=0), Credit(1)), (ls.Target(level=0), Focus(None))],
-    ids=["focus without credit", "credit after the end", "focus after the end"],
-)
-def test_messages_that_change_nothing_do_not_prolong_a_wait(
-    tmp_path: Path, target: ls.Target | None, message: Credit | Focus
-) -> None:
+def test_messages_that_change_nothing_do_not_prolong_a_wait(tmp_path: Path) -> None:
     with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
         made = push(http, npy(hills(30, 30)))
     settings: dict[str, Any] = {"workers": 1, "idle_seconds": 0.5, "bye_seconds": 0.5}
     with running_server(tmp_path, **settings) as url, raw_stream(url + made["url"]) as stream:
-        stream.send(Open(target or ls.Target(), credit=64 if target is None else 100_000))
+        stream.send(Open(ls.Target(level=0), credit=100_000))
         over = threading.Event()
 
         def speak() -> None:
             with suppress(ConnectionClosed):  # the server may be the first
                 while not over.wait(0.05):
-                    stream.send(message)
+                    stream.send(Credit(1))  # after the end
 
         thread = threading.Thread(target=speak)
         thread.start()

@@ -27,7 +27,6 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/healthz"): None,
     ("GET", "/readyz"): None,
     ("GET", "/metrics"): "admin",
-    ("POST", "/v1/tickets"): "read",
     ("GET", "/v1/surfaces"): "read",
     ("POST", "/v1/surfaces"): "write",
     ("GET", "/v1/surfaces/{surface}"): "read",
@@ -327,8 +326,8 @@ def test_pages_of_named_origins_read_what_is_answered(keys: Keys) -> None:
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=LOCAL) as http:
             asked = {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
             return [
-                await http.options("/v1/tickets", headers={"origin": "https://maps.example.org", **asked}),
-                await http.options("/v1/tickets", headers={"origin": "https://example.org", **asked}),
+                await http.options("/v1/surfaces", headers={"origin": "https://maps.example.org", **asked}),
+                await http.options("/v1/surfaces", headers={"origin": "https://example.org", **asked}),
                 await http.get("/v1/surfaces", headers={"origin": "https://maps.example.org"}),
             ]
 

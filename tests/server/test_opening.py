@@ -11,11 +11,12 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 import lodestream as ls
 from lodestream.messages import CODES, SUBPROTOCOL, Bye, Credit, End, Error, Event, Header, Layer, Open, Segments, Stop
-from lodestream.opening import MAX_OPENING, OPENED, to_address
+from lodestream.opening import MAX_OPENING, to_address
+from lodestream.ranges import RangeSet
 from lodestream.wire import serialize
 from tests.server.helpers import Raw, data_of, hills, npy, push, raw_stream
 
@@ -31,8 +32,8 @@ def url(server: str, surface: dict[str, Any]) -> str:
 
 
 @contextmanager
-def opened(url: str, query: str | None, offered: tuple[str, ...] = (OPENED, SUBPROTOCOL)) -> Iterator[Raw]:
-    with raw_stream(url, f"?{query}", subprotocols=offered) as stream:
+def opened(url: str, query: str | None) -> Iterator[Raw]:
+    with raw_stream(url, f"?{query}") as stream:
         yield stream
 
 
@@ -78,7 +79,7 @@ def refusal(stream: Raw) -> Error:
 def test_the_answer_is_that_to_the_message(url: str, target: ls.Target) -> None:
     message = Open(target, 5000)
     with opened(url, to_address(serialize(message))) as stream:
-        assert stream.socket.subprotocol == OPENED
+        assert stream.socket.subprotocol == SUBPROTOCOL
         by_address = events_of(stream)
     with raw_stream(url) as stream:
         stream.send(message)
@@ -126,25 +127,11 @@ def header_of(events: list[Event]) -> Header:
     return events[0]
 
 
-@pytest.mark.parametrize("offered", [(SUBPROTOCOL,), (SUBPROTOCOL, "other")])
-def test_a_client_that_does_not_know_of_it_opens_by_a_message(url: str, offered: tuple[str, ...]) -> None:
-    with opened(url, to_address(serialize(Open(ls.Target(level=0)))), offered) as stream:
-        assert stream.socket.subprotocol == SUBPROTOCOL
-        stream.send(Open(ls.Target(max_bytes=2000)))
-        assert events_of(stream)[-1] == End("bytes")
-
-
 def test_without_the_parameter_nothing_is_taken_from_the_address(url: str) -> None:
     with opened(url, "other=1") as stream:
         assert stream.socket.subprotocol == SUBPROTOCOL
         stream.send(Open(ls.Target(max_bytes=2000)))
         assert events_of(stream)[-1] == End("bytes")
-
-
-def test_the_subprotocol_itself_has_to_be_offered_too(url: str) -> None:
-    with pytest.raises(InvalidStatus) as caught, opened(url, to_address(serialize(Open())), (OPENED,)):
-        pass
-    assert caught.value.response.status_code == 426
 
 
 def packed(**fields: Any) -> str:
@@ -166,6 +153,7 @@ def packed(**fields: Any) -> str:
         (packed(target={"level": 50}), "bad-target", "got 50"),
         (packed(held=[[0, 10]]), "bad-held", "open.container"),
         (packed(container="0" * 64), "other-container", "expected container"),
+        (packed(token="secret"), "bad-message", "no token in an address"),
     ],
 )
 def test_what_is_wrong_is_told_as_of_a_message(url: str, query: str, code: str, words: str) -> None:
@@ -175,7 +163,7 @@ def test_what_is_wrong_is_told_as_of_a_message(url: str, query: str, code: str, 
     assert words in said.detail
 
 
-def test_a_second_open_is_out_of_turn(url: str) -> None:
+def test_an_open_before_the_end_is_out_of_turn(url: str) -> None:
     with opened(url, to_address(serialize(Open(credit=0)))) as stream:
         assert isinstance(stream.receive(), Header)
         stream.send(Open())
@@ -193,3 +181,19 @@ def test_the_surface_is_whole(url: str) -> None:
     decoder = ls.Decoder()
     decoder.feed(data)
     assert np.array_equal(decoder.surface().points, hills(90, 80))
+
+
+def test_after_an_end_it_goes_on_with_what_was_not_sent(url: str, surface: dict[str, Any]) -> None:
+    with raw_stream(url) as stream:
+        stream.send(Open(ls.Target(max_bytes=3000)))
+        first = stream.until_end()
+        assert first[-1] == End("bytes")
+        stream.send(Open(ls.Target(first=((5, 20), (10, 30)))))
+        events = events_of(stream)
+    assert events[-1] == End("complete")
+    sent = RangeSet()
+    for event in (*first, *events):
+        if isinstance(event, Segments):
+            assert not list(sent.overlap(event.offset, len(event.data))), "nothing is sent twice"
+            sent.add(event.offset, len(event.data))
+    assert sent.covers(0, surface["levels"][-1]["bytes"])

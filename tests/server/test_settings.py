@@ -11,6 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from lodestream_server import Settings
+from lodestream_server import settings as settings_module
+from lodestream_server.bounds import Bounds
 from lodestream_server.command import chosen_settings, register
 from lodestream_server.table import GROUPS, TABLE, Setting
 from tests.server import manual
@@ -51,7 +53,8 @@ def test_the_page_is_the_table() -> None:
 
 
 def test_the_settings_are_the_table_and_their_types_fit() -> None:
-    assert list(Settings.model_fields) == list(TABLE)
+    assert [name for name in Settings.model_fields if name not in Bounds.model_fields] == list(TABLE)
+    assert not set(TABLE) & set(Bounds.model_fields)
     types = typing.get_type_hints(Settings)
     kinds: dict[type, Any] = {int: ("an integer", "bytes,"), float: "seconds", bool: "yes or no", Path: "a path"}
     for name, setting in TABLE.items():
@@ -104,9 +107,10 @@ def test_sizes_carry_units(text: str, size: int) -> None:
         ("keep_free", "-1", "expected bytes"),
         ("upload_bytes", 0, "at least 1"),
         ("port", 65536, "0 to 65535"),
-        ("idle_seconds", "nan", "more than 0"),
-        ("idle_seconds", "inf", "more than 0"),
-        ("build_memory", "64MiB", "at least 256MiB"),
+        ("memory", "1MiB", "at least 256MiB"),
+        ("idle_seconds", "nan", "finite number"),
+        ("idle_seconds", 0, "greater than 0"),
+        ("max_streams", 0, "greater than or equal to 1"),
         ("insecure", "perhaps", "yes or no"),
         ("log_format", "xml", "one of text, json"),
         ("root_path", "maps/", "begins with a slash"),
@@ -123,3 +127,22 @@ def test_lists_and_paths() -> None:
     assert settings.origins == ("https://a.example", "https://b.example")
     assert settings.tokens == Path("here/tokens.json")
     assert parse("--token-file", "there").tokens == Path("there")
+
+
+def test_bounds_are_no_business_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LODESTREAM_MAX_STREAMS", "3")
+    assert Settings().max_streams == Bounds().max_streams
+    assert Settings(max_streams=3).max_streams == 3
+
+
+def test_memory_is_divided_among_builds_and_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (16 << 30, 1 << 40):
+        monkeypatch.setattr(settings_module, "memory_limit", lambda there=there: there)
+        for workers in (1, 2, 3, 7):
+            chosen = Settings(workers=workers)
+            assert chosen.memory_of_build * workers <= there // 2
+            assert chosen.memory_of_build * workers + chosen.memory_of_levels < there
+    assert Settings(memory=8 << 30, workers=4).memory_of_build == 2 << 30
+    assert Settings(memory=8 << 30, workers=4).memory_of_levels == 4 << 30
+    assert Settings(workers=1000000).memory_of_build == 512 << 20
+    assert Settings(build_memory=1 << 30).memory_of_build == 1 << 30

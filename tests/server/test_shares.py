@@ -14,7 +14,9 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from lodestream.messages import MAX_HELD, Credit, Focus, Header, Open
+import lodestream as ls
+from lodestream.messages import MAX_HELD, End, Header, Open, Stop
+from lodestream.protocol import State
 from lodestream.sender import Sender
 from lodestream.wire import serialize
 from lodestream_server import jobs, running_server, streams, worker
@@ -238,8 +240,8 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
             if len(arguments) and len(arguments[0]) > 6000:
                 planning.append("short" if len(arguments[0]) < short else "open")
                 assert go.wait(PATIENCE)
-            elif not arguments and self.turning and len(self.held) > 2000:
-                planning.append("focus")
+            elif self.state is State.ENDED:
+                planning.append("again")
                 assert go.wait(PATIENCE)
             return work(self, *arguments)
 
@@ -253,7 +255,6 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
         await enter(self, caller, rank)
 
     monkeypatch.setattr(Sender, "receive", patient(Sender.receive))
-    monkeypatch.setattr(Sender, "wanted", patient(Sender.wanted))
     monkeypatch.setattr(Turns, "_enter", noted)
     with ExitStack() as stack, town.client("good") as good:
         surface = push(good, npy(hills(100, 90)))
@@ -287,11 +288,13 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
         assert planning == ["open", "short", *["open"] * 4]
         go.clear()
         planning.clear()
-        theirs[0].send(Focus(((0, 5), (0, 5))))
-        theirs[0].send(Credit(4))
-        eventually(lambda: planning or None, "the long change of order")
+        theirs[0].send(Stop())
+        while not isinstance(theirs[0].receive(), End):
+            pass
+        theirs[0].send(Open(ls.Target(first=((0, 5), (0, 5))), credit=4))
+        eventually(lambda: planning or None, "the plan that begins with a region")
         goes_on()
-        assert planning == ["focus"]
+        assert planning == ["again"]
         go.set()
 
 

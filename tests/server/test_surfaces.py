@@ -235,7 +235,6 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/healthz",
         "/readyz",
         "/metrics",
-        "/v1/tickets",
         "/v1/surfaces",
         "/v1/surfaces/{surface}",
         "/v1/surfaces/{surface}/retry",

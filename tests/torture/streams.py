@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tenacity import wait_random_exponential
 
 import lodestream as ls
 from lodestream.errors import CorruptStreamError, LodestreamError
@@ -132,12 +131,12 @@ def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None =
 @contextmanager
 def _hasty() -> Iterator[None]:
     """Waits between attempts that are in proportion to links of milliseconds."""
-    usual = roads._WAIT
-    roads._WAIT = wait_random_exponential(multiplier=0.002, max=0.1)
+    usual = roads._FIRST_PAUSE, roads._LONGEST_PAUSE
+    roads._FIRST_PAUSE, roads._LONGEST_PAUSE = 0.002, 0.1
     try:
         yield
     finally:
-        roads._WAIT = usual
+        roads._FIRST_PAUSE, roads._LONGEST_PAUSE = usual
 
 
 async def _all(url: str, container: bytes, count: int, until: tuple[float, float], seed: int, report: Report) -> None:

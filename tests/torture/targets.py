@@ -27,7 +27,7 @@ from lodestream.container import read_index
 from lodestream.container.frames import section_extent
 from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
 from lodestream.errors import FormatWarning, InputError, LodestreamError, StreamError, UnsupportedVersionError
-from lodestream.messages import Bye, Credit, End, Error, Event, Focus, Header, Layer, MessageError, Open, Segments, Stop
+from lodestream.messages import Bye, Credit, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
 from lodestream.plan import plan
 from lodestream.protocol import State
 from lodestream.sender import Sender
@@ -231,8 +231,6 @@ def _messages() -> tuple[bytes, ...]:
         Layer(1, 2, 3, 0.5, 0.25),
         End("complete"),
         Error("idle", "title", "detail"),
-        Focus(((0, 9), (3, 5))),
-        Focus(),
     ]
     # Several in a row, each after its length, as a stranger would send them.
     single = [serialize(event) for event in (*opens, *others)]

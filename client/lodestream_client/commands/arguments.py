@@ -182,23 +182,23 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
         "--limit-rate",
         type=parse_rate,
         metavar="RATE",
-        help="receive at most this much a second, such as 1mbit or 200kB",
+        help="limit the rate of receiving, for example 1mbit or 200kB (per second)",
     )
 
 
 def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) -> None:
     """Add ``--max-vertices``; without decoding only the container's tables count."""
     what = (
-        "refuse a surface of more vertices, or one that takes more than 128 bytes for each of N with all its channels, "
-        "before memory is taken for it"
+        "refuse a surface of more than N vertices, or of more than 128 bytes for each of N, channels included, before "
+        "memory is allocated"
         if decodes
-        else "refuse a container whose tables take more than 128 bytes for each of N, before they are read"
+        else "refuse a container whose tables need more than 128 bytes for each of N vertices, before they are read"
     )
     parser.add_argument(
         "--max-vertices",
         type=_count,
         metavar="N",
-        help=f"{what} (default: what takes two fifths of the memory there is)",
+        help=f"{what} (default: as many as fit into two fifths of the memory)",
     )
 
 
@@ -212,21 +212,21 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=parse_precision,
         metavar="[NAME=]P",
-        help="greatest error of the complete surface, in its unit or as <x>d times its extent (default: lossless); "
-        "NAME=P is for the attribute NAME, which is lossless otherwise; may be repeated",
+        help="maximum error of the complete surface: a number in its unit, or 1e-3d for 1e-3 times its extent "
+        "(default: lossless); NAME=P is for the attribute NAME (default: lossless); may be repeated",
     )
     group.add_argument(
         "--rms",
         type=parse_tolerance,
         metavar="R",
-        help="make the shortest stream whose root mean square error is at most R, in the surface's unit or as <x>d "
-        "times its extent; not with a --precision of the points",
+        help="make the shortest stream that ends at a root mean square error of at most R: a number in the surface's "
+        "unit, or 1e-3d for 1e-3 times its extent; not together with a --precision of the points",
     )
     group.add_argument(
         "--closed",
         choices=("auto", "none", "rows", "cols", "both"),
         default="auto",
-        help="which axes of the grid wrap: rows means that the last row is followed by the first (default: auto)",
+        help="closed axes of the grid: with rows, the first row follows the last (default: auto, the file decides)",
     )
     group.add_argument("--name", metavar="N", help="name of the surface")
     group.add_argument(
@@ -286,9 +286,10 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
     """Add what says where to stop and in which order."""
     group = parser.add_argument_group(
         "target",
-        "where to stop; of several limits the first one met. E is in the surface's unit, or <x>d times its extent",
+        "Where to stop: at the first limit that is met. E is a number in the surface's unit, or 1e-3d for 1e-3 times "
+        "its extent.",
     )
-    group.add_argument("--level", type=_level, metavar="K", help="levels 0 to K only; OUT is the grid of that level")
+    group.add_argument("--level", type=_level, metavar="K", help="only levels 0 to K; OUT is the grid of level K")
     group.add_argument("--until-rms", type=parse_tolerance, metavar="E", help="stop at a root mean square error of E")
     group.add_argument("--until-max", type=parse_tolerance, metavar="E", help="stop at a maximum error of E")
     group.add_argument("--max-bytes", type=parse_size, metavar="N", help="stop before more than N bytes of the surface")
@@ -297,19 +298,19 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
         "--roi",
         type=_region,
         metavar="R0:R1,C0:C1",
-        help="only this window: rows and columns of the whole surface, half-open; OUT is that window",
+        help="only this window: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid; OUT is the window",
     )
     group.add_argument(
         "--attributes",
         type=_names,
         metavar="NAMES",
-        help="only these attributes beside the points, by their names with commas between them; none: no attribute",
+        help="only these attributes beside the points: names separated by commas, or none (default: all)",
     )
     group.add_argument(
         "--order",
         choices=("quality", "level"),
         default="quality",
-        help="bits in order of what they do to the error, or level by level (default: quality)",
+        help="quality: whatever reduces the error most comes first; level: level by level (default: quality)",
     )
 
 

@@ -39,8 +39,8 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "decode",
         run,
-        "turn a container, or as much of it as is wanted, into a file",
-        "The suffix of OUT names its format; standard output gets NPY.",
+        "decode a container into a file, completely or up to a limit",
+        "The suffix of OUT decides its format; standard output gets NPY.",
     )
     parser.add_argument("container", metavar="IN.lode", help="container to read; - for standard input")
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
@@ -49,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--partial",
         action="store_true",
-        help="of a cut or damaged container, write the last whole layer before the cut",
+        help="accept a truncated or damaged container: write its last complete layer",
     )
     add_json_option(parser)
 

@@ -16,8 +16,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "demo",
         run,
-        "start a server, upload surfaces, stream them over a slow link, stop early, show them",
-        "Needs nothing but the installation; writes a picture and two surfaces, and ends by itself within two minutes.",
+        "stream a surface of 1.3 million points over a slow link, stop early, and show what came",
+        "Starts a server of its own, generates mountains, uploads them, and stops at an RMS error of 10 m.\n"
+        "Prints the errors told beside the errors found, and what plain files of as many bytes show.\n"
+        "Writes terrain.npy and, if matplotlib is installed, demo.png. Takes half a minute.",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("lodestream-demo"), metavar="DIR", help="where to write (default: %(default)s)"

@@ -25,8 +25,8 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "encode",
         run,
-        "turn a file, or several of one surface, into a container",
-        "The content of a file decides about its format. Without --precision and --rms the container is lossless.",
+        "encode a surface into a container, from one file or several",
+        "The content of a file decides its format. Without --precision and --rms the container is lossless.",
     )
     parser.add_argument("files", nargs="+", metavar="FILE", help="what to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")

@@ -17,9 +17,9 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "formats",
         run,
-        "list the formats of files, which of them are read and written, and their -o options",
-        "The content of a file decides about its format; its suffix only where any content would do.\n"
-        "What is written follows the suffix of OUT. docs/formats.md says more of each.",
+        "list the file formats that can be read and written, and their -o options",
+        "The content of a file decides its format, or its suffix where the content fits any (text, .hgt).\n"
+        "Written files follow the suffix of OUT. More in docs/formats.md.",
     )
     add_json_option(parser)
 

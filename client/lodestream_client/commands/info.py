@@ -28,9 +28,9 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "info",
         run,
-        "tell the size, levels, layers and errors of a container or of a surface on a server",
-        "Levels: what all levels up to one cost, and their error.\n"
-        "Layers: what each prefix of the stream costs, and its error.",
+        "show size, levels, layers and errors of a container or of a surface on a server",
+        "Levels: bytes of each level and all coarser ones, and the error that they leave.\n"
+        "Layers: bytes of the stream up to the end of each layer, and the error there.",
     )
     parser.add_argument(
         "what",

@@ -54,10 +54,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "pull",
         run,
-        "stream a surface, or as much of it as is wanted, from a server into a file",
-        "The suffix of OUT names its format; standard output gets NPY. A connection that breaks is replaced, and what\n"
-        "has come is not sent again. After Ctrl-C, or when the server is gone for good, OUT is written as far as\n"
-        "the surface came, and what came is kept for --resume.",
+        "stream a surface from a server into a file, completely or up to a limit",
+        "The suffix of OUT decides its format; standard output gets NPY. A broken connection is opened again and\n"
+        "continues where it broke. After Ctrl-C, or if the server does not come back, OUT is written from what was\n"
+        "received, which is also kept for --resume.",
     )
     parser.add_argument(
         "url", type=parse_source, metavar="URL", help="the surface's address, or that of a container on any web server"
@@ -69,32 +69,23 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on from what an earlier pull left in LODESTREAM_CACHE (default: the user's cache folder), ask only "
-        "for what is not there, and keep what comes until the whole surface has been written",
+        help="continue an earlier pull: ask only for what is missing in the folder LODESTREAM_CACHE (default: the "
+        "user's cache folder), and keep what comes there until the whole surface has been written",
     )
     parser.add_argument(
         "--transport",
         choices=("auto", "ws", "http"),
         default="auto",
-        help="by WebSocket, or in parts of the container by HTTP Range; auto takes the second where the first does not "
-        "come through (default: auto)",
-    )
-    parser.add_argument(
-        "--replica",
-        dest="replicas",
-        action="append",
-        default=[],
-        type=parse_source,
-        metavar="URL",
-        help="another address of the same surface, to go on from when a connection fails; may be repeated",
+        help="ws: WebSocket; http: HTTP Range requests; auto: WebSocket, or HTTP where that is not possible "
+        "(default: auto)",
     )
     parser.add_argument(
         "--retry",
         type=parse_seconds,
         default=60.0,
         metavar="S",
-        help="give up when no byte has come for S seconds since a connection was lost or fell silent; 0 replaces no "
-        "connection (default: 60)",
+        help="reconnect when a connection is lost or silent, and give up after S seconds without a byte; 0: never "
+        "reconnect (default: 60)",
     )
     add_token_option(parser)
     add_json_option(parser)
@@ -103,7 +94,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Stream, write, report; of what came before an interruption too."""
     target = target_of(args)
-    if args.transport == "ws" and not all(map(addresses.is_surface, (args.url, *args.replicas))):
+    if args.transport == "ws" and not addresses.is_surface(args.url):
         args.parser.error("argument --transport: a file's address has no WebSocket")
     check_out(args)
     with interruptible(), Kept(args.resume) as kept:
@@ -166,7 +157,7 @@ def _receive(
     identity = kept.identity
     with _Progress(target) as bar:
         stream = sync.connect(
-            [args.url, *args.replicas],
+            args.url,
             target=target,
             token=token_of(args),
             transport=args.transport,

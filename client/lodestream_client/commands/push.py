@@ -33,10 +33,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "push",
         run,
-        "upload a file, or several of one surface, to a server",
-        "Waits until the surface is ready; the last line of standard output is its address.\n"
-        "A container (.lode) is sent and kept as it is; of the surface options only --name goes with it.\n"
-        "A surface that waits, or whose container is missing, is an error; the server keeps it for retry.",
+        "upload a surface to a server, from one file or several",
+        "Waits until the surface is ready. The last line of standard output is its address.\n"
+        "A container (.lode) is kept unchanged; of the surface options it takes only --name.\n"
+        "If the server cannot build the surface now, push fails; the server keeps the upload for retry.",
     )
     parser.add_argument("files", nargs="+", metavar="FILE", help="what to upload; - for standard input")
     parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")

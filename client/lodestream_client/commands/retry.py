@@ -16,11 +16,11 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "retry",
         run,
-        "have a server build a surface again that waits, failed or is missing",
-        "Waits until the surface is ready; the last line of standard output is its address.",
+        "let a server build a surface again that is waiting, failed or missing",
+        "Waits until the surface is ready. The last line of standard output is its address.",
     )
     parser.add_argument("url", type=parse_surface, metavar="URL", help="the surface's address")
-    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has taken it up")
+    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has accepted the request")
     add_token_option(parser)
     add_json_option(parser)
 

@@ -1,4 +1,4 @@
-"""The demo: a server, two surfaces, a slow link, an early stop, and what came of it."""
+"""The demo: a server, a million points, a slow link, an early stop, and what as many bytes of plain files show."""
 
 from __future__ import annotations
 

@@ -1,96 +1,115 @@
-"""The demo's picture: for each surface four moments of its stream, side by side."""
+"""The demo's picture: what as many bytes show, side by side, whole and enlarged. The README shows one of these."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import render
+from .terrain import CELL
 
-__all__ = ["Moment", "draw"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-_PAPER = "#0e1216"
-_INK = "#e8e6e1"
-_DIM = "#98a2ab"
-_ACCENT = "#e9b44c"
+__all__ = ["Panel", "draw"]
 
-_TERRAIN = ["#2f6b52", "#4c8a5b", "#86a563", "#c9b978", "#d9b98a", "#e6d3b8", "#fbf7f0"]
-_TORUS = ["#1c2f5c", "#2a6f97", "#4fb3a5", "#e9c46a", "#e76f51"]
+Floats = NDArray[np.float64]
 
-_WIDTH = 500
-_HEIGHT = 347
+_PAPER, _INK, _DIM, _ACCENT, _EMPTY = "#0e1216", "#e8e6e1", "#98a2ab", "#e9b44c", "#1b2127"
+_TINTS = ["#1f5a4c", "#3f8058", "#86a563", "#c9b978", "#b98f68", "#a58a7c", "#d9d2cc", "#ffffff"]
+_SUN = np.array([-0.6, 0.6, 0.55])  # north-west, as maps have it
+_EXAGGERATION = 1.4
+_WIDTH = 1400  # pixels
+_MARGIN = 0.006  # all lengths below in widths of the picture
+_TITLE = 0.060
+_COLOURS = 256
 
 
 @dataclass(frozen=True)
-class Moment:
-    """A state to show: its points, and what stands beneath."""
+class Panel:
+    """Heights in metres, NaN where there are none yet, and what stands above them."""
 
-    points: NDArray[Any]
+    heights: NDArray[Any]
     title: str
-    caption: str
+    captions: tuple[str, str]
 
 
-def draw(rows: Sequence[Sequence[Moment]], path: Path) -> None:
-    """Write the picture as PNG; a row is heights, or x, y, z of a grid that closes both ways."""
+def draw(panels: Sequence[Panel], window: tuple[slice, slice], path: Path) -> None:
+    """Write a PNG: a column for each panel, above the whole surface, below the window of it.
+
+    All have the colours, the scale and the light of the last panel. Needs matplotlib.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from PIL import Image
 
-    across = max(map(len, rows))
-    figure = Figure(figsize=(across * 4.0, len(rows) * 3.35), dpi=100, facecolor=_PAPER)
+    rows, columns = panels[-1].heights.shape
+    across = (1 - _MARGIN * (len(panels) + 1)) / len(panels)
+    down = across * rows / columns
+    tall = _TITLE + 2 * down + 3 * _MARGIN
+    figure = Figure(figsize=(_WIDTH / 100, _WIDTH / 100 * tall), dpi=100, facecolor=_PAPER)
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(rows), across, squeeze=False)
-    figure.subplots_adjust(left=0.008, right=0.992, top=0.995, bottom=0.09 / len(rows) * 2, wspace=0.02, hspace=0.22)
-    for row, moments in zip(panels, rows, strict=True):
-        pictures = _pictures([moment.points for moment in moments])
-        for panel, moment, picture in zip(row, moments, pictures, strict=True):
-            panel.set_axis_off()
-            panel.imshow(picture, interpolation="antialiased")
-            last = moment is moments[-1]
-            panel.text(
-                0.5, -0.015, moment.title, transform=panel.transAxes, ha="center", va="top",
-                color=_ACCENT if not last else _INK, fontsize=14, fontweight="bold",
-            )  # fmt: skip
-            panel.text(
-                0.5, -0.105, moment.caption, transform=panel.transAxes, ha="center", va="top", color=_DIM, fontsize=10.5
+    low, high = float(panels[-1].heights.min()), float(panels[-1].heights.max())
+    centred: dict[str, Any] = {"ha": "center", "va": "center"}
+    for number, panel in enumerate(panels):
+        left = _MARGIN + number * (across + _MARGIN)
+        lit = _relief(panel.heights.astype(np.float64), low, high)
+        for place, part, filtering in ((1, (slice(None), slice(None)), "antialiased"), (0, window, "bicubic")):
+            bottom = _MARGIN + place * (down + _MARGIN)
+            axes = figure.add_axes((left, bottom / tall, across, down / tall), facecolor=_EMPTY)
+            _bare(axes)
+            axes.imshow(lit[part], interpolation=filtering, aspect="auto")
+            if place == 1:
+                _frame(axes, window)
+            elif np.isnan(panel.heights[part]).all():
+                axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, color=_DIM, fontsize=12, **centred)
+        last = number == len(panels) - 1
+        for text, height, colour, size, weight in (
+            (panel.title, 0.016, _INK if last else _ACCENT, 13.5, "bold"),
+            (panel.captions[0], 0.034, _INK, 10.5, "normal"),
+            (panel.captions[1], 0.049, _DIM, 10.5, "normal"),
+        ):
+            figure.text(
+                left + across / 2, 1 - height / tall, text, color=colour, fontsize=size, weight=weight, **centred
             )
-    figure.savefig(path, facecolor=_PAPER, pil_kwargs={"optimize": True})
+    drawn = io.BytesIO()
+    figure.savefig(drawn, facecolor=_PAPER)
+    # A palette makes the file a third as large.
+    picture = Image.open(drawn).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    picture.save(path, format="PNG", optimize=True)
 
 
-def _pictures(states: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:
-    # One camera and one scale of colours for all moments, taken from the last: only the surface changes.
-    original = states[-1].astype(np.float64)
-    return [(_terrain if original.ndim == 2 else _torus)(state.astype(np.float64), original) for state in states]
-
-
-def _terrain(heights: NDArray[np.float64], original: NDArray[np.float64]) -> NDArray[np.float32]:
-    rows, columns = original.shape
-    spacing = (92.6, 74.2)
-    low, high = float(original.min()), float(original.max())
-    lift = 0.135 * columns * spacing[1] / (high - low)
-    share = ((heights - low) / (high - low)).clip(0.0, 1.0)
-    patches = render.block((heights - low) * lift, spacing, _coloured(share, _TERRAIN), -0.09 * columns * spacing[1], 4)
-    centre = (columns * spacing[1] / 2, -rows * spacing[0] / 2, 0.02 * columns * spacing[1])
-    camera = render.Camera(-66.0, 36.0, centre, 1.46 * columns * spacing[1])
-    return render.draw(patches, camera, _WIDTH, _HEIGHT)
-
-
-def _torus(points: NDArray[np.float64], original: NDArray[np.float64]) -> NDArray[np.float32]:
-    angle = np.arctan2(points[:, :, 1], points[:, :, 0])
-    ring = 2.1 + 0.12 * np.cos(3 * angle)
-    tube = np.hypot(np.hypot(points[:, :, 0], points[:, :, 1]) - ring, points[:, :, 2] - 0.25 * np.sin(2 * angle))
-    share = ((tube - 0.68) / 0.34).clip(0.0, 1.0)
-    camera = render.Camera(-58.0, 47.0, (0.0, 0.0, -0.05), 1.22 * float(np.ptp(original[:, :, 0])))
-    patches = render.ring(points, _coloured(share, _TORUS), (10, 9))
-    return render.draw(patches, camera, _WIDTH, _HEIGHT)
-
-
-def _coloured(share: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+def _relief(heights: Floats, low: float, high: float) -> Floats:
+    """Colours by height, shaded by slope: (H, W, 4), transparent where there is nothing."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colours: NDArray[np.float64] = LinearSegmentedColormap.from_list("", list(names), N=1024)(share)
-    return colours[:, :, :3]
+    slopes = np.gradient(heights * (_EXAGGERATION / CELL))
+    normals = np.stack([-slopes[1], slopes[0], np.ones_like(heights)], axis=2)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    light = 0.31 + 0.25 * normals[..., 2] + 0.68 * (normals @ (_SUN / np.linalg.norm(_SUN))).clip(0.0)
+    share = ((heights - low) / (high - low)).clip(0.0, 1.0)
+    colours = LinearSegmentedColormap.from_list("", _TINTS, N=1024)(np.nan_to_num(share))
+    colours[..., :3] = (colours[..., :3] * np.nan_to_num(light, nan=1.0)[..., None]).clip(0.0, 1.0)
+    colours[..., 3] = np.isfinite(heights)
+    lit: Floats = colours
+    return lit
+
+
+def _bare(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _frame(axes: Axes, window: tuple[slice, slice]) -> None:
+    from matplotlib.patches import Rectangle
+
+    rows, columns = window
+    corner, width, height = (columns.start, rows.start), columns.stop - columns.start, rows.stop - rows.start
+    axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=_INK, linewidth=1.2))

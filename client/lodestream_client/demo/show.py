@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
 
 from .. import sync
-from ..commands.output import cell, console, human_size, print_json
-from . import models, picture
+from ..commands.output import cell, console, human_size, note, print_json, progress_bar
+from . import picture, plain
 from .service import own_server
+from .terrain import terrain
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
     from rich.table import Table
 
     from lodestream.decoder import View
@@ -27,177 +33,225 @@ if TYPE_CHECKING:
 
 __all__ = ["show"]
 
+_SHAPE = (1024, 1280)
 _LINK = 64_000 / 8  # bytes per second
-_STOP = ls.Tolerance(1e-3, relative=True)
-
-# Shares of the extent: the picture shows the first states whose RMS error is at most these, then the stop.
-_EARLIER = {"jacksboro": (0.1, 0.02), "torus": (0.02, 0.005)}
+_STOP = 10.0  # metres
+_STEP = 3  # a line of the table for so many times the bytes of the line before
+_WINDOW = 8  # the picture enlarges an eighth of the rows and of the columns
 
 
 @dataclass(frozen=True)
-class _Arrival:
+class _Moment:
+    """A line of the table; errors in metres."""
+
     seconds: float
-    view: View
-
-
-@dataclass(frozen=True)
-class _Run:
-    """One surface streamed: what came when, and what it is compared with."""
-
-    model: models.Model
-    arrivals: Sequence[_Arrival]
-    ended: str
-    whole: int
-    extent: float
+    bytes: int
+    rms: float
+    rms_found: float
+    max: float
+    max_found: float
+    npy_rows: int
+    overview_factor: int
+    overview_rms: float
 
     @property
-    def last(self) -> View:
-        return self.arrivals[-1].view
-
-    @property
-    def raw(self) -> int:
-        return int(self.model.points.size) * 4
+    def agrees(self) -> bool:
+        pairs = ((self.rms, self.rms_found), (self.max, self.max_found))
+        return all(f"{told:.9g}" == f"{found:.9g}" for told, found in pairs)
 
 
-def show(folder: Path, *, as_json: bool = False) -> int:
-    """Run the demo and write its picture and surfaces into `folder`; the exit code.
+def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE) -> int:
+    """Run the demo and write its surface and, where matplotlib is, its picture into `folder`; the exit code.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it is not there.
+    as_json : bool
+        Print one JSON object on standard output, and everything else on standard error.
+    shape : (rows, columns)
+        Of the surface.
 
     Raises
     ------
     LodestreamError
-        When something that it needs is not installed, or the server does not start.
+        When something that it needs is not installed, the server does not start, or an error told is not the error
+        found.
     """
     out = console(stderr=as_json)
-    chosen = (models.jacksboro(), models.torus())
     folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "terrain.npy"
     with ExitStack() as stack:
-        with out.status("starting a server (the first time, kernels are compiled, which takes a while)"):
-            url = stack.enter_context(own_server())
-            _warm()
-        out.print(f"A server of our own at {url}, and a link of 64 kbit/s to it")
-        runs = [_run(model, url, out) for model in chosen]
-    agreed = [_compare(run, out) for run in runs]
-    paths = _write(runs, folder)
-    out.print()
+        bar = stack.enter_context(progress_bar())
+        task = bar.add_task("starting a server (the first time this compiles, for a minute)", total=None, figures="")
+        url = stack.enter_context(own_server())
+        bar.remove_task(task)
+        heights = _made(shape, file, bar)
+        ls.decode(ls.encode(heights[:16, :16]))  # compiles the decoder before the clock runs
+        surface = _uploaded(url, file, bar)
+        whole = int(surface.details["levels"][-1]["bytes"])
+        arrivals = _streamed(surface, bar)
+    moments = [_moment(seconds, view, heights) for seconds, view in _chosen(arrivals)]
+    last = moments[-1]
+    plain_bytes = file.stat().st_size
+    out.print(
+        f"{shape[0]:,} x {shape[1]:,} generated heights in whole metres, over a link of {_LINK * 8 / 1000:.0f} kbit/s, "
+        f"stopped at an RMS error of {_STOP:g} m\n"
+    )
+    out.print(_table(moments, whole, shape))
+    _conclude(last, whole, plain_bytes, out)
+    paths = [file]
+    drawn = _draw(arrivals[-1][1], last, heights, plain_bytes, folder / "demo.png")
+    if drawn is not None:
+        paths.append(drawn)
     out.print(cell(f"Written: {', '.join(map(str, paths))}"))
     if as_json:
-        print_json({"surfaces": [_summary(run) for run in runs], "files": [str(path) for path in paths]})
-    if not all(agreed):
-        raise LodestreamError("the error told and the error found differ: this is a bug, please report it")
+        print_json(
+            {
+                "shape": list(shape),
+                "whole_bytes": whole,
+                "plain_bytes": plain_bytes,
+                "moments": [asdict(moment) for moment in moments],
+                "files": [str(path) for path in paths],
+            }
+        )
+    if not all(moment.agrees for moment in moments):
+        raise LodestreamError("an error told is not the error found: this is a bug, please report it")
     return 0
 
 
-def _warm() -> None:
-    # Compiles the decoder before the clock runs: what is shown is the link, not the compiler.
-    import numpy as np
+def _made(shape: tuple[int, int], file: Path, bar: Progress) -> NDArray[np.int16]:
+    task = bar.add_task("generating the surface", total=1.0, figures=f"{math.prod(shape):,} points")
+    heights = terrain(shape, lambda done: bar.update(task, completed=done))
+    np.save(file, heights)
+    bar.remove_task(task)
+    return heights
 
-    wave = np.add.outer(np.arange(9.0), np.arange(8.0) ** 2).astype(np.float32)
-    ls.decode(ls.encode(wave))
+
+def _uploaded(url: str, file: Path, bar: Progress) -> Description:
+    task = bar.add_task("sending", total=1.0, figures=human_size(file.stat().st_size))
+
+    def progress(stage: str, fraction: float) -> None:
+        bar.update(task, description=f"{stage} on the server" if stage == "building" else stage, completed=fraction)
+
+    surface = sync.upload(url, file, progress=progress)
+    bar.remove_task(task)
+    return surface
 
 
-def _run(model: models.Model, url: str, out: Console) -> _Run:
-    from rich.live import Live
-
-    out.print(f"\n[bold]{model.title}[/bold]")
-    surface = sync.upload(url, model.source, options=model.options)
-    table = _table(model.unit)
-    arrivals: list[_Arrival] = []
+def _streamed(surface: Description, bar: Progress) -> list[tuple[float, View]]:
+    layers = surface.details["layers"]
+    total = next((layer["bytes"] for layer in layers if layer["rms"] <= _STOP), layers[-1]["bytes"])
+    task = bar.add_task("streaming", total=total, figures="")
+    arrivals: list[tuple[float, View]] = []
     started = time.monotonic()
-    with (
-        sync.connect(surface.url, target=ls.Target(until_rms=_STOP), limit_rate=_LINK) as stream,
-        Live(table, console=out, refresh_per_second=8, vertical_overflow="visible"),
-    ):
+    with sync.connect(surface.url, target=ls.Target(until_rms=ls.Tolerance(_STOP)), limit_rate=_LINK) as stream:
         for view in stream:
-            arrivals.append(_Arrival(time.monotonic() - started, view))
-            _add(table, arrivals[-1], _whole(surface))
-    header = stream.decoder.header
-    if header is None or stream.ended is None or not arrivals:
+            arrivals.append((time.monotonic() - started, view))
+            bar.update(task, completed=view.bytes, figures=f"{human_size(view.bytes)}, RMS error {view.rms:.3g} m")
+    bar.remove_task(task)
+    if not arrivals:
         raise LodestreamError("expected at least one view of the surface, got none")
-    return _Run(model, arrivals, stream.ended, _whole(surface), header.extent)
+    return arrivals
 
 
-def _whole(surface: Description) -> int:
-    # The surface without index and metadata: what a view's bytes are counted in.
-    return int(surface.details["levels"][-1]["bytes"])
+def _chosen(arrivals: Sequence[tuple[float, View]]) -> list[tuple[float, View]]:
+    chosen = [arrivals[-1]]
+    for arrival in reversed(arrivals):
+        if arrival[1].bytes * _STEP <= chosen[-1][1].bytes:
+            chosen.append(arrival)
+    return chosen[::-1]
 
 
-def _table(unit: str) -> Table:
+def _moment(seconds: float, view: View, heights: NDArray[np.int16]) -> _Moment:
+    rms, greatest = _errors(view.points, heights)
+    rough, factor = plain.overview(heights, view.bytes)
+    rows = int(np.isfinite(plain.beginning(heights, view.bytes)).all(axis=1).sum())
+    return _Moment(
+        round(seconds, 3), view.bytes, view.rms, rms, view.max_error, greatest, rows, factor, _errors(rough, heights)[0]
+    )
+
+
+def _errors(points: NDArray[Any], heights: NDArray[np.int16]) -> tuple[float, float]:
+    """Root mean square and maximum of the differences."""
+    difference = points.astype(np.float64) - heights
+    return float(np.sqrt((difference**2).mean())), float(np.abs(difference).max())
+
+
+def _table(moments: Sequence[_Moment], whole: int, shape: tuple[int, int]) -> Table:
     from rich.table import Table
 
-    suffix = f" [{unit}]" if unit else ""
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("time [s]", "bytes", "of all", "level", f"RMS error{suffix}", f"maximum{suffix}"):
-        # The brackets of a unit are no markup.
-        table.add_column(name.replace("[", "\\["), justify="right")
+    for name in (
+        "bytes",
+        "of the\nstream",
+        "RMS error\ntold [m]",
+        "\nfound [m]",
+        "maximum\ntold [m]",
+        "\nfound [m]",
+        "plain file:\nrows come",
+        "overview: factor,\nRMS error [m]",
+    ):
+        table.add_column(name.replace("[", "\\["), justify="right")  # the brackets of a unit are no markup
+    for it in moments:
+        table.add_row(
+            f"{it.bytes:,}",
+            f"{it.bytes / whole:.2%}",
+            f"{it.rms:.3f}",
+            f"{it.rms_found:.3f}",
+            f"{it.max:.0f}",
+            f"{it.max_found:.0f}",
+            f"{it.npy_rows} of {shape[0]:,}",
+            f"1:{it.overview_factor}  {it.overview_rms:5.1f}",
+        )
     return table
 
 
-def _add(table: Table, arrival: _Arrival, whole: int) -> None:
-    view = arrival.view
-    table.add_row(
-        f"{arrival.seconds:.2f}",
-        f"{view.bytes:,}",
-        f"{view.bytes / whole:.1%}",
-        str(view.level),
-        f"{view.rms:.6g}",
-        f"{view.max_error:.6g}",
-    )
-
-
-def _compare(run: _Run, out: Console) -> bool:
-    """Print the error told beside the error found, and the price; whether the errors agree."""
-    view, model = run.last, run.model
-    found = model.errors(view.points)
-    pairs = [(f"{told:.9g}", f"{seen:.9g}") for told, seen in zip((view.rms, view.max_error), found, strict=True)]
-    goal = "1e-3 of the extent"
-    why = (
-        f"stopped at an RMS error of {goal}" if run.ended == "rms" else f"came whole: no state before is within {goal}"
-    )
-    out.print(f"\n[bold]{model.title.split(',')[0]}[/bold] {why}; {run.arrivals[-1].seconds:.1f} s")
-    for name, (told, seen) in zip(("RMS error", "maximum"), pairs, strict=True):
-        verdict = "agree" if told == seen else "DIFFER"
-        out.print(f"  {name:9}  told {told:>13} {model.unit:2} found {seen:>13} {model.unit:2} {verdict}")
+def _conclude(last: _Moment, whole: int, plain_bytes: int, out: Console) -> None:
     out.print(
-        f"  bytes      {view.bytes:,}: {view.bytes / run.whole:.1%} of the whole stream ({run.whole:,}), "
-        f"{view.bytes / run.raw:.1%} of the float32 surface ({run.raw:,})"
+        f"\nStopped after {last.bytes:,} bytes: {last.bytes / whole:.1%} of the stream ({whole:,}), "
+        f"{last.bytes / plain_bytes:.1%} of terrain.npy ({plain_bytes:,})."
     )
-    return all(told == seen for told, seen in pairs)
+    out.print(
+        f"Over this link: {last.seconds:.1f} s. The whole stream, every value exact, takes {whole / _LINK:.0f} s, "
+        f"terrain.npy {plain_bytes / _LINK:.0f} s."
+    )
+    out.print(
+        "Plain file: the first bytes of terrain.npy. Overview: the finest grid of means that fits into as many bytes, "
+        "deflated as in a GeoTIFF, bilinear between them."
+    )
 
 
-def _summary(run: _Run) -> dict[str, Any]:
-    view = run.last
-    rms, max_error = run.model.errors(view.points)
-    return {
-        "name": run.model.stem,
-        "ended": run.ended,
-        "seconds": round(run.arrivals[-1].seconds, 3),
-        "bytes": view.bytes,
-        "whole_bytes": run.whole,
-        "raw_bytes": run.raw,
-        "rms": view.rms,
-        "rms_found": rms,
-        "max": view.max_error,
-        "max_found": max_error,
-    }
-
-
-def _write(runs: Sequence[_Run], folder: Path) -> list[Path]:
-    moments = folder / "moments.png"
-    picture.draw([_moments(run) for run in runs], moments)
-    paths = [moments]
-    for run in runs:
-        paths.append(folder / f"{run.model.stem}.obj")
-        ls.write(run.model.placed(run.last.points), paths[-1])
-    return paths
-
-
-def _moments(run: _Run) -> list[picture.Moment]:
-    shares = (*_EARLIER[run.model.stem], 0.0)
-    moments = []
-    for share in shares:
-        arrival = next((it for it in run.arrivals if it.view.rms <= share * run.extent), run.arrivals[-1])
-        view = arrival.view
-        error = f"RMS error {view.rms:.3g} {run.model.unit}".rstrip()
-        moments.append(picture.Moment(view.points, human_size(view.bytes), f"after {arrival.seconds:.1f} s · {error}"))
-    size = f"{human_size(run.raw)} as float32 · {run.raw / _LINK:.0f} s at 64 kbit/s"
-    return [*moments, picture.Moment(run.model.points, "the original", size)]
+def _draw(view: View, last: _Moment, heights: NDArray[np.int16], plain_bytes: int, path: Path) -> Path | None:
+    rows, columns = heights.shape
+    size = f"{last.bytes:,} bytes"
+    panels = (
+        picture.Panel(
+            plain.beginning(heights, last.bytes),
+            "first bytes of a plain file",
+            (size, f"{last.npy_rows} of {rows:,} rows"),
+        ),
+        picture.Panel(
+            plain.overview(heights, last.bytes)[0],
+            f"overview 1:{last.overview_factor}, deflated",
+            (size, f"RMS error {last.overview_rms:.1f} m"),
+        ),
+        picture.Panel(
+            view.points,
+            "Lodestream",
+            (size, f"RMS error {last.rms:.1f} m, told and found"),
+        ),
+        picture.Panel(
+            heights,
+            "the original",
+            (f"{plain_bytes:,} bytes", f"{rows:,} x {columns:,} heights, int16"),
+        ),
+    )
+    top, left = round(0.36 * rows), round(0.24 * columns)
+    window = slice(top, top + rows // _WINDOW), slice(left, left + columns // _WINDOW)
+    try:
+        picture.draw(panels, window, path)
+    except ImportError:
+        note("no picture without matplotlib: pip install 'lodestream[plot]'")
+        return None
+    return path

@@ -21,7 +21,7 @@ from . import planes
 from .list_directed import is_text
 from .notes import warn
 from .planes import Cut
-from .plot3d_layouts import OPTIONS, Layout, Numbers, choices_of, find_layout, open_numbers
+from .plot3d_layouts import Layout, Numbers, dimensions_of, find_layout, open_numbers
 from .source import Source
 
 __all__ = ["MORE", "READ_OPTIONS", "SUFFIXES", "read", "sniff"]
@@ -31,7 +31,7 @@ MORE = "Q files and function files of the same grid"
 READ_OPTIONS: Mapping[str, str] = {
     "plane": planes.HELP,
     "block": "number of one block of a file of several, from 1",
-    **{name: words for name, (_, words) in OPTIONS.items()},
+    "dimensions": "2 or 3, where a PLOT3D file fits both",
 }
 
 #: What the first two integers of a file may be, to be taken for PLOT3D.
@@ -64,7 +64,7 @@ def read(source: Source) -> Surface:
     metadata; a function file ``function_1`` and so on.
     """
     numbers = open_numbers(source.path)
-    layout = find_layout(numbers, ["grid"], choices_of(source))
+    layout = find_layout(numbers, ["grid"], dimensions_of(source))
     chosen = source.integer_option("block", 1, len(layout.dims))
     indices = range(len(layout.dims)) if chosen is None else [chosen - 1]
     taken, metadata = planes.cuts(source, [layout.dims[index] for index in indices])

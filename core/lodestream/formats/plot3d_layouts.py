@@ -18,24 +18,21 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, OptionError
+from ..errors import FormatError
 from .list_directed import is_text, read_numbers
 from .planes import Dims
 from .source import Source, number
 
-__all__ = ["OPTIONS", "Layout", "Numbers", "choices_of", "find_layout", "open_numbers"]
+__all__ = ["Layout", "Numbers", "dimensions_of", "find_layout", "open_numbers"]
 
-#: Options that decide where several layouts fit, with the values that they take and a line of help.
-OPTIONS: Mapping[str, tuple[Mapping[str, object], str]] = {
-    "reals": ({"single": 4, "double": 8}, "of a binary PLOT3D file: single or double"),
-    "endian": ({"little": "<", "big": ">"}, "byte order of a binary PLOT3D file: little or big"),
-    "records": ({"no": False, "yes": True}, "whether a binary PLOT3D file has Fortran's record markers: yes or no"),
-    "blocks": (
-        {"single": False, "multi": True},
-        "whether a PLOT3D file begins with a count of blocks: single or multi",
-    ),
-    "iblank": ({"no": False, "yes": True}, "whether a PLOT3D grid has IBLANK: yes or no"),
-    "dimensions": ({"2": 2, "3": 3}, "of a PLOT3D file: 2 or 3"),
+#: Values of what a layout consists of, for what is not known of a file.
+_VALUES: Mapping[str, tuple[object, ...]] = {
+    "endian": ("<", ">"),
+    "records": (False, True),
+    "blocks": (False, True),
+    "dimensions": (2, 3),
+    "reals": (4, 8),
+    "iblank": (False, True),
 }
 
 #: More than any grid has; each block costs a little time and memory of its own.
@@ -44,8 +41,11 @@ _MAX_VARIABLES = 1 << 10
 _MAX_POINTS = 1 << 24
 _MARKER = 4
 
-#: Options that text has no use for.
+#: What text has no use for.
 _BINARY = ("reals", "endian", "records")
+
+#: The option for the layouts of one size that real files have: two dimensions of several blocks, or three of one.
+_DIMENSIONS = "dimensions"
 
 _KINDS = {"grid": "grid", "q": "Q", "function": "function"}
 
@@ -137,20 +137,17 @@ class Layout:
         per_block = 2 if self.kind == "q" else 1  # the reference numbers of a Q file are a record of their own
         return [place for place, _ in self.places()[self.multi + per_block :: per_block]]
 
-    def words(self, names: Sequence[str]) -> str:
-        """Write the layout as options."""
-        values = [
-            self.precision,
-            self.endian,
-            self.records,
-            self.multi,
-            self.iblank,
-            self.dimensions,
-        ]
-        given = dict(zip(OPTIONS, values, strict=True))
-        names = names if self.precision else [name for name in names if name not in _BINARY]
-        spelled = {name: word for name in names for word, value in OPTIONS[name][0].items() if value == given[name]}
-        return " ".join(f"{name}={word}" for name, word in spelled.items())
+    def words(self) -> str:
+        """Write the layout in words, but for its points."""
+        words = [f"{self.dimensions} dimensions", "a count of blocks" if self.multi else "no count of blocks"]
+        words += ["IBLANK"] * self.iblank
+        if self.precision:
+            words += [
+                "single" if self.precision == 4 else "double",
+                "little endian" if self.endian == "<" else "big endian",
+            ]
+            words += ["record markers"] * self.records
+        return ", ".join(words)
 
     def points(self) -> str:
         """Write the points of the blocks in words."""
@@ -199,17 +196,10 @@ def open_numbers(path: Path) -> Numbers:
     return _Text(path) if text else _Binary(path)
 
 
-def choices_of(source: Source) -> dict[str, object]:
-    """Give the values of the options that were given."""
-    result: dict[str, object] = {}
-    for name, (values, _) in OPTIONS.items():
-        word = source.options.get(name)
-        if word is None:
-            continue
-        if str(word).lower() not in values:
-            raise OptionError(f"expected {name}= {' or '.join(values)}, got {str(word)!r}")
-        result[name] = values[str(word).lower()]
-    return result
+def dimensions_of(source: Source) -> dict[str, object]:
+    """What the option ``dimensions`` says of a file, for `find_layout`."""
+    chosen = source.integer_option(_DIMENSIONS, 2, 3)
+    return {} if chosen is None else {_DIMENSIONS: chosen}
 
 
 def find_layout(
@@ -223,7 +213,8 @@ def find_layout(
     kinds : sequence of str
         The kinds of file that it may be.
     wanted : mapping of str to values
-        What is known, as `choices_of` gives it.
+        What is known: some of ``endian``, ``records``, ``blocks`` (a count of them comes first), ``dimensions``,
+        ``reals`` (bytes of one) and ``iblank``.
     dims : sequence of (int, int, int), optional
         Points of the blocks of the grid that the file belongs to.
 
@@ -241,23 +232,19 @@ def find_layout(
     unit = "numbers" if numbers.text else "bytes"
     what = f"a PLOT3D {' or '.join(_KINDS[kind] for kind in kinds)} file"
     if fitting:
-        names = [name for name in OPTIONS if len({layout.words([name]) for layout in fitting}) > 1]
-        listed = "; or ".join(f"{layout.words(names) or layout.kind} ({layout.points()})" for layout in fitting)
+        listed = "; or ".join(f"{layout.points()} ({layout.kind}, {layout.words()})" for layout in fitting)
+        differ = len({layout.dimensions for layout in fitting}) > 1
         raise FormatError(
-            f"expected {what} that only one layout fits, got {number(numbers.size)} {unit} that {len(fitting)} fit: "
-            f"choose by options: {listed}"
+            f"expected {what} that only one layout fits, got {number(numbers.size)} {unit} that {len(fitting)} fit"
+            f"{', choose by -o dimensions=2 or 3' if differ else ''}: {listed}"
         )
-    spelled = {name: {value: word for word, value in values.items()} for name, (values, _) in OPTIONS.items()}
-    asked = " ".join(f"{name}={spelled[name][value]}" for name, value in wanted.items())
     if not plausible:
+        asked = f" with dimensions={wanted[_DIMENSIONS]}" if _DIMENSIONS in wanted else ""
         of_grid = "the dimensions of the grid" if dims is not None else "dimensions of blocks"
-        raise FormatError(
-            f"expected {what}{f' with {asked}' if asked else ''}, which begins with {of_grid}, got none in any layout"
-        )
+        raise FormatError(f"expected {what}{asked}, which begins with {of_grid}, got none in any layout")
     sizes = {layout.size(): layout for layout in plausible}
-    names = [name for name in OPTIONS if name != "dimensions"]
     nearest = "; or ".join(
-        f"{number(size)} ({sizes[size].points()}, {sizes[size].words(names)})"
+        f"{number(size)} ({sizes[size].points()}, {sizes[size].words()})"
         for size in sorted(sizes, key=lambda size: abs(size - numbers.size))[:2]
     )
     raise FormatError(
@@ -270,7 +257,7 @@ def _plausible(numbers: Numbers, kinds: Sequence[str], wanted: Mapping[str, obje
     """Give the layouts whose header can be one, whatever the size."""
 
     def choices(name: str) -> list[Any]:
-        values = [wanted[name]] if name in wanted else list(OPTIONS[name][0].values())
+        values = [wanted[name]] if name in wanted else list(_VALUES[name])
         return [None] if numbers.text and name in _BINARY else values
 
     for kind, endian, records, multi, dimensions in product(

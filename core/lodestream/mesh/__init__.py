@@ -1,7 +1,7 @@
 """Meshes of polygons and structured surfaces, in both directions.
 
-`recognise` finds the grids that the faces of a mesh make, whatever the order of its vertices and faces; `faces_of`
-makes the welded mesh of any surface, which is what every format for meshes writes. Between the two, two keys of a
+`recognise` finds the grids that the faces of a mesh make, whatever the order of its vertices and faces; `weld`
+finds the mesh of any surface, which is what every format for meshes writes. Between the two, two keys of a
 surface's metadata say what a grid alone does not tell about the mesh that it came from, so that it goes out as it came.
 Both hold at every level of the surface and both may be missing.
 
@@ -47,6 +47,6 @@ A cell with a corner that is a hole has no face.
 from __future__ import annotations
 
 from .model import CornerAttribute, Mesh
-from .weld import Faces, Weld, faces_of, weld
+from .weld import Weld, weld
 
-__all__ = ["CornerAttribute", "Faces", "Mesh", "Weld", "faces_of", "weld"]
+__all__ = ["CornerAttribute", "Mesh", "Weld", "weld"]

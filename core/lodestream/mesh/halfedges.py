@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 
 from ..kernels import inlined, kernel
 
-__all__ = ["Corners", "find_pieces", "find_twins", "find_umbrellas", "join_pieces", "next_half_edge", "orient", "turn"]
+__all__ = [
+    "Corners",
+    "find_pieces",
+    "find_twins",
+    "find_umbrellas",
+    "first_around",
+    "join_pieces",
+    "next_half_edge",
+    "orient",
+    "turn",
+]
 
 Corners = NDArray[np.int32]
 
@@ -37,6 +47,22 @@ def previous_half_edge(corners: Corners, half: int) -> int:
     if k > 0:
         return half - 1
     return half + (2 if corners[face, 3] < 0 else 3)
+
+
+@inlined
+def first_around(corners: Corners, twins: NDArray[np.int32], seed: int) -> tuple[int, bool]:
+    """Where a walk round the vertex of a half-edge begins, and whether it comes back there.
+
+    Back against the sense of rotation, to the border or once round.
+    """
+    first = seed
+    while True:
+        twin = twins[first]
+        if twin < 0:
+            return first, False
+        first = next_half_edge(corners, twin)
+        if first == seed:
+            return first, True
 
 
 @kernel
@@ -260,17 +286,7 @@ def find_umbrellas(
     for seed in range(umbrella.size):
         if umbrella[seed] >= 0 or corners[seed >> 2, seed & 3] < 0:
             continue
-        # Back against the sense of rotation, to the border or once round.
-        first = seed
-        closed = False
-        while True:
-            twin = twins[first]
-            if twin < 0:
-                break
-            first = next_half_edge(corners, twin)
-            if first == seed:
-                closed = True
-                break
+        first, closed = first_around(corners, twins, seed)
         half = first
         faces = 0
         while True:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import kernel
-from .halfedges import Corners, next_half_edge, previous_half_edge
+from .halfedges import Corners, first_around, next_half_edge, previous_half_edge
 
 __all__ = ["find_fans", "find_poles", "unfold"]
 
@@ -153,16 +153,7 @@ def unfold(
     for seed in range(umbrella.size):
         if umbrella[seed] < 0 or not pole[umbrella[seed]] or done[seed >> 2]:
             continue
-        first = seed
-        closed = False
-        while True:
-            twin = twins[first]
-            if twin < 0:
-                break
-            first = next_half_edge(corners, twin)
-            if first == seed:
-                closed = True
-                break
+        first, closed = first_around(corners, twins, seed)
         half = first
         start = count
         while True:

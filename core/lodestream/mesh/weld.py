@@ -2,41 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..surface import Block, Surface
 from .cells import unpack_cells
 from .joining import Part, join_points, parts_of, poles_of, wraps
 
-__all__ = ["Faces", "Weld", "faces_of", "weld"]
-
-
-class Faces(NamedTuple):
-    """A welded mesh, as `faces_of` gives it.
-
-    Attributes
-    ----------
-    vertices : array of shape (V, 3)
-        x, y, z. Heights are drawn over x and y, planar points get z = 0. The surface's type; float64 where the
-        coordinates of heights are not whole.
-    quads : int64 array of shape (Q, 4)
-        0-based vertices of each quad, going round it.
-    triangles : int64 array of shape (T, 3)
-        0-based vertices of each triangle, going round it.
-    attributes : dict of str to arrays of shape (V,) or (V, K)
-        The blocks' attributes; channels of the points beyond the third are ``attribute_0`` and so on.
-    """
-
-    vertices: NDArray[Any]
-    quads: NDArray[np.int64]
-    triangles: NDArray[np.int64]
-    attributes: dict[str, NDArray[Any]]
+__all__ = ["Weld", "weld"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,34 +42,13 @@ class Weld:
     joined: NDArray[np.int64]
 
 
-def faces_of(surface: Surface) -> Faces:
-    """Make the mesh of a surface, for the formats whose vertices carry their attributes with them.
+def weld(surface: Surface) -> Weld:
+    """Find the vertices and faces of a surface's mesh.
 
     Blocks are welded where points on their sides are one (by `Surface.joints`, or else by their coordinates and
     attributes), closed axes are joined by faces, a collapsed side is one vertex with a fan of triangles, and cells at
     holes are left out; see `lodestream.mesh` for what the metadata say about it. Every valid point is a vertex, with a
     face or without.
-
-    Raises
-    ------
-    InputError
-        When the metadata's ``faces``, ``poles`` or ``geotransform`` are not of the form that they should have.
-    """
-    welded = weld(surface)
-    vertices = np.concatenate([_coordinates(block, surface.metadata) for block in surface.blocks])[welded.source]
-    attributes: dict[str, NDArray[Any]] = {}
-    first = surface.blocks[0]
-    for channel in range(3, first.points.shape[2] if first.points.ndim == 3 else 0):
-        values = [block.points[:, :, channel].reshape(-1) for block in surface.blocks]
-        attributes[f"attribute_{channel - 3}"] = np.concatenate(values)[welded.source]
-    for name, array in first.attributes.items():
-        values = [block.attributes[name].reshape(-1, *array.shape[2:]) for block in surface.blocks]
-        attributes[name] = np.concatenate(values)[welded.source]
-    return Faces(vertices, welded.quads, welded.triangles, attributes)
-
-
-def weld(surface: Surface) -> Weld:
-    """Find the vertices and faces of a surface's mesh; what `faces_of` makes it of.
 
     Raises
     ------
@@ -200,26 +154,3 @@ def _compressed(
         return Weld(source, quads, triangles, edges, joined)
     numbers = np.cumsum(used) - 1
     return Weld(source, numbers[quads], numbers[triangles], numbers[edges], numbers[joined[source]])
-
-
-def _coordinates(block: Block, metadata: Mapping[str, Any]) -> NDArray[Any]:
-    """x, y and z of the points in row order."""
-    points = block.points
-    rows, width = block.shape
-    if points.ndim == 3:
-        places = points.reshape(rows * width, -1)[:, :3]
-        if places.shape[1] == 3:
-            return places
-        return np.concatenate([places, np.zeros((len(places), 1), places.dtype)], axis=1)
-    row, column = (index.reshape(-1) for index in np.indices((rows, width)))
-    x: NDArray[Any] = column
-    y: NDArray[Any] = row
-    transform = metadata.get("geotransform")
-    if transform is not None:
-        try:
-            x0, x_column, x_row, y0, y_column, y_row = map(float, transform)
-        except (TypeError, ValueError):
-            raise InputError(f"expected a geotransform of six numbers in the metadata, got {transform!r}") from None
-        x = x0 + (column + 0.5) * x_column + (row + 0.5) * x_row
-        y = y0 + (column + 0.5) * y_column + (row + 0.5) * y_row
-    return np.stack([x, y, points.reshape(-1)], axis=-1)

@@ -8,14 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Camera", "Patch", "block", "draw", "ring"]
+__all__ = ["Camera", "Patch", "draw"]
 
 Floats = NDArray[np.float64]
 
-_KEY = np.array([-0.55, 0.45, 0.70])
-_FILL = np.array([0.8, -0.3, 0.4])
-_ROCK = np.array([0.60, 0.50, 0.42])
-_WALL_ROWS = 150
 _OVERSAMPLING = 2
 
 
@@ -104,84 +100,3 @@ class _Canvas:
         alpha = tiles[..., 3:].sum(axis=(1, 3))
         colour = tiles[..., :3].sum(axis=(1, 3)) / np.maximum(alpha, 1.0)
         return np.concatenate([colour, alpha / _OVERSAMPLING**2], axis=2).clip(0.0, 1.0)
-
-
-def block(heights: Floats, spacing: tuple[float, float], colours: Floats, floor: float, fine: int) -> list[Patch]:
-    """A terrain as a block with side walls.
-
-    Parameters
-    ----------
-    heights : array (H, W), z up, row 0 in the north
-    spacing : (metres between rows, metres between columns)
-    colours : array (H, W, 3), unshaded
-    floor : z of the block's foot
-    fine : points drawn between two of the grid's, along each axis
-    """
-    rows, columns = heights.shape
-    y = -np.arange(rows)[:, None] * spacing[0] + np.zeros((1, columns))
-    x = np.arange(columns)[None, :] * spacing[1] + np.zeros((rows, 1))
-    position = np.stack([x, y, heights], axis=2)
-    normal = np.stack(
-        [
-            -np.gradient(heights, spacing[1], axis=1),
-            np.gradient(heights, spacing[0], axis=0),
-            np.ones_like(heights),
-        ],
-        axis=2,
-    )
-    lit = _shade(colours, normal, _sun(heights, spacing))
-    return [
-        Patch(position, lit, (fine, fine)),
-        _wall(position[-1], floor, fine, 0.62),
-        _wall(position[:, -1], floor, fine, 0.45),
-    ]
-
-
-def ring(points: Floats, colours: Floats, fine: tuple[int, int]) -> list[Patch]:
-    """A grid of x, y, z that closes both ways."""
-    down = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
-    across = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
-    normals = np.cross(down, across)
-    lit = _shade(colours, normals, np.ones(points.shape[:2]), gloss=0.35)
-    return [Patch(_joined(points), _joined(lit), fine, _joined(normals))]
-
-
-def _joined(grid: Floats) -> Floats:
-    return np.pad(grid, ((0, 1), (0, 1), (0, 0)), mode="wrap")
-
-
-def _shade(colours: Floats, normal: Floats, sun: Floats, gloss: float = 0.0) -> Floats:
-    unit = normal / np.linalg.norm(normal, axis=2, keepdims=True)
-    key = (unit @ (_KEY / np.linalg.norm(_KEY))).clip(0.0)
-    fill = (unit @ (_FILL / np.linalg.norm(_FILL))).clip(0.0)
-    sky = 0.5 + 0.5 * unit[:, :, 2]
-    light = 0.30 + 0.20 * sky + 0.14 * fill + 0.80 * key * sun
-    shine = gloss * (unit @ np.array([-0.10, -0.30, 0.95])).clip(0.0) ** 24
-    shaded: Floats = (colours * light[:, :, None] + shine[:, :, None]).clip(0.0, 1.0)
-    return shaded
-
-
-def _sun(heights: Floats, spacing: tuple[float, float]) -> Floats:
-    # Walk from every point towards the key light: whatever stands above the ray takes its light away.
-    toward = _KEY[:2] / np.hypot(*_KEY[:2])
-    rise = _KEY[2] / np.hypot(*_KEY[:2]) * 0.62
-    step = min(spacing)
-    blocked = np.zeros_like(heights)
-    rows, columns = heights.shape
-    for number in range(1, 60):
-        distance = number * step
-        r = np.clip(np.arange(rows) - round(toward[1] * distance / spacing[0]), 0, rows - 1)
-        c = np.clip(np.arange(columns) + round(toward[0] * distance / spacing[1]), 0, columns - 1)
-        above = heights[np.ix_(r, c)] - (heights + rise * distance)
-        np.maximum(blocked, above, out=blocked)
-    return 1.0 - 0.65 * np.clip(blocked / (2.0 * step), 0.0, 1.0)
-
-
-def _wall(edge: Floats, floor: float, fine: int, light: float) -> Patch:
-    share = np.linspace(0.0, 1.0, _WALL_ROWS)[:, None]
-    z = floor + share * (edge[:, 2] - floor)
-    positions = np.stack([np.broadcast_to(edge[:, 0], z.shape), np.broadcast_to(edge[:, 1], z.shape), z], axis=2)
-    # Strata follow the surface, faintly, so that a wall reads as rock and not as a hole.
-    depth = edge[:, 2] - z
-    tone = light * (0.95 + 0.05 * np.sin(depth * (2 * np.pi * 5 / np.ptp(depth))) - 0.25 * (1 - share))
-    return Patch(positions, tone[:, :, None] * _ROCK, (2, fine))

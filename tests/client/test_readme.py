@@ -1,0 +1,59 @@
+"""The README's commands, programs and links work."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lodestream_client.program import build_parser
+from lodestream_client.demo.terrain import terrain
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands() -> list[list[str]]:
+    lines = re.findall(r"^\$ (lodestream .*)$", "".join(blocks("console")), re.MULTILINE)
+    return [shlex.split(line.removesuffix("&"), comments=True)[1:] for line in lines]
+
+
+def test_its_links_lead_somewhere() -> None:
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert len(links) > 10
+    for link in links:
+        path, _, heading = link.partition("#")
+        assert (ROOT / path).exists(), link
+        headings = re.findall(r"^#+ (.*)$", (ROOT / path).read_text(), re.MULTILINE) if heading else []
+        assert not heading or heading in [it.lower().replace(" ", "-") for it in headings], link
+
+
+def test_its_commands_are_understood() -> None:
+    found = commands()
+    assert {command[0] for command in found} == {"encode", "info", "decode", "serve", "push", "pull", "token"}
+    for command in found:
+        build_parser().parse_args([it.replace("URL", "http://127.0.0.1:8000/v1/surfaces/ID") for it in command])
+
+
+def test_its_programs_run(
+    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lodestream-demo").mkdir()
+    np.save(tmp_path / "lodestream-demo" / "terrain.npy", terrain((256, 480)))
+    programs = blocks("python")
+    assert len(programs) == 2
+    names: dict[str, object] = {}
+    for program in programs:
+        exec(program.replace("http://127.0.0.1:8000", server), names)
+    window, surface = names["window"], names["surface"]
+    assert isinstance(window, np.ndarray)
+    assert np.array_equal(window, surface.points[100:220, 300:460])  # type: ignore[attr-defined]
+    assert "(256, 480)" in capsys.readouterr().out
