@@ -1,4 +1,4 @@
-"""Two hundred random schedules of links that break; ``make torture`` runs ten thousand and more of them."""
+"""A hundred random schedules of links that break; ``make torture`` runs ten thousand and more of them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from tests.torture import streams
 
 
 def test_whatever_a_link_does_the_surface_is_the_same_in_the_end() -> None:
-    report = streams.run(200)
+    report = streams.run(100)
     assert report.problems == []
-    assert report.identical + report.errors.total() == report.schedules >= 200
-    assert report.identical > 160
-    assert report.connections > 280, "links were to break"
+    assert report.identical + report.errors.total() == report.schedules >= 100
+    assert report.identical > 80
+    assert report.connections > 140, "links were to break"

@@ -91,9 +91,6 @@ def test_the_manual_is_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pipes(terrain_file: Path) -> None:
     encoded = call("encode", "-", "-", data=terrain_file.read_bytes())
     assert encoded.returncode == 0
-    decoded = call("decode", "-", "-", "--max-bytes", "2000", data=encoded.stdout)
-    assert decoded.returncode == 0
-    assert decoded.stdout.startswith(b"\x93NUMPY")
     whole = call("decode", "-", "-", data=encoded.stdout)
     assert whole.stdout == terrain_file.read_bytes()
     assert b"complete" in whole.stderr

@@ -120,7 +120,7 @@ def test_a_moebius_strip_of_blocks_stays_together() -> None:
     assert_watertight(ls.Surface(blocks=[ls.Block(block) for block in cut(strip, [0, 12, 26, 40], [0, 7])]))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.lists(st.integers(1, 9), min_size=1, max_size=3),
     st.lists(st.integers(1, 9), min_size=1, max_size=3),

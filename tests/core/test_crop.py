@@ -47,7 +47,7 @@ def test_what_a_step_takes_of_an_axis_gives_what_is_wanted(closed: bool) -> None
                 assert crop.step.length <= max(stop - start + 60, 4) or step.wraps
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     shape=st.tuples(st.integers(1, 140), st.integers(1, 90)),
     closed=st.sampled_from(CLOSURES),

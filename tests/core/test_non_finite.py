@@ -148,13 +148,13 @@ def surfaces(draw: st.DrawFn) -> ls.Surface:
     return ls.Surface(blocks=blocks)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(surfaces())
 def test_every_surface_comes_back_bit_for_bit(surface: ls.Surface) -> None:
     assert_comes_back(surface)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(surfaces(), st.booleans())
 def test_with_a_precision_or_an_error_infinities_come_back_and_the_rest_nearly(surface: ls.Surface, rms: bool) -> None:
     attributes = {name: "0.25" for name in ("t", "flow") if name in surface.blocks[0].attributes}
@@ -333,17 +333,17 @@ def test_without_infinities_holes_cost_what_they_did() -> None:
     assert sections.KEPT_MASKS in kinds_of(ls.encode(lake((60, 70))))
 
 
-@pytest.mark.parametrize("signs", [[np.inf], [np.inf, -np.inf], [np.inf, np.nan]])
-def test_half_of_all_points_infinite_costs_a_few_per_cent(signs: list[float]) -> None:
+def test_half_of_all_points_infinite_costs_a_few_per_cent() -> None:
     rng = np.random.default_rng(3)
-    heights = np.cumsum(rng.normal(size=(700, 720)), axis=1).astype(np.float32)
+    heights = np.cumsum(rng.normal(size=(400, 420)), axis=1).astype(np.float32)
     half = rng.random(heights.shape) < 0.5
     heights[half] = np.nan
     holes = len(ls.encode(heights))
-    heights[half] = rng.choice(signs, int(half.sum()))
-    container = assert_comes_back(ls.Surface(heights))
-    # Nothing that is worth a byte where all are alike, and a bit for each of them where each is one of two.
-    assert len(container) - holes < (0.001 if len(signs) == 1 else 0.035) * heights.nbytes
+    for signs in ([np.inf], [np.inf, -np.inf], [np.inf, np.nan]):
+        heights[half] = rng.choice(signs, int(half.sum()))
+        container = assert_comes_back(ls.Surface(heights))
+        # Nothing that is worth a byte where all are alike, and a bit for each of them where each is one of two.
+        assert len(container) - holes < (0.001 if len(signs) == 1 else 0.035) * heights.nbytes
 
 
 def test_one_infinity_costs_some_bytes() -> None:

@@ -98,7 +98,7 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
         assert decoder.bytes < 0.9 * len(container)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.sampled_from(CLOSURES),

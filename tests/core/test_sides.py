@@ -18,7 +18,7 @@ from .layouts import cube, layouts, overlapping, tubes
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(layouts())
 def test_any_layout_is_watertight_at_every_level(blocks: list[LatticeBlock]) -> None:
     arrangement = checked(blocks)

@@ -45,7 +45,7 @@ def _ragged(rng: np.random.Generator, shape: tuple[int, int], channels: int, dty
     return points.astype(dtype)
 
 
-@settings(max_examples=60)
+@settings(max_examples=35)
 @given(
     shape=st.tuples(st.integers(1, 40), st.integers(2, 40)),
     channels=st.sampled_from([0, 0, 2, 3, 5]),
@@ -149,7 +149,7 @@ def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
         assert (0 if quantiser is None else quantiser.base) == base
 
 
-@settings(max_examples=60)
+@settings(max_examples=35)
 @given(
     sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
     classes=st.lists(st.integers(0, 29), min_size=5, max_size=5),

@@ -9,13 +9,15 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tests.server.helpers import eventually
+
 from .driver import Client
 from .events import History, Subject
 from .site import FOLDERS, Site, copy_tree
 
 __all__ = ["KINDS", "Disasters"]
 
-_PATIENCE = 60.0
+_PATIENCE = 150.0
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
 
@@ -95,8 +97,12 @@ class Disasters:
         """The disk fills up; a server ends, and another starts, while it is full."""
         disk = self._site.disk
         assert disk is not None, "expected a site on a disk of its own"
+        before = self._history.refused()
         disk.fill(self._random.choice((0, 0, 4096, 30_000)))
         self._calm()
+        if self._history.refused() == before:  # there was room enough, or nobody had anything new
+            disk.fill(0)
+            eventually(lambda: self._history.refused() > before, "an upload for which there is no room")
         end = self._next("full", ("go on", "kill", "stop"))
         if end != "go on":
             self._end(end)

@@ -16,7 +16,7 @@ from .events import Answer, History, Kind, Operation, Seen, Subject
 
 __all__ = ["Client", "Crowd", "Goods", "Server"]
 
-_PATIENCE = 60.0
+_PATIENCE = 150.0
 _SETTLED = ("ready", "failed", "missing", "waiting")
 
 

@@ -205,6 +205,11 @@ class History:
         with self._lock:
             self.operations.remove(operation)
 
+    def refused(self) -> int:
+        """How often it was answered until now that there is no room."""
+        with self._lock:
+            return sum(operation.answer is not None and operation.answer.status == 507 for operation in self.operations)
+
     def server_ended(self, server: str) -> None:
         """Note that a server has ended, with all that it was doing."""
         with self._lock:

@@ -30,7 +30,7 @@ __all__ = ["FOLDERS", "Disk", "Site", "can_fill", "copy_tree"]
 #: The folders in which everything acknowledged lies.
 FOLDERS = ("records", "uploads", "containers")
 
-_PATIENCE = 60.0
+_PATIENCE = 150.0
 
 
 def can_fill() -> bool:

@@ -24,7 +24,7 @@ from tests.server.sockets import CONTINUATION, PING, Place, frame, handshake
 
 @pytest.fixture(scope="module")
 def surface(http: httpx.Client) -> dict[str, Any]:
-    return push(http, npy(hills(420, 400)))
+    return push(http, npy(hills(200, 190)))
 
 
 def opened(url: str) -> socket.socket:

@@ -19,7 +19,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream_server import level_queue, running_server, worker
-from lodestream_server.level_files import Key, LevelFiles
+from lodestream_server.access import key_of
+from lodestream_server.level_files import Key, Lease, LevelFiles
 from lodestream_server.levels import LevelJob, RefusedLevel, make_level
 from lodestream_server.tokens import TokenFile
 from tests.server import hostile, slow
@@ -79,6 +80,22 @@ def slowly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levels other than the coarsest are made when the file ``go`` is there."""
     monkeypatch.setattr(level_queue, "make_level", slow.make_coarsest)
     monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
+
+
+@pytest.fixture
+def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The levels for which somebody waits, as they came; when ``two`` comes, levels are made."""
+    levels: list[int] = []
+    wait = level_queue.LevelQueue._wait
+
+    async def noted(self: level_queue.LevelQueue, key: Key, caller: str) -> Lease:
+        levels.append(key.level)
+        if caller == key_of("two"):
+            (tmp_path / "go").touch()
+        return await wait(self, key, caller)
+
+    monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)
+    return levels
 
 
 # What the server holds.
@@ -166,7 +183,7 @@ def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: N
         assert len(list((tmp_path / "levels").iterdir())) == 1
 
 
-def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: None) -> None:
+def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: None, line: list[int]) -> None:
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
         answers: list[httpx.Response] = []
@@ -179,6 +196,7 @@ def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: No
         with asking(url, finest(surface)):  # who goes while others wait disturbs nobody
             for thread in threads:
                 thread.start()
+            eventually(lambda: len(line) == 7, "all to wait for the level")
             eventually(lambda: begun(tmp_path), "the level to begin")
         (tmp_path / "go").touch()
         for thread in threads:
@@ -218,50 +236,26 @@ def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly
         assert eventually(lambda: _taken(other, f"{surface['url']}/levels/0"), "a turn").status_code == 200
 
 
-def test_callers_take_turns(tmp_path: Path, slowly: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = TokenFile(tmp_path / "tokens.json")
-    one, two = (file.create(name, ("write",))[0] for name in ("one", "two"))
-    asked: list[int] = []
-    line_up = level_queue.LevelQueue._line_up
-
-    def lined_up(self: level_queue.LevelQueue, job: Any, caller: str) -> None:
-        asked.append(job.key.level)
-        if job.key.level == 0:
-            (tmp_path / "go").touch()
-        line_up(self, job, caller)
-
-    monkeypatch.setattr(level_queue.LevelQueue, "_line_up", lined_up)
-    with running_server(tmp_path, workers=1) as url, client(url, one) as http, client(url, two) as other:
-        surface = push(http, npy(hills()))
-        finer = [len(surface["levels"]) - number for number in range(1, 5)]
-        with ExitStack() as held:
-            for count, level in enumerate(finer, 1):
-                held.enter_context(asking(url, f"{surface['url']}/levels/{level}", one))
-                eventually(lambda count=count: len(asked) == count, "the level to be in the queue")  # type: ignore[misc]
-            assert other.get(f"{surface['url']}/levels/0").status_code == 200
-            order = [level for _, level in eventually(lambda: _so_many(tmp_path, 5), "all to be made")]
-        assert asked == [*finer, 0]
-        assert order[0] == finer[0]
-        assert order.index(0) <= 2
-
-
-def test_a_level_that_another_waits_for_too_is_made_in_the_turn_of_either(tmp_path: Path, slowly: None) -> None:
+@pytest.mark.parametrize("also", [(), (0,)], ids=["for itself", "for both"])
+def test_a_level_is_made_in_the_turn_of_either_who_waits_for_it(
+    tmp_path: Path, slowly: None, line: list[int], also: tuple[int, ...]
+) -> None:
     file = TokenFile(tmp_path / "tokens.json")
     one, two = (file.create(name, ("write",))[0] for name in ("one", "two"))
     with running_server(tmp_path, workers=1) as url, client(url, one) as http, client(url, two) as other:
         surface = push(http, npy(hills(90, 80)))
-        count = len(surface["levels"])
-        assert count >= 6
+        finest_level = len(surface["levels"]) - 1
+        assert finest_level >= 5
+        asked = [*range(finest_level, finest_level - 5, -1), *also]
         with ExitStack() as held:
-            asked = [*range(count - 1, count - 6, -1), 0]
-            for level in asked:
+            for count, level in enumerate(asked, 1):
                 held.enter_context(asking(url, f"{surface['url']}/levels/{level}", one))
-                eventually(lambda: begun(tmp_path), "a level to begin")
-            threading.Timer(0.5, (tmp_path / "go").touch).start()
+                eventually(lambda count=count: len(line) == count, "the level to be in the queue")  # type: ignore[misc]
             assert other.get(f"{surface['url']}/levels/0").status_code == 200
-            order = [level for _, level in eventually(lambda: _so_many(tmp_path, len(asked)), "all to be made")]
-        assert sorted(order) == sorted(asked)
-        assert order[0] == count - 1
+            order = [level for _, level in eventually(lambda: _so_many(tmp_path, 6), "all to be made")]
+        assert line == [*asked, 0]
+        assert sorted(order) == sorted({*asked, 0})
+        assert order[0] == finest_level
         assert order.index(0) <= 2
 
 

@@ -12,6 +12,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -113,12 +114,13 @@ def run(
     root = folder / "site"
     root.mkdir()
     site = Site(root, history, "64m" if "full" in kinds else None)
-    done = Done(owners=2 if owners else 0)
+    done, held = Done(owners=2 if owners else 0), ExitStack()
+    held.callback(site.close)
     try:
         goods, subjects, picture = _goods(site, owners, with_picture="extra" in kinds)
         site.start()
         crowd = Crowd(history, goods, site.servers, subjects, seed=seed, size=CLIENTS)
-        operator = Client("operator", history, goods, site.servers, crowd.ids, random_)
+        operator = held.enter_context(closing(Client("operator", history, goods, site.servers, crowd.ids, random_)))
         # Their ids are learned first, so that a list can be read whatever is answered later.
         for subject in goods.bodies:
             operator.upload(subject)
@@ -130,12 +132,11 @@ def run(
                 disasters.happen(left.pop())
         done.disasters = disasters.done
         done.ready = disasters.settle([subject for subject in goods.bodies if subject in crowd.ids])
-        operator.close()
         site.stop()
     except AssertionError as error:
         raise AssertionError("\n".join((str(error), *map(str, check(history)[:_SHOWN])))) from error
     finally:
-        site.close()
+        held.close()
     done.findings = check(history)
     _count(history, done)
     done.seconds = time.monotonic() - started

@@ -22,6 +22,10 @@ __all__ = ["SmallDisk", "can_mount", "run"]
 
 _Stored: TypeAlias = dict[str, NDArray[np.float32]]
 
+# With so much room beside what was uploaded its container fits, and the page or two of what is written down of it.
+_MARGIN = 1.2
+_MARGIN_BYTES = 32 << 10
+
 
 @dataclass
 class SmallDisk:
@@ -114,5 +118,13 @@ def _settled(http: httpx.Client, location: str) -> str | None:
     entry = http.get(location).raise_for_status().json()
     assert entry["state"] != "failed", entry
     if entry["state"] == "queued" and entry["reason"] is not None:
-        return "waits"
+        # What has room may not have been tried again since another was deleted.
+        return "waits" if _free(http) < _MARGIN * entry["upload_bytes"] + _MARGIN_BYTES else None
     return "ready" if entry["state"] == "ready" else None
+
+
+def _free(http: httpx.Client) -> float:
+    """Bytes that are free on the server's disk."""
+    lines = http.get("/metrics").raise_for_status().text.splitlines()
+    (line,) = (line for line in lines if line.startswith("lodestream_disk_free_bytes "))
+    return float(line.split()[1])
