@@ -41,7 +41,7 @@ class Line:
     def place(self, value: Any) -> int:
         """Where a value is on the line."""
         if self.rule == 2:
-            return round(clamp_float(float(value) * 10.0**self.t))
+            return round(min(max(float(value) * 10.0**self.t, -SAFE), SAFE))
         if not self.is_float:
             return signed(int(value)) >> self.t
         pattern = self._pattern(value)
@@ -63,11 +63,6 @@ class Line:
             return ((place << self.t) % (1 << self.bits)).to_bytes(size, "little")
         m = (-1 - place if place < 0 else place) << self.t
         return (m % (1 << self.bits - 1) | (place < 0) << self.bits - 1).to_bytes(size, "little")
-
-
-def clamp_float(value: float) -> float:
-    """A float within the whole numbers that floats hold exactly."""
-    return min(max(value, -float(SAFE)), float(SAFE))
 
 
 class Stored:

@@ -80,7 +80,4 @@ def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
 
 
 def _number(digits: list[int]) -> int:
-    number = 0
-    for digit in digits:
-        number = 2 * number + digit
-    return number
+    return int("".join(map(str, digits)), 2)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.stranger.coder import MARGIN, Unit, clamp
-from tests.stranger.header import Header, Lattice, Part
+from tests.stranger.header import Header, Lattice
 from tests.stranger.layout import Grid, Levels
 from tests.stranger.lifting import Lines, details, undo
 from tests.stranger.quantised import sixteenths, step
@@ -153,21 +153,17 @@ def block_places(header: Header, levels: Levels, block: int, level: int) -> tupl
     return sorted(rows), sorted(columns)
 
 
-def part_places(header: Header, levels: Levels, number: int, level: int) -> tuple[list[int], list[int]]:
+def part_places(header: Header, levels: Levels, number: int, level: int) -> list[list[int]]:
     """The rows and columns of its block at which the nodes of a part stand, in the order of its grid."""
     part = header.parts[number]
     grid = levels.grids[len(header.curves) + number]
     block = header.blocks[part.block]
-    return (
-        _in_block(part, grid.places[level][0], 0, block.rows),
-        _in_block(part, grid.places[level][1], 1, block.columns),
-    )
-
-
-def _in_block(part: Part, places: list[int], axis: int, size: int) -> list[int]:
-    count = part.shape[axis]
-    turned = [count - 1 - place for place in places] if part.backwards[axis] else places
-    return [(part.first[axis] + place) % size for place in turned]
+    found = []
+    for axis, size in enumerate((block.rows, block.columns)):
+        last = part.shape[axis] - 1
+        places = [last - place if part.backwards[axis] else place for place in grid.places[level][axis]]
+        found.append([(part.first[axis] + place) % size for place in places])
+    return found
 
 
 def put_together(header: Header, levels: Levels, block: int, level: int, grids: dict[int, Lines]) -> Lines:
