@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 from .container import ByteRange, Index
 from .errors import CorruptStreamError, OptionError
 from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
 from .plan import plan
-from .plans import Mark
+from .plans import Mark, Plan
 from .protocol import Connection, Side, State
 from .ranges import RangeSet
 
@@ -169,7 +170,8 @@ class Sender:
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         self.why = None
-        self._follow(chosen.slices, chosen.marks, sum(slice_.length for slice_ in chosen.before))
+        marks = _as_held(chosen) if self._given else chosen.marks
+        self._follow(chosen.slices, marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
             Header(
@@ -210,3 +212,16 @@ class Sender:
     def _end_if_done(self) -> None:
         if not self._slices:
             self._outbox.append(End(self._ended))
+
+
+def _as_held(chosen: Plan) -> list[Mark]:
+    """The marks of a plan after another one, whose slices the client has decoded as they came.
+
+    A state beyond which more is held is not shown by itself: its figures are not known.
+    """
+    ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
+    held = [ahead + mark.sent for mark in chosen.marks]
+    return [
+        mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown)
+        for mark, size in zip(chosen.marks, held, strict=True)
+    ]

@@ -47,8 +47,9 @@ def test_the_commands(
     for source in (("pull", surface), ("decode", container_file)):
         code, stdout, stderr = run(*source, out, "--max-vertices", POINTS - 1)
         assert (code, stdout) == (1, "")
+        name = "" if source[0] == "pull" else f"{source[1]}: "
         assert stderr.splitlines() == [
-            f"lodestream: expected at most {POINTS - 1:,} vertices (max_vertices), got {POINTS:,}"
+            f"lodestream: {name}expected at most {POINTS - 1:,} vertices (max_vertices), got {POINTS:,}"
         ]
         assert not out.exists()
         assert run(*source, out, "--max-vertices", POINTS)[0] == 0
