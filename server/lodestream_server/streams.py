@@ -249,6 +249,8 @@ class _Session:
         while self._sender.state is not State.CLOSED:
             data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
+            # However long it takes to plan, or to have a turn for it: the client has said something.
+            self._heard.set()
             async with self._mine:
                 if self._takes_long(data):
                     await self._plan(self._sender.receive, data)
