@@ -82,10 +82,9 @@ def follow(url: str, asynchronous: bool, **chosen: Any) -> None:
 
 
 def says(*messages: bytes | str) -> Behaviour:
-    """Takes the client's open, says this, then waits until the client is gone."""
+    """Says this to the client, whose open is in the address, then waits until it is gone."""
 
     def behave(connection: ServerConnection) -> None:
-        connection.recv()
         for message in messages:
             connection.send(message)
         for _ in connection:
@@ -96,7 +95,6 @@ def says(*messages: bytes | str) -> Behaviour:
 
 def hangs_up(*messages: bytes, code: int = 1000, reason: str = "") -> Behaviour:
     def behave(connection: ServerConnection) -> None:
-        connection.recv()
         for message in messages:
             connection.send(message)
         connection.close(code, reason)
@@ -186,7 +184,6 @@ def test_a_server_that_restarts(asynchronous: bool) -> None:
 
 def test_a_socket_that_breaks(asynchronous: bool) -> None:
     def behave(connection: ServerConnection) -> None:
-        connection.recv()
         connection.send(HEADER)
         connection.socket.shutdown(socket.SHUT_RDWR)
 

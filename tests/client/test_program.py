@@ -159,7 +159,6 @@ def test_an_interrupt_ends_with_one_line(tmp_path: Path) -> None:
     heard = threading.Event()
 
     def behave(connection: ServerConnection) -> None:
-        connection.recv()
         heard.set()
         for _ in connection:
             pass

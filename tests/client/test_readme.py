@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream_client.program import build_parser
 from lodestream_client.demo.terrain import terrain
+from lodestream_client.program import build_parser
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
