@@ -44,12 +44,11 @@ def test_the_commands(
 ) -> None:
     monkeypatch.setenv("LODESTREAM_CACHE", str(tmp_path / "cache"))  # in which no other test has left a part of it
     out = tmp_path / "o.npy"
-    for source in (("pull", surface), ("decode", container_file)):
+    for source, where in ((("pull", surface), ""), (("decode", container_file), f"{container_file}: ")):
         code, stdout, stderr = run(*source, out, "--max-vertices", POINTS - 1)
         assert (code, stdout) == (1, "")
-        name = "" if source[0] == "pull" else f"{source[1]}: "
         assert stderr.splitlines() == [
-            f"lodestream: {name}expected at most {POINTS - 1:,} vertices (max_vertices), got {POINTS:,}"
+            f"lodestream: {where}expected at most {POINTS - 1:,} vertices (max_vertices), got {POINTS:,}"
         ]
         assert not out.exists()
         assert run(*source, out, "--max-vertices", POINTS)[0] == 0

@@ -82,7 +82,7 @@ def follow(url: str, asynchronous: bool, **chosen: Any) -> None:
 
 
 def says(*messages: bytes | str) -> Behaviour:
-    """Takes the client's open, says this, then waits until the client is gone."""
+    """Says this to the client, whose open is in the address, then waits until it is gone."""
 
     def behave(connection: ServerConnection) -> None:
         for message in messages:
