@@ -398,7 +398,7 @@ class Builder:
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            await asyncio.to_thread(discard, folder)
+            await _removed(folder)
 
     async def _run(self, call: Call) -> worker.Built | worker.Refused:
         try:
@@ -469,6 +469,16 @@ class Builder:
             folder=folder,
             allowed=self._settings.formats,
         )
+
+
+async def _removed(folder: Path) -> None:
+    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would."""
+    removing = asyncio.ensure_future(asyncio.to_thread(discard, folder))
+    try:
+        await asyncio.shield(removing)
+    except asyncio.CancelledError:
+        await removing
+        raise
 
 
 def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from lodestream_server import jobs, running_server, worker
 from lodestream_server.markers import MARKER
 from lodestream_server.storage import Storage
 from tests.server import slow
-from tests.server.helpers import eventually, hills, kept, npy, push, settled, upload_of
+from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, push, settled, upload_of
 
 
 @contextmanager
@@ -313,3 +314,26 @@ def test_a_record_written_by_a_later_version_is_read(tmp_path: Path) -> None:
     storage = Storage(data)
     assert storage.get(surface["id"]).state == "ready"
     storage.close()
+
+
+def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -> None:
+    """A surface is deleted as soon as it is ready: its build is still tidying up, and no thread is free for that."""
+    folder = tmp_path / "left"
+    folder.mkdir()
+
+    async def cancelled() -> None:
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
+        free = threading.Event()
+        busy = asyncio.ensure_future(asyncio.to_thread(free.wait, PATIENCE))
+        await asyncio.sleep(0)
+        task = asyncio.ensure_future(jobs._removed(folder))
+        await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.sleep(0.01)
+        free.set()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await busy
+
+    asyncio.run(cancelled())
+    assert not folder.exists()
