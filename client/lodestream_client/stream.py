@@ -106,7 +106,7 @@ class BaseStream:
         # The download is told things by whoever iterates and by whoever stops, which may be two threads.
         self._lock = threading.RLock()
         self._stopped = False
-        self._turns = 0  # how often the focus has changed
+        self._turns = 0  # how often the region that comes first has changed
         self._abandoned = False
         self._truncated = False
         self._close_by: float | None = None

@@ -1,9 +1,9 @@
-"""An adaptive binary range coder whose chances come from contexts, one alone or two mixed.
+"""An adaptive binary range coder whose probabilities come from contexts, a single one or two mixed.
 
-A *context* is an integer: its probability of a 1 over 2**20 and, in the lowest 8 bits, how sure it is (1 to 127). After
-each bit the probability moves towards 0 or 2**20 - 1 by the part `_RATES` of the distance and gets surer by 1. Two
-contexts are mixed in the logistic domain: the chance is `_SQUASH` of the sum of both `_STRETCH`, each times its weight;
-each weight then grows by its `_STRETCH` times the error of the chance.
+A *context* is an integer: its probability of a 1 over 2**20 and, in the lowest 8 bits, its adaptation count (1 to 127).
+After each bit the probability moves towards 0 or 2**20 - 1 by the part `_RATES` of the distance, and the count grows by
+1. Two contexts are mixed in the logistic domain: the probability is `_SQUASH` of the sum of both `_STRETCH`, each times
+its weight; each weight then grows by its `_STRETCH` times the prediction error.
 
 Everything is an integer below 2**36 in magnitude and right shifts round down, so that every machine codes alike.
 """
@@ -21,9 +21,9 @@ __all__ = ["INDEX", "UNKNOWN", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit",
 WIDEST = 0xFFFFFFFF
 #: An index known to be positive spares the compiled loop the test for one that counts from the end.
 INDEX = 0x7FFFFFFF
-#: A context before anything was learned: even chances, sure to the least degree.
+#: A context at the start: a probability of one half, and an adaptation count of 1.
 UNKNOWN = (1 << 27) | 1
-#: Either weight before anything was learned, over 2**16.
+#: Either weight at the start, over 2**16.
 WEIGHT = 1 << 15
 
 _BOTTOM = 1 << 24
@@ -31,7 +31,7 @@ _SUREST = 127
 _HEAVIEST = 1 << 18
 _ONE = (1 << 20) - 1
 
-#: By how much a context moves that is sure to degree n, over 2**16: 2**16 / (n + 3/2), rounded down.
+#: By what part a context with the adaptation count n moves, over 2**16: 2**16 / (n + 3/2), rounded down.
 _RATES = np.array([2**17 // (2 * n + 3) for n in range(_SUREST + 1)], np.int32)
 
 #: 2**16 / (1 + exp(-i / 4)), rounded, for i = 0 to 32.
@@ -52,7 +52,8 @@ def _squash_table() -> NDArray[np.uint16]:
     return chances
 
 
-#: Chance over 2**16 of x in 1/256: entry x + 2048, between the anchors of `_LOGISTIC` in a straight line, rounded down.
+#: Probability over 2**16 of x in 1/256: entry x + 2048, between the anchors of `_LOGISTIC` in a straight line, rounded
+#: down.
 _SQUASH = _squash_table()
 #: The inverse: for the highest 12 bits of a probability, the least x with _SQUASH[x + 2048] >= 16 p + 8, within +-2047.
 _STRETCH = np.clip(np.searchsorted(_SQUASH, 16 * np.arange(4096) + 8) - 2048, -2047, 2047).astype(np.int16)
@@ -113,7 +114,7 @@ def _narrowed(decoding: bool, bit: int, low: int, width: int, chance: int) -> tu
 
 @inlined
 def _mixed(total: int) -> int:
-    """Chance of a 1 over 2**16 where inputs times their weights come to this in all."""
+    """Probability of a 1 over 2**16 for this sum of inputs times their weights."""
     return int(_SQUASH[(min(max(total >> 16, -2047), 2047) + 2048) & 4095])
 
 
@@ -133,7 +134,7 @@ def _learned(context: int, bit: int) -> int:
 
 @inlined
 def _weighed(weight: int, x: int, error: int) -> int:
-    """A weight of an input after a bit whose chance was off by ``error``."""
+    """A weight of an input after a bit with this prediction error."""
     return min(max(weight + ((x * error + 16384) >> 15), -_HEAVIEST), _HEAVIEST)
 
 
@@ -148,9 +149,9 @@ def code_bit(
     model: NDArray[np.int32],
     slot: int,
 ) -> tuple[int, int, int, int]:
-    """Code one bit in one context and let the context learn it; returns bit, low, width, place.
+    """Code one bit in one context, which adapts; returns bit, low, width, place.
 
-    The chance of a 1 is the highest 16 bits of the probability, within 32 ... 2**16 - 32. Writing, ``low`` is the
+    The coder uses the highest 16 bits of the probability, within 32 ... 2**16 - 32. Writing, ``low`` is the
     interval's lower end and a carry runs back into bytes already written; reading, it is the distance of the data from
     that end. Bytes past the end of the data are zeros.
     """
@@ -175,7 +176,7 @@ def code_mixed_bit(
     other: int,
     weights: int,
 ) -> tuple[int, int, int, int]:
-    """Code one bit in two contexts, mixed with the two weights at ``weights``; all four learn it. See `code_bit`."""
+    """Code one bit in two contexts, mixed with the two weights at ``weights``; all four adapt. See `code_bit`."""
     context, second = int(model[slot & INDEX]), int(model[other & INDEX])
     heavy, light = int(model[weights & INDEX]), int(model[(weights + 1) & INDEX])
     x, y = _stretched(context), _stretched(second)

@@ -9,7 +9,7 @@ first 1, its sign.
 What a context sees of a coefficient are the bits known so far: of this plane for coefficients coded before it, of the
 planes above for those that come later, and of the planes at and above this one for its parent and what is around that.
 All of it is counted in units of the plane (bits below are shifted out); what lies outside the tile's band is 0. The
-contexts, in this order (`binary_coder` says what they are and learn):
+contexts, in this order (see `binary_coder` for their probabilities):
 
 - *Across*, of a coefficient's bit: ((m 5 + h) 5 + v) 4 + kind. m is the class of its own magnitude so far, in units of
   the next higher plane: 0, 1, 2 (for 2 and 3), 3 (for 4 and more). h and v are the sums of the two neighbours in its
@@ -370,7 +370,7 @@ def pass_gains(
                     sums[remaining] += square
                     remaining -= 1
                 while remaining > 0:
-                    # The first pass of a lower plane tells nothing about a coefficient that is significant already.
+                    # The first pass of a lower plane skips a coefficient that is significant already.
                     known = min((remaining + 1) >> 1, plane)
                     error = float((value & ((1 << known) - 1)) - reconstruction_point(known))
                     sums[remaining] += error * error

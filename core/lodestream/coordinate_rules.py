@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["VALUES", "Rule", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
+__all__ = ["VALUES", "Rule", "are_rules", "bits", "evaluate", "fit_axis", "neighbours", "plain", "rounded"]
 
 Rule = list[Any]
 
@@ -40,7 +40,7 @@ def evaluate(
         return np.asarray(place * float(rule[1]) + float(rule[0]))
     if rule[-1] is True:
         origin, last, _ = map(float, rule)
-        values = place * ((last - origin) / (place.size - 1)) + origin
+        values = place * ((last - origin) / max(place.size - 1, 1)) + origin
         values.reshape(-1)[-1] = last
         return np.asarray(values)
     if rule[-1] is False:
@@ -49,6 +49,23 @@ def evaluate(
         return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
     origin, across, by_row, shift = map(float, rule)
     return np.asarray((column + shift) * across + (row + shift) * by_row + origin)
+
+
+def are_rules(rules: object) -> bool:
+    """Whether these are two rules that `evaluate` takes, of x and of y."""
+    return isinstance(rules, list) and len(rules) == 2 and all(map(_is_rule, rules))
+
+
+def _is_rule(rule: object) -> bool:
+    if not isinstance(rule, list) or len(rule) < 2:
+        return False
+    *numbers, last = rule
+    named = isinstance(last, bool) or last == VALUES
+    if not all(type(number) in (int, float) for number in (numbers if named else rule)):
+        return False
+    if last == VALUES:
+        return True
+    return len(numbers) == 2 if named else len(rule) in (2, 4) or (len(rule) == 3 and last != 0)
 
 
 def rounded(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -70,8 +70,8 @@ class Decoder:
         self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
         self._frames = FrameReader()
         self._slices: Slices | None = None
-        self._focus: Region | None = None
-        self._near: NDArray[np.bool_] | None = None  # the tiles of the focus, once slices come by the index
+        self._focus: Region | None = None  # the region that comes first
+        self._near: NDArray[np.bool_] | None = None  # its tiles, once the index is known
         self._turned = False
         self._early: list[tuple[int, bytes]] = []
         self._loose: dict[int, tuple[int, bytearray]] = {}  # unfinished service sections, by where each goes on

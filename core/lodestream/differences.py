@@ -2,7 +2,7 @@
 
 The width follows from the lattice's step and the value's exponent. So the bits that a difference takes are counted
 down from the most that the exponent of the restored value allows, in contexts; the bits themselves and the sign are
-stored as they are. Before all that, a place on the line that was met before tells the difference that it had.
+stored as they are. If the place on the line has occurred before, its last difference predicts this one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _CONTEXTS = _BESIDE + 16
 
 #: Places on the line whose last difference is remembered, in a table by their hash.
 _ENTRIES = 1 << 14
-#: A difference this close to the one remembered is told by how much it is off.
+#: A difference this close to the one remembered is coded as the distance from it.
 _CLOSE = 8
 _SPREAD = 0x9E3779B97F4A7C15 - (1 << 64)
 

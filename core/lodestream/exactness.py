@@ -20,7 +20,7 @@ __all__ = ["agree", "decode_piece", "encode_piece"]
 
 #: The rules beside those of the line.
 _RAW, _OFFSETS = 0, 3
-#: Values that are on no line near the others, NaN and infinity, are told by their place in a list.
+#: Values that are on no line near the others, NaN and infinity, are listed and coded by their number in the list.
 _MOST_SPECIALS = 15
 
 

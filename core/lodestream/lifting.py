@@ -32,7 +32,7 @@ TAPS = np.array([4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1],
 REACH = len(TAPS)
 #: Largest magnitude that the inverse hands on after each axis; a full decode never reaches it.
 CLAMP = 2**27
-#: Binary places between lattice steps in which pictures of incomplete levels are computed.
+#: Binary places between lattice steps in which reconstructions of incomplete levels are computed.
 FRACTION_BITS = 3
 
 _STRIP = 64  # columns worked on together

@@ -1,8 +1,8 @@
 """The mask of a surface with holes, without loss: each point in the context of those before it.
 
 Points are coded in raster order, each by the mean of two models in the logistic domain (`binary_coder`): one that sees
-the ten nearest points before it and learns fast, and one that sees sixteen and learns more. Where all that surrounds a
-group of sixteen points in a row is equal, one bit says whether they are equal to that too.
+the ten nearest points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that
+surrounds a group of sixteen points in a row is equal, one bit says whether they are equal to that too.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def encode_mask(mask: NDArray[np.bool_]) -> bytes:
     rows, columns = mask.shape
     field = _field(rows, columns)
     field[_ABOVE:, _BESIDE : _BESIDE + columns] = mask
-    # A point takes at most 11 bits (a chance of 32 in 2**16), and a group of them one bit before.
+    # A point takes at most 11 bits (a probability of 32 / 2**16), and a group of them one bit before.
     data = np.empty(64 + 2 * mask.size, np.uint8)
     length = _code(False, rows, columns, field.ravel(), field.shape[1], _model(), data)
     return data[:length].tobytes()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 from .container import ByteRange, Index
 from .errors import CorruptStreamError, OptionError
 from .messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
 from .plan import plan
-from .plans import Mark
+from .plans import Mark, Plan
 from .protocol import Connection, Side, State
 from .ranges import RangeSet
 
@@ -41,7 +42,7 @@ class Sender:
     layers : int
         Layers or levels that have been handed out; from the first one on there is something to draw.
     held : RangeSet
-        Bytes of the container that the client held when it opened last.
+        Bytes of the container that the client holds from elsewhere, as it said last.
     why : str or None
         Why the stream ended, once it has.
     """
@@ -58,7 +59,7 @@ class Sender:
         self._slices: deque[ByteRange] = deque()
         self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
         self._provided = 0
-        self._given: list[tuple[int, int]] = []  # what has been sent, as runs of (offset, length)
+        self._given = RangeSet()
         self._window = 0
         self._ended = "complete"
 
@@ -107,7 +108,7 @@ class Sender:
         event = self._outbox.popleft()
         if isinstance(event, Segments):
             self.sent += len(event.data)
-            self._give(event.offset, len(event.data))
+            self._given.add(event.offset, len(event.data))
         elif isinstance(event, Layer):
             self.layers += 1
         elif isinstance(event, End):
@@ -154,22 +155,15 @@ class Sender:
         self._mark()
         self._end_if_done()
 
-    def _give(self, offset: int, length: int) -> None:
-        start, before = self._given[-1] if self._given else (offset, 0)
-        if start + before == offset:
-            self._given[-1:] = [(start, before + length)]
-        else:
-            self._given.append((offset, length))
-
     def _plan(self, event: Open) -> None:
         index = self._index
         try:
-            self.held = self._said(event)
-            chosen = plan(index, event.target, self.held)
+            chosen = plan(index, event.target, self._said(event))
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         self.why = None
-        self._follow(chosen.slices, chosen.marks, sum(slice_.length for slice_ in chosen.before))
+        marks = _as_held(chosen) if self._given else chosen.marks
+        self._follow(chosen.slices, marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
             Header(
@@ -190,7 +184,7 @@ class Sender:
         self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
 
     def _said(self, event: Open) -> RangeSet:
-        """What the client holds, as it says, or as it was sent over this connection."""
+        """What the client has: what it says that it holds, or else what it said before and what it was sent since."""
         if not event.held and event.container is None:
             return RangeSet((*self.held, *self._given))
         if event.held and event.container is None:
@@ -200,6 +194,7 @@ class Sender:
         held = RangeSet(event.held)
         if held.end > self._index.size:
             raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {held.end}")
+        self.held = held
         return held
 
     def _mark(self) -> None:
@@ -210,3 +205,16 @@ class Sender:
     def _end_if_done(self) -> None:
         if not self._slices:
             self._outbox.append(End(self._ended))
+
+
+def _as_held(chosen: Plan) -> list[Mark]:
+    """The marks of a plan after another one, whose slices the client has decoded as they came.
+
+    A state beyond which more is held is not shown by itself: its figures are not known.
+    """
+    ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
+    held = [ahead + mark.sent for mark in chosen.marks]
+    return [
+        mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown)
+        for mark, size in zip(chosen.marks, held, strict=True)
+    ]

@@ -1,7 +1,7 @@
 """How finely to divide values that lie on no lattice: until dividing on costs more than storing the rest does.
 
 Each bit more of the lattice is one bit less of exactness for every value whose bits reach so far. On smooth surfaces
-the transform foretells it, and it costs less; on noisy ones it costs as much or a little more.
+the transform predicts it, and it costs less; on noisy ones it costs as much or a little more.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class TileCoder:
         tiles = self.tiles[channel]
         rows = tiles.table.of_tile(tile)
         coefficients = int((rows[:, ROWS] * rows[:, COLUMNS]).sum())
-        # A decision takes at most 11 bits (a chance of 32 in 2**16), a coefficient two of them in a plane.
+        # A decision takes at most 11 bits (a probability of 32 / 2**16), a coefficient two of them in a plane.
         data = np.empty(64 + 3 * passes * coefficients, np.uint8)
         length = code_passes(
             False,

@@ -39,7 +39,9 @@ class Bounds(BaseModel):
     max_connections: int | None = _follows(
         1, "connections of all kinds: 5000, or as many as the limit of open files (ulimit -n) is enough for"
     )
-    max_streams: int = _count(2000, "streams at the same time")
+    max_streams: int = _count(
+        2000, "streams at the same time, and beside them as many connections that have yet to show a token"
+    )
     max_client_streams: int = _count(1000, "streams at the same time of one token, or without one of one address")
     max_level_requests: int = _count(32, "requests for levels that wait at the same time")
     max_client_level_requests: int = _count(

@@ -31,8 +31,7 @@ _MOST_CONTROL_BYTES = 64 * 1024
 # The longest message in fragments of 260 bytes.
 _MOST_FRAGMENTS = 256
 
-# Frames of any kind: at once, and a second. Somebody who drags a picture about sends a `focus` for each of up to 144
-# pictures a second, and a link that was held up delivers several seconds of them together.
+# Frames of any kind: at once, and a second. A link that was held up delivers several seconds of messages together.
 _FRAMES = (2000.0, 500.0)
 
 # Of these, frames that are no message: pings, pongs, fragments.

@@ -71,6 +71,7 @@ class Limits:
         self._kept = kept
         self._alone = alone
         self._streams: Counter[str] = Counter()
+        self._openings: Counter[str] = Counter()
         self._uploads: dict[asyncio.Timeout, str] = {}  # and whose they are
         self._promised: Counter[str] = Counter()  # bytes, by caller
         self._taken: Counter[str | None] = Counter()  # bytes of uploads under way, by owner
@@ -101,6 +102,36 @@ class Limits:
             yield
         finally:
             _subtract(self._streams, client, 1)
+
+    @contextmanager
+    def opening(self, client: str) -> Iterator[None]:
+        """Be one of the connections that have yet to show a token; as many as streams, and beside them.
+
+        Parameters
+        ----------
+        client : str
+            Key of the address that it comes from.
+
+        Raises
+        ------
+        BusyError
+            When there are as many as there may be.
+        TooManyError
+            When this client has as many as are left to the others.
+        """
+        most, there, own = self._settings.max_streams, self._openings.total(), self._openings[client]
+        if there >= most:
+            raise BusyError(f"expected at most {most} connections that show no token yet; come back in a few seconds")
+        if own >= most - there:
+            raise TooManyError(
+                f"expected no more connections of one address that show no token yet than are left to others, "
+                f"got {own} and {most - there} left of {most}"
+            )
+        self._openings[client] += 1
+        try:
+            yield
+        finally:
+            _subtract(self._openings, client, 1)
 
     @asynccontextmanager
     async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:

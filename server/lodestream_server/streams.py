@@ -84,15 +84,17 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         return
     caller = caller_of(socket)
     try:
-        with parts.limits.stream((caller or anybody(socket)).key):
-            first = None if opening is None else from_address(opening)
-            if first is not None and _token(first) is not None:
-                raise MessageError("bad-message", "expected no token in an address, where logs keep it")
-            if caller is None:
-                # Nothing is told of the surface, not even whether it exists, before the token was seen.
+        first = None if opening is None else from_address(opening)
+        if first is not None and _token(first) is not None:
+            raise MessageError("bad-message", "expected no token in an address, where logs keep it")
+        if caller is None:
+            # Nothing is told of the surface, not even whether it exists, before the token was seen; and nobody takes a
+            # stream from those who have one by showing none.
+            with parts.limits.opening(anybody(socket).key):
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
+        with parts.limits.stream(caller.key):
             record = ready(parts, surface)
             container = await asyncio.to_thread(parts.containers.open, record.container or "")
             await _stream(_Session(socket, container, parts, first, caller), surface, caller)
@@ -249,6 +251,8 @@ class _Session:
         while self._sender.state is not State.CLOSED:
             data, self._first = await _message(self._socket) if self._first is None else self._first, None
             self._opened = self._opened or time.monotonic()
+            # However long it takes to plan, or to have a turn for it: the client has said something.
+            self._heard.set()
             async with self._mine:
                 if self._takes_long(data):
                     await self._plan(self._sender.receive, data)

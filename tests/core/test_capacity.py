@@ -95,7 +95,7 @@ def test_the_default_fits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     "changes",
     [
         {"blocks": (((40000, 50000), (False, False)),)},
-        {"blocks": (((2, 1 << 27), (False, False)),), "tile": (1, 15)},
+        {"blocks": (((2, 1 << 27), (False, False)),), "tile": (1, 13)},
         {"point_channels": 3, "blocks": (((20000, 20000), (False, False)),)},
     ],
     ids=["rows and columns", "narrow", "channels"],

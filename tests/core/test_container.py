@@ -17,9 +17,11 @@ import lodestream as ls
 from lodestream import CorruptStreamError, Decoder, StreamError, TruncatedStreamError, UnsupportedVersionError
 from lodestream.container import FrameReader, Index, describe, read_index, read_metadata, sections
 from lodestream.container.fields import FieldReader, FieldWriter
+from lodestream.coordinate_rules import evaluate
 from lodestream.plan import plan
 from lodestream.reception import Reception
 
+from .forgery import with_header
 from .surfaces import contained, figures, follow, index_of
 
 HEADER_START = len(sections.SIGNATURE)
@@ -158,6 +160,39 @@ def test_headers_that_lie_are_corrupt_and_take_no_memory(header: bytes) -> None:
     finally:
         tracemalloc.stop()
     assert HEADER_START <= caught.value.offset < len(header)
+
+
+@pytest.mark.parametrize(
+    "plane",
+    [
+        {},
+        {"grid": None},
+        {"grid": 5},
+        {"grid": [[0, 1]]},
+        {"grid": [[0, 1], [0, 1], [0, 1]]},
+        {"grid": [[0, 1], [0]]},
+        {"grid": [[0, 1], []]},
+        {"grid": [[0, 1], {"0": 1}]},
+        {"grid": [[0, "1"], [0, 1]]},
+        {"grid": [[0, 1, 0], [0, 1]]},
+        {"grid": [[0, 1, 2, 3, 4], [0, 1]]},
+        {"grid": [[0, True], [0, 1]]},
+        {"grid": [[0, 1, 2, False], [0, 1]]},
+        {"grid": [["values"], [0, 1]]},
+    ],
+    ids=repr,
+)
+def test_a_plane_that_is_none_is_corrupt(plane: dict[str, Any]) -> None:
+    points = np.stack([*np.meshgrid(np.arange(9.0), np.arange(7.0)), np.ones((7, 9))], axis=-1)
+    container = ls.encode(points)
+    assert index_of(container).header.plane is not None
+    with pytest.raises(CorruptStreamError, match="expected attributes, a plane"):
+        Decoder().feed(with_header(container, plane=plane))
+
+
+def test_a_rule_of_the_last_place_of_an_axis_of_one_is_that_place() -> None:
+    row, column = np.zeros((1, 1)), np.arange(5.0)[None]
+    assert evaluate([3.0, 4.0, True], row, column, down=True).tolist() == [[4.0]]
 
 
 def test_headers_with_bytes_missing_or_left_over_are_corrupt() -> None:

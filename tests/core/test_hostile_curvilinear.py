@@ -65,7 +65,13 @@ def lzf_zeros(size: int) -> bytes:
 
 #: Name of the file, its content, options, the class of the error, and what its message holds.
 CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
-    "PLOT3D that two layouts fit": ("a.xyz", two_layouts, {}, "FormatError", "28,812 bytes that 2 fit: choose by opti"),
+    "PLOT3D that two layouts fit": (
+        "a.xyz",
+        two_layouts,
+        {},
+        "FormatError",
+        "28,812 bytes that 2 fit, choose by -o di",
+    ),
     "PLOT3D of 2^72 points": (
         "a.xyz",
         lambda: struct.pack("<3i", 1 << 20, 1 << 20, 1 << 24) + bytes(99),

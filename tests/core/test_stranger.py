@@ -12,11 +12,11 @@ import pytest
 from tests.stranger.container import Container, Index, read_container, read_index
 from tests.stranger.decoder import Decoder, Shown, decode, surface
 from tests.stranger.fields import DamagedError
-from tests.stranger.picture import Values
+from tests.stranger.reconstruction import Values
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((GOLDEN / "expected.json").read_text())
-AFFORDED = 30_000  # values that plain Python makes pictures of in about a second
+AFFORDED = 30_000  # values that plain Python reconstructs in about a second
 
 
 def values_of(name: str) -> int:
@@ -86,7 +86,7 @@ def test_the_values_have_the_digest_of_the_metadata(name: str) -> None:
 
 
 @golden
-def test_every_layer_gives_its_picture(name: str) -> None:
+def test_every_layer_gives_its_reconstruction(name: str) -> None:
     container, decoder = decoded(name)
     expected = EXPECTED[name]["layers"]
     last = len(container.layers)
@@ -95,7 +95,7 @@ def test_every_layer_gives_its_picture(name: str) -> None:
         assert (layer.end, layer.rms, layer.maximum) == (wanted["bytes"], wanted["rms"], wanted["max"])
     afforded = max(2, AFFORDED // values_of(name))
     for count in sorted({round(1 + k * (last - 1) / (afforded - 1)) for k in range(afforded)}):
-        shown = decoder.picture(count) if count < last or container.exactness else surface_of(name)
+        shown = decoder.reconstruction(count) if count < last or container.exactness else surface_of(name)
         assert digests(shown) == expected[count - 1]["sha256"], f"layer {count}"
     assert digests(surface_of(name)) == expected[-1]["sha256"]
     if container.exactness is not None:
@@ -107,7 +107,7 @@ def test_every_level_gives_its_grids(name: str) -> None:
     _, decoder = decoded(name)
     *coarser, finest = EXPECTED[name]["levels"]
     assert len(coarser) == decoder.levels.last
-    assert [digests(decoder.picture(level=level)) for level in range(len(coarser))] == coarser
+    assert [digests(decoder.reconstruction(level=level)) for level in range(len(coarser))] == coarser
     assert digests(surface_of(name)) == finest
 
 
@@ -137,7 +137,7 @@ def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     for level, wanted in enumerate(EXPECTED[name]["levels"][:-1]):
         own = [entry for entry in entries if decoder.units[entry.unit].level == level]
         decoder.take([entry.take(file_of(name)) for entry in own], level)
-        assert digests(decoder.picture(level=level)) == wanted
+        assert digests(decoder.reconstruction(level=level)) == wanted
 
 
 @pytest.mark.parametrize("name", ["cylinder-even", "planar-open", "holes-float32"])
@@ -147,7 +147,7 @@ def test_the_beginning_of_a_file_gives_the_layers_that_it_holds(name: str) -> No
             container = read_container(file_of(name)[: wanted["bytes"] - missing])
             assert len(container.layers) == count - missing
             if not missing:
-                assert digests(decode(container).picture()) == wanted["sha256"]
+                assert digests(decode(container).reconstruction()) == wanted["sha256"]
 
 
 def test_a_damaged_layer_ends_what_is_taken_and_a_damaged_segment_is_refused() -> None:

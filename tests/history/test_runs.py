@@ -28,7 +28,7 @@ def told(folder: Path, *kinds: str, owners: bool = False) -> history.Done:
 
 
 def test_a_server_that_is_ended_and_killed_and_does_not_find_a_folder(tmp_path: Path) -> None:
-    assert told(tmp_path, "restart", "kill", "unmounted").deletes > 0
+    assert told(tmp_path, "restart", "kill", "unmounted").uploads > 0
 
 
 @pytest.mark.skipif("full" not in history.possible(), reason="no small disk can be mounted on this machine")

@@ -177,6 +177,23 @@ def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:
             pass
 
 
+def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Path) -> None:
+    made = limits(tmp_path, max_streams=4, max_client_streams=4)
+    with ExitStack() as held:
+        for client in ("a", "a", "b"):
+            held.enter_context(made.opening(client))
+        with pytest.raises(TooManyError, match="2 and 1 left of 4"), made.opening("a"):
+            pass
+        held.enter_context(made.opening("c"))
+        with pytest.raises(BusyError, match="at most 4"), made.opening("d"):
+            pass
+        for client in ("a", "b", "c", "d"):
+            held.enter_context(made.stream(client))
+    for _ in range(5):
+        with made.opening("a"), made.opening("a"):
+            pass
+
+
 # Over real sockets.
 
 
@@ -239,6 +256,41 @@ def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str,
             return isinstance(stream.receive(), Header)
 
     assert eventually(free, "room after they are gone")
+
+
+def test_who_shows_no_token_takes_no_stream_from_those_who_have_one(small: tuple[str, str, dict[str, str]]) -> None:
+    _, surface, tokens = small
+    with ExitStack() as held:
+        silent = [held.enter_context(raw_stream(surface)) for _ in range(2)]
+        assert code_of(held.enter_context(raw_stream(surface))) == ("too-many", 4429)
+        for name in ("one", "one", "two", "two"):
+            headers = {"Authorization": f"Bearer {tokens[name]}"}
+            stream = held.enter_context(raw_stream(surface, additional_headers=headers))
+            stream.send(Open(credit=0))
+            assert isinstance(stream.receive(), Header)
+        # However a token is shown, it has the streams of that token and no more.
+        silent[0].send(Open(credit=0, token=tokens["one"]))
+        assert code_of(silent[0]) == ("busy", 4503)
+
+
+def test_streams_count_by_the_token_in_open(small: tuple[str, str, dict[str, str]]) -> None:
+    _, surface, tokens = small
+
+    def opened(held: ExitStack, name: str) -> Raw:
+        stream = held.enter_context(raw_stream(surface))
+        stream.send(Open(credit=0, token=tokens[name]))
+        return stream
+
+    def free() -> bool:
+        with ExitStack() as held:
+            return isinstance(opened(held, "one").receive(), Header)
+
+    eventually(free, "room after the streams of before")
+    with ExitStack() as held:
+        for name in ("two", "two", "three"):
+            assert isinstance(opened(held, name).receive(), Header)
+        assert code_of(opened(held, "two")) == ("too-many", 4429)
+        assert isinstance(opened(held, "one").receive(), Header)
 
 
 def refused_at_once(url: str, token: str, length: int) -> bytes:

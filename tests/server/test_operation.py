@@ -24,10 +24,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
-from lodestream.messages import MAX_CREDIT, Header, Layer, Open, Stop
+from lodestream.messages import MAX_CREDIT, Bye, End, Header, Layer, Open, Stop
 from lodestream_server import logs, running_server
 from lodestream_server.table import TABLE
-from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, Raw, closed, data_of, eventually, hills, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +94,28 @@ def test_a_complete_stream_saves_nothing_and_a_stop_does(http: httpx.Client, ser
     eventually(lambda: grown(http, before, "lodestream_streams_total", "complete") == 1, "the end to be counted")
     assert grown(http, before, "lodestream_stream_saved_bytes_total") == 0
     assert whole(small) <= grown(http, before, "lodestream_stream_bytes_total") <= small["bytes"]
+
+
+def test_what_was_sent_before_another_open_is_counted_once(
+    http: httpx.Client, server: str, made: dict[str, Any]
+) -> None:
+    before = figures(http)
+    with raw_stream(server + made["url"]) as stream:
+        sent = 0
+        for first in (None, ((0, 5), (0, 5)), None):
+            stream.send(Open(ls.Target(first=first), 3000))
+            events = [stream.receive()]
+            while data_of(events) < 3000:
+                events.append(stream.receive())
+            stream.send(Stop())
+            while not isinstance(events[-1], End):
+                events.append(stream.receive())
+            sent += data_of(events)
+        stream.send(Bye())
+        closed(stream, 1000)
+    eventually(lambda: grown(http, before, "lodestream_streams_total", "stopped") == 1, "the stream to be counted")
+    assert sent == 9000
+    assert grown(http, before, "lodestream_stream_saved_bytes_total") == whole(made) - sent
 
 
 def test_what_the_client_held_is_not_saved(http: httpx.Client, server: str, made: dict[str, Any]) -> None:

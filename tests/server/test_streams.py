@@ -405,6 +405,13 @@ def test_a_client_that_is_gone_before_the_handshakes_end_is_no_error(offered: li
 
     sent: list[str] = []
     extensions: dict[str, Any] = {"websocket.http.response": {}}
-    scope = {"type": "websocket", "path": "/", "headers": [], "subprotocols": offered, "extensions": extensions}
+    scope = {
+        "type": "websocket",
+        "path": "/",
+        "query_string": b"",
+        "headers": [],
+        "subprotocols": offered,
+        "extensions": extensions,
+    }
     asyncio.run(streams.stream(WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
     assert len(sent) == 1

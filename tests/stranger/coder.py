@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from operator import mul
 
 from tests.stranger.tables import LOGISTIC
 
@@ -41,9 +41,9 @@ class RangeDecoder:
         for _ in range(4):
             self._low = self._low * 256 + next(self._bytes, 0)
 
-    def bit(self, chance: int) -> int:
-        """The next bit, whose chance of being 1 is `chance` / 2^16."""
-        bound = (self._width >> 16) * chance
+    def bit(self, probability: int) -> int:
+        """The next bit, whose probability of being 1 is `probability` / 2^16."""
+        bound = (self._width >> 16) * probability
         if self._low < bound:
             bit = 1
             self._width = bound
@@ -58,50 +58,38 @@ class RangeDecoder:
 
 
 class Model:
-    """Section 7.2: contexts, by the probabilities and surenesses that they start with, and the weights of mixtures."""
+    """Section 7.2: contexts, each a probability and an adaptation count, and pairs of weights for mixed ones."""
 
-    def __init__(self, chances: list[int], surenesses: list[int], pairs: int = 0) -> None:
-        self._chance = list(chances)
-        self._sureness = list(surenesses)
-        self._weights = [[32768, 32768] for _ in range(pairs)]
+    def __init__(self, contexts: int, pairs: int = 0) -> None:
+        self._contexts = [(2**19, 1)] * contexts
+        self._weights = [(32768, 32768)] * pairs
 
-    def _learn(self, context: int, bit: int) -> None:
-        n = self._sureness[context]
-        aim = 2**20 - 1 if bit else 0
-        self._chance[context] += (aim - self._chance[context]) * RATE[n] >> 16
-        if n < 127:
-            self._sureness[context] = n + 1
+    def _adapt(self, context: int, bit: int) -> None:
+        p, n = self._contexts[context]
+        target = 2**20 - 1 if bit else 0
+        self._contexts[context] = p + ((target - p) * RATE[n] >> 16), min(n + 1, 127)
 
     def alone(self, coder: RangeDecoder, context: int) -> int:
-        """A bit coded with one context."""
-        bit = coder.bit(clamp(self._chance[context] >> 4, 32, 65504))
-        self._learn(context, bit)
+        """A bit coded with a single context."""
+        bit = coder.bit(clamp(self._contexts[context][0] >> 4, 32, 65504))
+        self._adapt(context, bit)
         return bit
 
     def mixed(self, coder: RangeDecoder, first: int, second: int, pair: int) -> int:
-        """A bit coded with two contexts and one of the pairs of weights."""
-        return self.mixed_by(coder, [first, second], self._weights[pair])
-
-    def mixed_by(self, coder: RangeDecoder, contexts: list[int], weights: list[int]) -> int:
-        """A bit coded with several contexts and as many weights, which change."""
-        inputs = [STRETCH[self._chance[context] >> 8] for context in contexts]
-        total = sum(map(mul, weights, inputs)) >> 16
-        chance = SQUASH[clamp(total, -2047, 2047) + 2048]
-        bit = coder.bit(chance)
-        error = (65536 if bit else 0) - chance
-        weights[:] = [
-            clamp(weight + ((x * error + 16384) >> 15), -(2**18), 2**18)
-            for weight, x in zip(weights, inputs, strict=True)
-        ]
-        for context in contexts:
-            self._learn(context, bit)
+        """A bit coded with two mixed contexts and one of the pairs of weights."""
+        x, y = (STRETCH[self._contexts[context][0] >> 8] for context in (first, second))
+        u, v = self._weights[pair]
+        probability = SQUASH[clamp((u * x + v * y) >> 16, -2047, 2047) + 2048]
+        bit = coder.bit(probability)
+        error = (65536 if bit else 0) - probability
+        self._weights[pair] = _moved(u, x * error), _moved(v, y * error)
+        self._adapt(first, bit)
+        self._adapt(second, bit)
         return bit
 
-    def add(self) -> int:
-        """One more context that knows nothing yet; its number."""
-        self._chance.append(2**19)
-        self._sureness.append(1)
-        return len(self._chance) - 1
+
+def _moved(weight: int, by: int) -> int:
+    return clamp(weight + ((by + 16384) >> 15), -(2**18), 2**18)
 
 
 #: Contexts of a unit, and where those of plane 0 begin in one of indices: across, around.
@@ -109,24 +97,27 @@ CONTEXTS = 547
 ACROSS, AROUND = CONTEXTS, CONTEXTS + 400
 
 
+#: States of an index, by the state and the parity of the index before it.
 NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
 
 
-def new_contexts(count: int, pairs: int = 0) -> Model:
-    """Contexts that know nothing yet."""
-    return Model([2**19] * count, [1] * count, pairs)
-
-
 class Contexts:
-    """Contexts by their names, made where they are first asked for."""
+    """Single contexts by their names and numbers."""
 
-    def __init__(self) -> None:
-        self._models: dict[tuple[str, int], Model] = {}
+    def __init__(self, coder: RangeDecoder) -> None:
+        self._coder = coder
+        self._models: defaultdict[tuple[str, int], Model] = defaultdict(lambda: Model(1))
 
-    def bit(self, coder: RangeDecoder, name: str, number: int) -> int:
-        """A bit in a context alone."""
-        model = self._models.setdefault((name, number), new_contexts(1))
-        return model.alone(coder, 0)
+    def bit(self, name: str, number: int = 0) -> int:
+        """A bit coded with a single context."""
+        return self._models[name, number].alone(self._coder, 0)
+
+    def number(self, name: str, bits: int, first: int = 0) -> int:
+        """A number of so many bits, the highest first, in contexts `first` + v."""
+        v = 1
+        for _ in range(bits):
+            v = 2 * v + self.bit(name, first + v)
+        return v - (1 << bits)
 
 
 def _zeros(rows: int, columns: int, margin: int, value: int = 0) -> Grid:
@@ -191,7 +182,7 @@ class Unit:
     model: Model = field(init=False)
 
     def __post_init__(self) -> None:
-        self.model = new_contexts(CONTEXTS + 568, 6) if self.indices else new_contexts(CONTEXTS, 2)
+        self.model = Model(CONTEXTS + 568, 6) if self.indices else Model(CONTEXTS, 2)
 
     def decode(self, top: int | None, passes: int, segment: bytes, most: int) -> None:
         """Takes the next segment of a unit that may have so many bit-planes at most."""

@@ -1,4 +1,4 @@
-"""The whole decoder: takes layers or segments, gives the picture of every state and the grid of every level."""
+"""The whole decoder: takes layers or segments, gives the reconstruction of every state and the grid of every level."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from tests.stranger.exactness import restore
 from tests.stranger.header import Header
 from tests.stranger.layout import Levels, units_of
 from tests.stranger.masks import Masks
-from tests.stranger.picture import EIGHTHS, Arrays, Values, block_places, plane_value, put_together, rounded, value
+from tests.stranger.reconstruction import (
+    EIGHTHS,
+    Arrays,
+    Values,
+    block_places,
+    plane_value,
+    put_together,
+    rounded,
+    value,
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +54,7 @@ class Decoder:
         self.known.append(self._remaining())
 
     def whole(self, channel: int, level: int, remaining: list[int], complete: bool) -> int:
-        """The finest level up to which all coefficients of a channel are known."""
+        """F of the page: the finest level up to which all coefficients of a channel are known."""
         unknown = level + 1
         for number in range(channel, len(self.units), self.header.channels):
             unit = self.units[number]
@@ -113,8 +122,8 @@ class Decoder:
             first += attribute.channels
         return Shown(arrays, valid)
 
-    def picture(self, layers: int | None = None, level: int | None = None) -> list[Shown]:
-        """The picture after so many layers (or calls of `take`), or the grids of a coarser level."""
+    def reconstruction(self, layers: int | None = None, level: int | None = None) -> list[Shown]:
+        """The reconstruction after so many layers (or calls of `take`), or the grids of a coarser level."""
         return self.shown(self.channels(layers, level), level)
 
     def exact(self, exactness: Exactness) -> list[Shown]:
@@ -146,5 +155,5 @@ def decode(container: Container) -> Decoder:
 
 
 def surface(container: Container, decoder: Decoder) -> list[Shown]:
-    """The surface itself: the last picture, with exactness where the container has it."""
-    return decoder.picture() if container.exactness is None else decoder.exact(container.exactness)
+    """The surface itself: the last reconstruction, with exactness where the container has it."""
+    return decoder.reconstruction() if container.exactness is None else decoder.exact(container.exactness)

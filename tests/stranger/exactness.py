@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,7 +33,7 @@ class Line:
         self.t = t
         self.bits = 8 * dtype.itemsize
         self.is_float = dtype.kind == "f"
-        self.fraction = {32: 23, 64: 52}[self.bits] if self.is_float else 0
+        self.mantissa = {32: 23, 64: 52}[self.bits] if self.is_float else 0
 
     def _pattern(self, value: Any) -> int:
         return int(value.view(f"<u{self.dtype.itemsize}"))
@@ -42,7 +41,7 @@ class Line:
     def place(self, value: Any) -> int:
         """Where a value is on the line."""
         if self.rule == 2:
-            return round(clamp_float(float(value) * 10.0**self.t))
+            return round(min(max(float(value) * 10.0**self.t, -SAFE), SAFE))
         if not self.is_float:
             return signed(int(value)) >> self.t
         pattern = self._pattern(value)
@@ -53,7 +52,7 @@ class Line:
         """The exponent field of a value's pattern, where it plays a part."""
         if self.rule == 2 or not self.is_float:
             return 0
-        return self._pattern(value) >> self.fraction & (1 << self.bits - 1 - self.fraction) - 1
+        return self._pattern(value) >> self.mantissa & (1 << self.bits - 1 - self.mantissa) - 1
 
     def back(self, place: int) -> bytes:
         """The value at a place, as it is in memory."""
@@ -64,11 +63,6 @@ class Line:
             return ((place << self.t) % (1 << self.bits)).to_bytes(size, "little")
         m = (-1 - place if place < 0 else place) << self.t
         return (m % (1 << self.bits - 1) | (place < 0) << self.bits - 1).to_bytes(size, "little")
-
-
-def clamp_float(value: float) -> float:
-    """A float within the whole numbers that floats hold exactly."""
-    return min(max(value, -float(SAFE)), float(SAFE))
 
 
 class Stored:
@@ -98,23 +92,19 @@ class Piece:
     line: Line
     most: int
     specials: list[bytes]
-    coder: RangeDecoder
+    contexts: Contexts
     stored: Stored
-    contexts: Contexts = field(default_factory=Contexts)
     special: int = 0  # the last two bits that said whether a value is special, as one number
     memory: dict[int, tuple[int, int]] = field(default_factory=dict)  # entry -> place, difference
-
-    def _bit(self, name: str, number: int = 0) -> int:
-        return self.contexts.bit(self.coder, name, number)
 
     def value(self, x: Any) -> bytes:
         """The value sought where the layers gave x."""
         if self.specials:
-            bit = self._bit("special", self.special)
+            bit = self.contexts.bit("special", self.special)
             self.special = 2 * (self.special & 1) + bit
             if bit:
                 k = 1
-                while k < len(self.specials) and self._bit("which", k):
+                while k < len(self.specials) and self.contexts.bit("which", k):
                     k += 1
                 return self.specials[k - 1]
         place = self.line.place(x)
@@ -126,16 +116,13 @@ class Piece:
     def _difference(self, x: Any, remembered: tuple[int, int] | None, place: int) -> int:
         if remembered is not None and remembered[0] == place:
             y = remembered[1]
-            if self._bit("same"):
+            if self.contexts.bit("same"):
                 return y
-            if self._bit("close"):
-                v = 1
-                for _ in range(4):
-                    v = 2 * v + self._bit("beside", v)
-                return y - 8 + (v - 16)
+            if self.contexts.bit("close"):
+                return y - 8 + self.contexts.number("beside", 4)
         limit = clamp(self.most - self.line.exponent(x), 0, 63)
         c = limit
-        while c > 0 and self._bit("shorter", 16 * min(limit, 15) + min(limit - c, 15)):
+        while c > 0 and self.contexts.bit("shorter", 16 * min(limit, 15) + min(limit - c, 15)):
             c -= 1
         if c == 0:
             return 0
@@ -165,10 +152,10 @@ def restore(piece: bytes, values: Values) -> Values:
         return with_offsets(fields, t, values)
     if rule == 2 and dtype.kind != "f":
         raise ValueError("a piece of whole numbers has the rule of decimals")
-    (most,) = struct.unpack("<H", fields.take(2))
+    most = fields.number("H")
     specials = [fields.take(dtype.itemsize) for _ in range(most >> 12)]
-    coder = RangeDecoder(fields.take(fields.varint()))
-    state = Piece(Line(dtype, rule, t), most & 4095, specials, coder, Stored(fields.rest()))
+    contexts = Contexts(RangeDecoder(fields.take(fields.varint())))
+    state = Piece(Line(dtype, rule, t), most & 4095, specials, contexts, Stored(fields.rest()))
     restored = b"".join(state.value(x) for x in values)
     state.stored.finish()
     return np.frombuffer(restored, dtype)

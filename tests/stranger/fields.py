@@ -9,10 +9,6 @@ class DamagedError(ValueError):
     """The bytes are not those of a container, or not of one that this reader knows."""
 
 
-class CutError(DamagedError):
-    """There are fewer bytes than a field needs."""
-
-
 class Fields:
     """Reads one field after another."""
 
@@ -23,7 +19,7 @@ class Fields:
     def take(self, count: int) -> bytes:
         """The next bytes as they are."""
         if count > len(self.data) - self.position:
-            raise CutError("the bytes end within a field")
+            raise DamagedError("the bytes end within a field")
         self.position += count
         return self.data[self.position - count : self.position]
 

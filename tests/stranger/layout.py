@@ -217,33 +217,21 @@ Tiles = list[list[list[Unit]]]  # by row and column of tiles, then channel
 
 def units_of(header: Header, levels: Levels) -> list[Unit]:
     """Section 5: all units, in the order of their numbers."""
-    channels = range(header.channels)
     units = []
-    for channel in channels:
-        bands = []
-        for number, grid in enumerate(levels.grids):
-            if grid.part < 0 and channel >= header.coordinates:
-                continue
-            lacks = grid.lacking(0, channel < header.coordinates)
-            rows, columns = (_without(range(n), n, *lacks[2 * a : 2 * a + 2]) for a, n in enumerate(grid.shape[0]))
-            if len(rows) and len(columns):
-                place = (rows.start, columns.start)
-                bands.append(Band(0, number, place, len(rows), len(columns), place))
-        units.append(Unit(0, bands, header.base > 0 and channel < header.coordinates))
     coarser: dict[int, Tiles] = {}
-    for level in range(1, levels.last + 1):
+    for level in range(levels.last + 1):
         finer: dict[int, Tiles] = {}
-        for group in levels.groups(level):
+        for group in levels.groups(level) if level else [list(range(len(levels.grids)))]:
             tiles = _tiles(header, levels, level, group, coarser)
             finer.update(dict.fromkeys(group, tiles))
             units += [unit for row in tiles for tile in row for unit in tile]
-        coarser = finer
+        coarser = finer if level else {}  # no parents are in level 0
     return units
 
 
 def _tiles(header: Header, levels: Levels, level: int, group: list[int], coarser: dict[int, Tiles]) -> Tiles:
     """The tiles of a group at a level; `coarser` has those of the level below, by the number of a grid."""
-    is_cut = len(group) == 1 and levels.grids[group[0]].part >= 0
+    is_cut = level > 0 and len(group) == 1 and levels.grids[group[0]].part >= 0
     pieces = [1, 1]
     shift = [0, 0]
     if is_cut:
@@ -281,22 +269,23 @@ def _bands(
     if grid.part < 0 and channel >= header.coordinates:
         return []
     lacks = grid.lacking(level, channel < header.coordinates)
+    coarser = grid.shape[max(level - 1, 0)]
     spans = []
     for axis in (0, 1):
-        nodes = grid.shape[level - 1][axis]
+        nodes = coarser[axis]
         details = grid.shape[level][axis] - nodes
         piece = (range(nodes), range(details))
         if tile is not None:
             piece = cut(nodes, details, 2 ** header.tile[axis])[tile[axis]]
         spans.append((_without(piece[0], nodes, *lacks[2 * axis : 2 * axis + 2]), piece[1]))
-    shift = (int(grid.steps[level - 1][0] is not None), int(grid.steps[level - 1][1] is not None))
+    down, along = (int(step is not None) for step in grid.steps[max(level - 1, 0)])
     bands = []
-    for axis0, axis1 in ((0, 1), (1, 0), (1, 1)):
+    for axis0, axis1 in ((0, 1), (1, 0), (1, 1)) if level else ((0, 0),):
         r, c = spans[0][axis0], spans[1][axis1]
         if not len(r) or not len(c):
             continue
         kind = axis1 + 2 * axis0
-        place = (r.start + axis0 * grid.shape[level - 1][0], c.start + axis1 * grid.shape[level - 1][1])
+        place = (r.start + axis0 * coarser[0], c.start + axis1 * coarser[1])
         parent = next((band for band in inherited if (band.grid, band.kind) == (number, kind)), None)
-        bands.append(Band(kind, number, (r.start, c.start), len(r), len(c), place, parent, shift))
+        bands.append(Band(kind, number, (r.start, c.start), len(r), len(c), place, parent, (down, along)))
     return bands

@@ -20,8 +20,8 @@ SAMPLE = 2**27
 Lines = NDArray[np.int64]
 
 
-def _surplus(nodes: Lines, step: Step, predictor: Predictor) -> Lines:
-    """What the nodes foretell of each detail: floor((v_k + 128) / 256)."""
+def _predicted(nodes: Lines, step: Step, predictor: Predictor) -> Lines:
+    """What the nodes predict of each detail: floor((v_k + 128) / 256)."""
     run, (a, b) = step.run, predictor
     if run < 3 or predictor == (0, 0):
         return np.zeros_like(nodes[: step.midpoints])
@@ -77,8 +77,8 @@ def _update(d: Lines, step: Step) -> Lines:
 
 def undo(lines: Lines, step: Step, predictor: Predictor) -> Lines:
     """Undoes a step on lines of nodes and then details."""
-    surplus = _surplus(lines, step, predictor)
-    d = np.clip(lines[step.nodes :] + surplus, -DETAIL, DETAIL)
+    predicted = _predicted(lines, step, predictor)
+    d = np.clip(lines[step.nodes :] + predicted, -DETAIL, DETAIL)
     nodes = lines[: step.run] - _update(d, step)
     samples = np.zeros_like(lines)
     samples[0 : 2 * step.run : 2] = nodes
@@ -94,5 +94,5 @@ def details(samples: Lines, step: Step, predictor: Predictor) -> Lines:
     even, odd = x[0::2], x[1::2][: step.midpoints]
     d = odd - ((even[: step.midpoints] + even[1 : step.midpoints + 1]) >> 1)
     nodes = even[: step.run] + _update(d, step)
-    found: Lines = d - _surplus(nodes, step, predictor)
+    found: Lines = d - _predicted(nodes, step, predictor)
     return found

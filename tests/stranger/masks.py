@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.stranger.coder import RangeDecoder, new_contexts
+from tests.stranger.coder import Model, RangeDecoder
 from tests.stranger.fields import Fields
 from tests.stranger.header import Block
 
@@ -58,7 +58,7 @@ def _read_kept(fields: Fields, valid: Mask) -> Mask:
 
 def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
     """The mask of a block."""
-    coder, model = RangeDecoder(data), new_contexts(GROUPS + 4, 1)
+    coder, model = RangeDecoder(data), Model(GROUPS + 4, 1)
     margin = 4
     points = [[0] * (columns + 2 * margin) for _ in range(rows + 2)]  # two rows above, and four columns at each side
     last = 0
@@ -80,7 +80,4 @@ def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
 
 
 def _number(digits: list[int]) -> int:
-    number = 0
-    for digit in digits:
-        number = 2 * number + digit
-    return number
+    return int("".join(map(str, digits)), 2)

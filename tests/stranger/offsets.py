@@ -37,41 +37,31 @@ class Offsets:
     """The list of offsets, the last one first, and the contexts."""
 
     def __init__(self, coder: RangeDecoder, bits: int) -> None:
-        self.coder = coder
         self.bits = bits
-        self.contexts = Contexts()
+        self.contexts = Contexts(coder)
         self.listed: list[tuple[float, float]] = []
         self.in_turn = 0
-
-    def _bit(self, name: str, number: int = 0) -> int:
-        return self.contexts.bit(self.coder, name, number)
-
-    def _number(self, name: str, bits: int, first: int = 0) -> int:
-        v = 1
-        for _ in range(bits):
-            v = 2 * v + self._bit(name, first + v)
-        return v - (1 << bits)
 
     def _rank(self) -> int | None:
         if not self.listed:
             return None
-        if self._bit("first", self.in_turn):
+        if self.contexts.bit("first", self.in_turn):
             self.in_turn = min(self.in_turn + 1, 15)
             return 0
         self.in_turn = 0
-        return min(self._number("which", 6), len(self.listed) - 1) if self._bit("listed") else None
+        return min(self.contexts.number("which", 6), len(self.listed) - 1) if self.contexts.bit("listed") else None
 
     def place(self, x: float, base: float) -> int:
         """The place sought where the layers gave x."""
         rank = self._rank()
         if rank is None:
-            w = self._number("new", min(self.bits, 4))
+            w = self.contexts.number("new", min(self.bits, 4))
             for j in range(4, self.bits):
-                w = 2 * w + self._bit("new", 12 + j)
+                w = 2 * w + self.contexts.bit("new", 12 + j)
             place = place_of(x) + w - (1 << self.bits >> 1)
         else:
             low, high = self.listed[rank]
-            place = place_of(base + 0.5 * (low + high)) + self._number("off", 3, 8 if rank else 0) - 4
+            place = place_of(base + 0.5 * (low + high)) + self.contexts.number("off", 3, 8 if rank else 0) - 4
         f = value_at(place)
         bottom, top = (0.5 * (f + value_at(beside)) - base for beside in (place - 1, place + 1))
         if rank is None:

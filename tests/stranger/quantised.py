@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from tests.stranger.coder import MARGIN, Band
 from tests.stranger.layout import Grid, Levels
 
 NODE = [65536, 53303, 39201, 27993, 19842, 14039]
@@ -26,25 +25,14 @@ def step(levels: Levels, grid: Grid, kind: int, level: int, base: int) -> int:
             product *= _along(levels.last + 1 - first, False)
             continue
         steps = [grid.steps[number][axis] for number in range(first, levels.last + 1)]
-        product *= _along(sum(1 for taken in steps if taken is not None and taken.midpoints), detail)
+        product *= _along(sum(1 for taken in steps if taken is not None), detail)
     return max(1, product >> 32)
 
 
-def known_parts(band: Band, remaining: int, size: int) -> list[list[int]]:
-    """The known parts of a band's coefficients, without signs."""
-    found = [[0] * band.columns for _ in range(band.rows)]
-    for row in range(band.rows):
-        for column in range(band.columns):
-            m = band.magnitude[row + MARGIN][column + MARGIN]
-            if remaining == 0:
-                t = 16 * m - 8 if m and band.state[row][column] & 1 else 16 * m
-            else:
-                t = _sixteenths(m, band.born[row][column], remaining)
-            found[row][column] = min(t * size >> 4, 2**28)
-    return found
-
-
-def _sixteenths(m: int, born: int, n: int) -> int:
+def sixteenths(m: int, born: int, odd: int, n: int) -> int:
+    """An index in sixteenths when n passes remain; `odd` is 1 if its state is (quantiser Q1)."""
+    if n == 0:
+        return 16 * m - 8 if m and odd else 16 * m
     p = (n + 1) >> 1
     if m >> p:
         return 16 * ((m >> p) << p) + 7 * ((1 << p) - 1) - 4

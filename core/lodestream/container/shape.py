@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 
 from ..arrangement import covers
+from ..coordinate_rules import are_rules
 from ..errors import CorruptStreamError
 from ..joints import check_runs
 from ..sides import Arrangement, Curve, Part, Side
@@ -176,8 +177,10 @@ def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
             for name, code, components in values.get("attributes", [])
         )
         plane = values.get("plane")
-        if not (plane is None or isinstance(plane, dict)) or any(not 0 <= k.components < 2**16 for k in kinds):
-            raise ValueError("another")
+        if any(not 0 <= k.components < 2**16 for k in kinds):
+            raise ValueError("another number of components")
+        if plane is not None and not (isinstance(plane, dict) and are_rules(plane.get("grid"))):
+            raise ValueError("a plane without two rules of coordinates")
         if len({kind.name for kind in kinds}) != len(kinds):
             raise ValueError("two attributes of one name")
         changes = None

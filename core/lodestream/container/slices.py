@@ -23,7 +23,7 @@ class State(NamedTuple):
 
     ``all_planes`` says that nothing but exactness is missing; ``whole_level`` is the level to which, counted from the
     coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
-    exactness is missing in the focus.
+    exactness is missing in the region that comes first.
     """
 
     number: int

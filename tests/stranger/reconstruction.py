@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.stranger.coder import MARGIN, Unit, clamp
-from tests.stranger.header import Header, Lattice, Part
+from tests.stranger.header import Header, Lattice
 from tests.stranger.layout import Grid, Levels
 from tests.stranger.lifting import Lines, details, undo
-from tests.stranger.quantised import known_parts, step
+from tests.stranger.quantised import sixteenths, step
 
 Values = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 EIGHTHS = 8
 
 
-def known_part(magnitude: int, born: int, remaining: int) -> int:
-    """The magnitude that is shown when so many passes of the unit remain."""
+def reconstructed(magnitude: int, born: int, remaining: int) -> int:
+    """The magnitude of a coefficient when so many passes of the unit remain."""
     p = (remaining + 1) >> 1
     if magnitude >> p:
         return ((magnitude >> p) << p) + ((7 << p) >> 4)
@@ -31,7 +31,7 @@ def known_part(magnitude: int, born: int, remaining: int) -> int:
 
 
 class Arrays:
-    """The coefficients of one channel, which become its picture: an array for each grid."""
+    """The coefficients of one channel, which become its points: an array for each grid."""
 
     def __init__(self, header: Header, levels: Levels, channel: int, level: int) -> None:
         self.levels = levels
@@ -45,22 +45,20 @@ class Arrays:
             self.numbers[number] = np.zeros(grid.shape[level], np.int64)
 
     def put(self, unit: Unit, remaining: int, factor: int) -> None:
-        """The known part of a unit's coefficients, times a factor."""
+        """The reconstructed coefficients of a unit, times a factor."""
         for band in unit.bands:
             numbers = self.numbers[band.grid]
-            quantised = None
-            if self.base:
-                size = step(self.levels, self.levels.grids[band.grid], band.kind, unit.level, self.base)
-                quantised = known_parts(band, remaining, size)
+            size = step(self.levels, self.levels.grids[band.grid], band.kind, unit.level, self.base)
             for r in range(band.rows):
                 for c in range(band.columns):
-                    if quantised is None:
-                        shown = known_part(band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c], remaining)
+                    m, born = band.magnitude[r + MARGIN][c + MARGIN], band.born[r][c]
+                    if self.base:
+                        m = min(sixteenths(m, born, band.state[r][c] & 1, remaining) * size >> 4, 2**28)
                     else:
-                        shown = quantised[r][c]
-                    if shown:
+                        m = reconstructed(m, born, remaining)
+                    if m:
                         sign = band.sign[r + MARGIN][c + MARGIN]
-                        numbers[band.place[0] + r, band.place[1] + c] = sign * min(shown * factor, 2**28)
+                        numbers[band.place[0] + r, band.place[1] + c] = sign * min(m * factor, 2**28)
 
     def to_points(self, whole: int) -> None:
         """Undoes all steps, where the levels up to `whole` are known."""
@@ -155,21 +153,17 @@ def block_places(header: Header, levels: Levels, block: int, level: int) -> tupl
     return sorted(rows), sorted(columns)
 
 
-def part_places(header: Header, levels: Levels, number: int, level: int) -> tuple[list[int], list[int]]:
+def part_places(header: Header, levels: Levels, number: int, level: int) -> list[list[int]]:
     """The rows and columns of its block at which the nodes of a part stand, in the order of its grid."""
     part = header.parts[number]
     grid = levels.grids[len(header.curves) + number]
     block = header.blocks[part.block]
-    return (
-        _in_block(part, grid.places[level][0], 0, block.rows),
-        _in_block(part, grid.places[level][1], 1, block.columns),
-    )
-
-
-def _in_block(part: Part, places: list[int], axis: int, size: int) -> list[int]:
-    count = part.shape[axis]
-    turned = [count - 1 - place for place in places] if part.backwards[axis] else places
-    return [(part.first[axis] + place) % size for place in turned]
+    found = []
+    for axis, size in enumerate((block.rows, block.columns)):
+        last = part.shape[axis] - 1
+        places = [last - place if part.backwards[axis] else place for place in grid.places[level][axis]]
+        found.append([(part.first[axis] + place) % size for place in places])
+    return found
 
 
 def put_together(header: Header, levels: Levels, block: int, level: int, grids: dict[int, Lines]) -> Lines:
