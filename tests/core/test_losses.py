@@ -153,7 +153,7 @@ def test_what_does_not_come_back_is_named_and_nothing_else_is(suffix: str, surfa
 
 
 @given(surface=surfaces())
-@settings(max_examples=20)  # each of which is read in a process of its own
+@settings(max_examples=10)  # each of which is read in a process of its own
 def test_what_does_not_come_back_from_a_vts_is_named_and_nothing_else_is(surface: Surface) -> None:
     pytest.importorskip("vtkmodules")
     check_losses("vts", surface)

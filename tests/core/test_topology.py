@@ -333,7 +333,7 @@ def surface_of(blocks: list[LatticeBlock], kind: str, seed: int) -> ls.Surface |
 KINDS = st.sampled_from(["none", "agree", "apart", "mixed"])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     blocks=st.one_of(layouts(largest=6), overlapping(largest=6), tubes()),
     kind=KINDS,

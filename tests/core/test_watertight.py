@@ -132,7 +132,7 @@ def surface_of(blocks: list[LatticeBlock]) -> ls.Surface | None:
     return ls.Surface(blocks=[ls.Block(b.coordinates.astype(np.int64), b.closed, mask=b.mask) for b in usable])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(layouts(largest=8))
 def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)
