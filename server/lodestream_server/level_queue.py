@@ -22,6 +22,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
@@ -104,6 +105,10 @@ class Loan:
         if gave_back is not None:
             self._lease.release()
             gave_back()
+
+
+class _ReplacedError(Exception):
+    """The container is another file than the one that the process was allowed to read."""
 
 
 class LevelQueue:
@@ -334,10 +339,10 @@ class LevelQueue:
         for _ in range(_DEATHS):
             try:
                 return await self._run(wanted, key)
-            except ProcessDiedError as error:
+            except (ProcessDiedError, _ReplacedError) as error:
                 _log.warning("level %d of %s: %s", key.level, key.container, error)
                 await asyncio.to_thread(_empty, wanted.folder)
-        raise BusyError("the process that made the level was ended; come back soon")
+        raise BusyError("the process that made the level was ended, or its container replaced; come back soon")
 
     async def _run(self, wanted: LevelJob, key: Key) -> int:
         advice = "ask for a coarser level, or stream the surface"
@@ -355,6 +360,8 @@ class LevelQueue:
                 raise self._storage.gone(key.container) from None
             if error.errno in _NO_ROOM:
                 raise self._no_room(0) from None
+            if error.errno == errno.EACCES and os.access(wanted.container, os.R_OK):
+                raise _ReplacedError("its container was deleted and built again meanwhile") from None
             _log.error("a level could not be made for a reason that nobody foresaw: %s", error.traceback)
             raise
         except OSError as error:

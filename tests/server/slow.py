@@ -37,6 +37,7 @@ __all__ = [
     "leave",
     "listed",
     "make_coarsest",
+    "make_when_told",
     "nothing",
     "number",
     "out_of_processor_time",
@@ -231,6 +232,18 @@ def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
         if time.monotonic() > until:
             return RefusedLevel("OptionError", "nobody said go")
         time.sleep(0.01)
+    return make_level(job)
+
+
+def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Make a level once ``go`` appears beside ``begun`` in its folder, which is all that its process may write to."""
+    begun, go = job.folder / "begun", job.folder / "go"
+    begun.touch()
+    until = time.monotonic() + _PATIENCE
+    while not go.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    begun.unlink()
+    go.unlink()
     return make_level(job)
 
 

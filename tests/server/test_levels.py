@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import io
+import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,6 +28,7 @@ from lodestream_server.tokens import TokenFile
 from tests.server import hostile, slow
 from tests.server.helpers import PATIENCE, eventually, hills, npy, problem, push
 from tests.server.programs import alive, server
+from tests.server.test_confinement import needs_landlock
 
 
 @contextmanager
@@ -308,6 +311,27 @@ def test_a_level_that_takes_too_much_is_refused_and_the_next_one_is_made(
         monkeypatch.setattr(level_queue, "make_level", slow.kill_level_once)
         monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
         assert http.get(finest(surface)).content == npy(hills())
+
+
+@needs_landlock
+def test_a_container_may_be_built_again_while_a_level_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(level_queue, "make_level", slow.make_when_told)
+
+    def begin() -> Path:
+        return eventually(lambda: next((tmp_path / "levels").glob("*/begun"), None), "a process to begin")
+
+    with running_server(tmp_path, workers=1) as url, client(url) as http, ThreadPoolExecutor(1) as other:
+        surface = push(http, npy(hills()))
+        container = tmp_path / "containers" / f"{surface['container']}.lode"
+        answer = other.submit(http.get, finest(surface))
+        begun = begin()
+        # The same bytes in another file: the process may read only the one that there was.
+        shutil.copy(container, tmp_path / "copy")
+        (tmp_path / "copy").replace(container)
+        begun.with_name("go").touch()
+        eventually(lambda: not begun.exists(), "the process to go on")
+        begin().with_name("go").touch()
+        assert answer.result(PATIENCE).content == npy(hills())
 
 
 def test_no_word_of_its_process_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from lodestream_server.fsck_command import register
 from lodestream_server.storage import Storage
 from tests.server import slow
 from tests.server.helpers import hills, npy, problem, push, settled, upload_of
-from tests.server.test_builds import running
+from tests.server.test_builds import building, running
 
 BODY = npy(hills(seed=5))
 
@@ -141,9 +141,8 @@ def test_an_upload_that_cannot_be_read_is_not_refused(tmp_path: Path, monkeypatc
     monkeypatch.setattr(worker, "build", slow.wait)
     with running(data) as http:
         where = http.post("/v1/surfaces", content=BODY).headers["location"]
-        upload = upload_of(data, http.get(where).json()) / "0"
-        upload.write_bytes(BODY[:-8] + bytes(8))  # as a bad disk gives it back
-        upload.write_bytes(BODY[:-1] + b"")
+        building(http, where)  # which has been found as it was acknowledged
+        (upload_of(data, http.get(where).json()) / "0").write_bytes(BODY[:-1])  # as a bad disk gives it back
         (data / "go").touch()
         surface = settled(http, where)
         assert surface["state"] == "waiting"
