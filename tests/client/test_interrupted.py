@@ -188,7 +188,9 @@ def test_for_people_there_is_a_line_of_figures(relief_surface: str, folder: Path
         process.send_signal(signal.SIGINT)
         code, stdout, stderr = end(process)
     assert (code, stdout) == (130, "")
-    first, figures, last = stderr.splitlines()
+    # Somebody who interrupts is not kept waiting: on a busy machine the name may not come in time, and that is told.
+    late = "lodestream: written without its name and place, which could not be fetched: "
+    first, figures, last = [line for line in stderr.splitlines() if not line.startswith(late)]
     assert first == "lodestream: interrupted"
     assert figures.startswith("lodestream: stopped: level ")
     assert "maximum" in figures
