@@ -11,26 +11,30 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-lowest torture lint format bench bench-peers bench-server bench-stream wheel clean
+.PHONY: help demo kernels test test-lowest torture lint format bench bench-peers bench-server bench-stream wheel clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
-demo: $(STAMP) ## stream a million points over a slow link, stop early, and show what came
+demo: kernels ## stream a million points over a slow link, stop early, and show what came
 	@$(BIN)/lodestream demo $(ARGS)
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Three
 # of pytest's share two processors, since some of the tests wait for a clock.
-test: $(STAMP) ## run the tests; ARGS="-k name" for some of them
+test: kernels ## run the tests; ARGS="-k name" for some of them
 	@$(BIN)/python -m tests.warming # compile once, not in every process at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 3 --dist loadfile $(ARGS)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
 
-torture: $(STAMP) ## what takes too long for every run, into docs/reliability.md; ARGS="--seconds 300" or "kills fuzz"
+torture: kernels ## what takes too long for every run, into docs/reliability.md; ARGS="--seconds 300" or "kills fuzz"
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --group torture || true
 	@$(BIN)/python -m tests.torture $(ARGS)
+
+# Compiled when Lodestream is installed, and again whenever their sources change.
+kernels: $(STAMP)
+	@$(BIN)/python core/kernels/build.py
 
 lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
 	@status=0; \
@@ -41,16 +45,16 @@ format: $(STAMP) ## let ruff lay out the code and sort its imports
 	@$(BIN)/ruff check --quiet --select I --fix
 	@$(BIN)/ruff format --quiet
 
-bench: $(STAMP) ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
+bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
 	@$(BIN)/python -m benchmarks $(ARGS)
 
 bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other coders; ARGS="--only ours" or "--tables"
 	@$(PEERS)/bin/python -m benchmarks.peers $(ARGS)
 
-bench-server: $(STAMP) ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
+bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
 	@$(BIN)/python -m benchmarks.server $(ARGS)
 
-bench-stream: $(STAMP) ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
+bench-stream: kernels ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
 	@$(BIN)/python -m benchmarks.stream
 
 wheel: $(STAMP) ## build dist/*.whl

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import bare_kernel, inlined
+from .numba_kernels import bare_kernel, inlined
 
 __all__ = ["INDEX", "UNKNOWN", "WEIGHT", "WIDEST", "code_bit", "code_mixed_bit", "finish", "start"]
 

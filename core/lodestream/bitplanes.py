@@ -44,7 +44,7 @@ from .band_fields import (
     STRIDE,
 )
 from .binary_coder import INDEX, UNKNOWN, WEIGHT, WIDEST, code_bit, code_mixed_bit, finish, start
-from .kernels import bare_kernel, inlined, kernel
+from .numba_kernels import bare_kernel, inlined, kernel
 from .trellis import ODD, TRANSITIONS
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .binary_coder import INDEX, UNKNOWN, WIDEST, code_bit, finish, start
-from .kernels import inlined, kernel
+from .numba_kernels import inlined, kernel
 
 __all__ = ["code_differences", "most_bits"]
 

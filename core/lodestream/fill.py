@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import kernel
 from .layout import Layout
 from .lifting import forward_step
+from .numba_kernels import kernel
 from .predictors import predictor
 from .surface import Closed
 from .transform import allocate, forward, inverse

@@ -1,96 +1,144 @@
-"""The decorators behind every compiled loop."""
+"""The compiled kernels, each as a function of arrays: what ``core/kernels/lodestream.h`` declares, which says more.
+
+A call checks that each array has the dtype declared, lies in one piece, and may be written where the kernel writes it;
+then the kernel runs without the interpreter's lock. What a kernel refuses raises ValueError: lengths and places that do
+not fit each other are a fault of the caller, never of a stream.
+"""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar, cast
+import ctypes
+from typing import Any, NamedTuple
 
-import numba
-from numba.core import caching
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["bare_kernel", "cache_folders", "inlined", "keep_no_more", "kernel", "strict_kernel", "unkept"]
+from .library import library
 
-_log = logging.getLogger(__name__)
+__all__ = ["MASK_MODEL", "mask"]
 
-#: numba's option to do without its run time, which makes arrays and counts references to them.
-_UNCOUNTED: dict[str, Any] = {"_nrt": False}
-
-_Function = TypeVar("_Function", bound=Callable[..., object])
-
-_loops: list[Any] = []  # those that are kept on disk
-
-_UNKEPT = (
-    "Lodestream compiles its kernels anew in every process, which takes a minute or more: no folder in which they "
-    "could be kept can be written; NUMBA_CACHE_DIR names one"
-)
-_kept = True
+_REFUSED = -(2**63)
 
 
-def unkept() -> str | None:
-    """Why compiled kernels are not kept on disk, in a line; None where they are, or none was made yet."""
-    return None if _kept else _UNKEPT
+class Array(NamedTuple):
+    """An array in one piece, of any shape: a pointer and its number of elements."""
+
+    dtype: np.dtype[Any]
+    written: bool
 
 
-def _compiled(function: _Function, **options: Any) -> _Function:
-    try:
-        loop: Any = numba.njit(cache=True, nogil=True, **options)(function)
-    except RuntimeError as error:
-        if "no locator available" not in str(error):  # numba's words for want of a folder that can be written
-            raise
-    else:
-        _loops.append(loop)
-        return cast(_Function, loop)
-    global _kept
-    if _kept:
-        _log.warning(_UNKEPT)
-    _kept = False
-    return cast(_Function, numba.njit(nogil=True, **options)(function))
+class Plane(NamedTuple):
+    """Rows of values that lie side by side, however far apart the rows: a pointer, rows, columns, pitch."""
+
+    dtype: np.dtype[Any]
+    written: bool
 
 
-def kernel(function: _Function) -> _Function:
-    """Compile a plain loop at its first call, keep the machine code on disk, and run it without the interpreter's lock.
+class _Integer(NamedTuple):
+    """int64."""
 
-    Where no folder for it can be written, a warning is logged, and each process compiles for itself.
 
-    Multiplications and additions may be fused: kernels either compute with integers that float64 holds exactly, where
-    fusing changes nothing, or state the tolerance that they need.
+class _Real(NamedTuple):
+    """float64."""
+
+
+def reads(dtype: DTypeLike) -> Array:
+    """An array that a kernel reads."""
+    return Array(np.dtype(dtype), False)
+
+
+def writes(dtype: DTypeLike) -> Array:
+    """An array that a kernel changes."""
+    return Array(np.dtype(dtype), True)
+
+
+def reads_plane(dtype: DTypeLike) -> Plane:
+    """Rows that a kernel reads."""
+    return Plane(np.dtype(dtype), False)
+
+
+def writes_plane(dtype: DTypeLike) -> Plane:
+    """Rows that a kernel changes."""
+    return Plane(np.dtype(dtype), True)
+
+
+INTEGER, REAL = _Integer(), _Real()
+
+_Argument = Array | Plane | _Integer | _Real
+
+
+class Kernel:
+    """A function of the library.
+
+    Parameters
+    ----------
+    name : str
+        Without ``lode_``.
+    arguments : what each argument is
+        The function takes each as one or more of its own, as said there, and returns int64.
+
+    Raises
+    ------
+    UnavailableError
+        When it is called and the library cannot be loaded.
     """
-    return _compiled(function, fastmath={"contract"})
+
+    def __init__(self, name: str, *arguments: _Argument) -> None:
+        self.name = name
+        self._arguments = arguments
+        self._function: Any = None
+
+    def __call__(self, *values: Any) -> int:
+        """Call it; ValueError or TypeError where the values are not what was declared."""
+        if self._function is None:
+            self._function = self._bound()
+        if len(values) != len(self._arguments):
+            raise TypeError(f"{self.name}: expected {len(self._arguments)} arguments, got {len(values)}")
+        passed: list[Any] = []
+        for place, (value, declared) in enumerate(zip(values, self._arguments, strict=True)):
+            if isinstance(declared, Array):
+                self._check(place, value, declared)
+                if not value.flags.c_contiguous:
+                    raise ValueError(f"{self.name}: expected argument {place} in one piece, got {value.strides}")
+                passed += (value.ctypes.data, value.size)
+            elif isinstance(declared, Plane):
+                self._check(place, value, declared)
+                rows, columns = value.shape
+                if (columns > 1 and value.strides[1] != value.itemsize) or (rows > 1 and value.strides[0] < 0):
+                    raise ValueError(f"{self.name}: expected argument {place} in rows, got {value.strides}")
+                passed += (value.ctypes.data, rows, columns, value.strides[0] // value.itemsize)
+            else:
+                passed.append(value)
+        result: int = self._function(*passed)
+        if result == _REFUSED:
+            raise ValueError(f"{self.name}: lengths or places do not fit each other: {self._described(values)}")
+        return result
+
+    def _check(self, place: int, value: NDArray[Any], declared: Array | Plane) -> None:
+        if value.dtype != declared.dtype or (declared.written and not value.flags.writeable):
+            kind = "to be written" if declared.written else "to be read"
+            raise TypeError(f"{self.name}: expected argument {place} of {declared.dtype} {kind}, got {value.dtype}")
+
+    def _bound(self) -> Any:
+        function = library()[f"lode_{self.name}"]
+        types: list[Any] = []
+        for declared in self._arguments:
+            if isinstance(declared, Array):
+                types += (ctypes.c_void_p, ctypes.c_int64)
+            elif isinstance(declared, Plane):
+                types += (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+            else:
+                types.append(ctypes.c_double if isinstance(declared, _Real) else ctypes.c_int64)
+        function.argtypes, function.restype = types, ctypes.c_int64
+        return function
+
+    @staticmethod
+    def _described(values: tuple[Any, ...]) -> str:
+        return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
-def bare_kernel(function: _Function) -> _Function:
-    """Compile a loop like `kernel` that makes no array, and does not count references to those that it is given.
+_I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
 
-    Whoever calls it holds them. Where a loop calls others or takes views for a few samples at a time, counting would
-    cost as much as the work.
-    """
-    return _compiled(function, fastmath={"contract"}, **_UNCOUNTED)
-
-
-def inlined(function: _Function) -> _Function:
-    """A part of a kernel that is compiled into each place that calls it: a call would cost more than the work.
-
-    It makes no array and counts no references, see `bare_kernel`.
-    """
-    return cast(_Function, numba.njit(nogil=True, fastmath={"contract"}, forceinline=True, **_UNCOUNTED)(function))
-
-
-def strict_kernel(function: _Function) -> _Function:
-    """Compile a plain loop like `kernel`, but round after every operation: float64 results are those of numpy."""
-    return _compiled(function)
-
-
-def cache_folders() -> set[Path]:
-    """Where the machine code of the loops is kept that are defined so far."""
-    return {Path(loop.stats.cache_path) for loop in _loops}
-
-
-def keep_no_more() -> None:
-    """From now on compile what is not on the disk for this process alone, which may not write there.
-
-    What is kept there is loaded by other processes, which trust it.
-    """
-    cache: Any = caching.Cache
-    cache.save_overload = lambda *_: None
+# mask.c
+MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
+mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))

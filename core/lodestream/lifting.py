@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
-from .kernels import bare_kernel, inlined
+from .numba_kernels import bare_kernel, inlined
 
 __all__ = ["CLAMP", "FRACTION_BITS", "REACH", "TAPS", "forward_step", "inverse_step"]
 

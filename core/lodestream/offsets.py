@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .binary_coder import INDEX, UNKNOWN, WIDEST, code_bit, finish, start
-from .kernels import inlined, strict_kernel
+from .numba_kernels import inlined, strict_kernel
 
 __all__ = ["MOST_BITS", "code_offsets", "have_offsets", "places_of", "values_at"]
 

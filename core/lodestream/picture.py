@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrangement import VertexCounter
-from .kernels import strict_kernel
 from .lattice import Lattice
 from .measure import distances
+from .numba_kernels import strict_kernel
 from .sides import Arrangement, stored
 
 __all__ = ["Original", "coordinate_distances", "originals_of", "store_values"]

@@ -24,7 +24,7 @@ from .band_fields import (
     STRIDE,
 )
 from .bitplanes import BLOCK
-from .kernels import kernel
+from .numba_kernels import kernel
 from .quantiser import MOST_BASE, Quantiser
 from .tiles import TileTable
 from .trellis import ODD, TRANSITIONS

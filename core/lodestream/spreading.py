@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import BLOCK, reconstruction_point
-from .kernels import bare_kernel, inlined
 from .lifting import FRACTION_BITS
+from .numba_kernels import bare_kernel, inlined
 from .predictors import COEFFICIENT_BITS
 from .trellis import ODD, TRANSITIONS
 

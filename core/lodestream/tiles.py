@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import SUMS, code_passes, new_model
-from .kernels import kernel
 from .layout import REMEMBERED, Band, Layout
+from .numba_kernels import kernel
 from .quantiser import Quantiser, step_of
 from .spreading import UNANNOUNCED, spread_bands
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis import AxisStep
-from .kernels import kernel
 from .layout import Layout, Source
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
+from .numba_kernels import kernel
 from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
 
 __all__ = [

@@ -281,7 +281,7 @@ def _limit(allowed: Allowed) -> None:
         most = math.ceil(min(time.process_time() + allowed.seconds, _MOST_SECONDS))
         # Told so by SIGXCPU; who does not listen is killed.
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
-    kernels = sys.modules.get("lodestream.kernels")
+    kernels = sys.modules.get("lodestream.numba_kernels")
     folders = () if kernels is None else kernels.cache_folders()
     if kernels is not None:
         kernels.keep_no_more()
@@ -332,7 +332,7 @@ def _try_confinement() -> list[str]:
 def _warm(name: str) -> _Warmed:
     """Call a function once in a process that ends then, and once here."""
     # Whoever is the parent says it, once.
-    logging.getLogger("lodestream.kernels").disabled = True
+    logging.getLogger("lodestream.numba_kernels").disabled = True
     try:
         warm = resolve(name)
     except Exception:

@@ -30,7 +30,7 @@ def warm() -> str | None:
         Why the kernels are not kept on disk, if they are not.
     """
     from lodestream import decode, encode
-    from lodestream.kernels import unkept
+    from lodestream.numba_kernels import unkept
 
     _find_grids()
     for surface in _surfaces():

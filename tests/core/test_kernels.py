@@ -24,7 +24,7 @@ for module in pkgutil.walk_packages(lodestream.__path__, "lodestream."):
 """
 
 KERNELS = """
-from lodestream import kernels
+from lodestream import numba_kernels as kernels
 for make in (kernels.kernel, kernels.bare_kernel, kernels.strict_kernel):
     @make
     def total(most):

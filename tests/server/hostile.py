@@ -22,7 +22,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from lodestream.kernels import cache_folders
+from lodestream.numba_kernels import cache_folders
 from lodestream_server import worker
 from lodestream_server.levels import LevelJob, MadeLevel, RefusedLevel
 from lodestream_server.worker import Built, Job, Refused, build

@@ -139,7 +139,7 @@ def out_of_processor_time(job: Job) -> Built | Refused:
 
 def unkept() -> str:
     """Find no folder for the kernels; and say so as a build process would, which nobody is to hear."""
-    logging.getLogger("lodestream.kernels").warning("no folder, says a build process")
+    logging.getLogger("lodestream.numba_kernels").warning("no folder, says a build process")
     return "no folder for the kernels"
 
 

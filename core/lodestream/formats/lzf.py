@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
-from ..kernels import kernel
+from ..numba_kernels import kernel
 from .source import number
 
 __all__ = ["decompress"]

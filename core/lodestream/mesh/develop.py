@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, kernel
+from ..numba_kernels import inlined, kernel
 from .halfedges import Corners
 
 __all__ = ["Development", "develop_quads", "develop_triangles"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..numba_kernels import kernel
 from ..surface import Closed
 from .develop import Development
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, kernel
+from ..numba_kernels import inlined, kernel
 
 __all__ = [
     "Corners",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..numba_kernels import kernel
 from .halfedges import Corners, first_around, next_half_edge, previous_half_edge
 
 __all__ = ["find_fans", "find_poles", "unfold"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..numba_kernels import kernel
 from .halfedges import Corners
 from .model import Mesh
 from .patchwork import Quads

@@ -1,0 +1,95 @@
+/* Masks of surfaces with holes, without loss (docs/format.md, "Masks").
+ *
+ * Points are coded in raster order, each by the mean of two models in the logistic domain: one that sees the ten
+ * nearest points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that surrounds
+ * a group of sixteen points in a row is equal, one bit says whether they are equal to that too.
+ */
+#include "binary_coder.h"
+
+enum {
+    GROUP = 16,
+    ABOVE = 2,
+    BESIDE = 3,
+    NEAR = 1 << 16,            /* first of the contexts that see ten points */
+    GROUPS = NEAR + (1 << 10), /* first of those of groups: by their surroundings and the last group's answer */
+    WEIGHTS = GROUPS + 4,
+};
+
+/* Whether all around a group is 1 or all is 0: then its value, else -1. */
+static int surroundings(const uint8_t *at, int64_t stride, int64_t count) {
+    int64_t sum = at[-1] + at[-2];
+    for (int64_t j = -2; j < count + 2; j++)
+        sum += at[j - stride] + at[j - 2 * stride];
+    return sum == 0 ? 0 : sum == 2 * (count + 4) + 2 ? 1 : -1;
+}
+
+LODE_INLINE void code_points(bool reads, struct coder *coder, uint8_t *at, int64_t stride, int64_t count,
+                             int32_t *model) {
+    /* Seven points of the row above and five of the one above that move on with the point. */
+    const uint8_t *up = at - stride, *far_up = at - 2 * stride;
+    int32_t above = 0, further = 0, before = 0;
+    for (int64_t j = -3; j < 3; j++)
+        above = 2 * above + up[j];
+    for (int64_t j = -2; j < 2; j++)
+        further = 2 * further + far_up[j];
+    for (int64_t j = -4; j < 0; j++)
+        before = 2 * before + at[j];
+    for (int64_t j = 0; j < count; j++) {
+        above = (above << 1 | up[j + 3]) & 127;
+        further = (further << 1 | far_up[j + 2]) & 31;
+        int32_t wide = further << 11 | above << 4 | before;
+        int32_t near = NEAR + ((further >> 1 & 7) << 7 | (above >> 1 & 31) << 2 | (before & 3));
+        int bit = code_mixed_bit(reads, coder, at[j], &model[wide], &model[near], &model[WEIGHTS]);
+        at[j] = (uint8_t)bit;
+        before = (before << 1 | bit) & 15;
+    }
+}
+
+LODE_INLINE int code_rows(bool reads, struct coder *coder, int64_t columns, int64_t first, int64_t last,
+                          uint8_t *field, int32_t *model, int answer) {
+    int64_t stride = columns + 2 * BESIDE;
+    for (int64_t row = first; row < last; row++) {
+        for (int64_t left = 0; left < columns; left += GROUP) {
+            int64_t count = columns - left < GROUP ? columns - left : GROUP;
+            uint8_t *at = field + (row + ABOVE) * stride + BESIDE + left;
+            int around = surroundings(at, stride, count);
+            if (around >= 0) {
+                int same = 1;
+                for (int64_t j = 0; !reads && j < count; j++)
+                    same &= at[j] == around;
+                answer = code_bit(reads, coder, same, &model[GROUPS + 2 * around + answer]);
+                if (answer) {
+                    for (int64_t j = 0; j < count; j++)
+                        at[j] = (uint8_t)around;
+                    continue;
+                }
+            }
+            code_points(reads, coder, at, stride, count, model);
+        }
+    }
+    return answer;
+}
+
+int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
+                  int64_t field_count, int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count,
+                  int64_t *state, int64_t state_count) {
+    if (rows < 1 || columns < 1 || rows > INT32_MAX || columns > INT32_MAX || first < 0 || last < first ||
+        last > rows || field_count != (rows + ABOVE) * (columns + 2 * BESIDE) || model_count != LODE_MASK_MODEL ||
+        state_count != 4)
+        return LODE_REFUSED;
+    struct coder coder = {(uint64_t)state[0], (uint32_t)state[1], state[2], data, data_count};
+    int answer = state[3] & 1;
+    if (first == 0) {
+        coder = coder_start(reads, data, data_count);
+        answer = 0;
+        for (int i = 0; i < LODE_MASK_MODEL; i++)
+            model[i] = i < WEIGHTS ? UNKNOWN_CONTEXT : FIRST_WEIGHT;
+    }
+    answer = reads ? code_rows(true, &coder, columns, first, last, field, model, answer)
+                   : code_rows(false, &coder, columns, first, last, field, model, answer);
+    state[0] = (int64_t)coder.low;
+    state[1] = coder.width;
+    state[2] = coder.place;
+    state[3] = answer;
+    return reads || last < rows ? coder.place : coder_finish(&coder);
+}
