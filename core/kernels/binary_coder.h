@@ -1,4 +1,5 @@
-/* The adaptive binary range coder, for the kernels that code decisions in contexts (docs/format.md, "The binary coder").
+/* The adaptive binary range coder, for the kernels that code decisions in contexts (docs/format.md, "The binary
+ * coder").
  *
  * A context is an int32: its probability of a 1 over 2^20, and in the lowest 8 bits its adaptation count, 1 to 127.
  * After each bit the probability moves towards 0 or 2^20 - 1 by the part RATES of the distance, and the count grows by
@@ -108,7 +109,8 @@ LODE_INLINE int32_t context_after(int32_t context, int bit) {
     return (int32_t)((uint32_t)chance << 8) | (count < MOST_ADAPTED ? count + 1 : MOST_ADAPTED);
 }
 
-/* Code one bit in one context, which adapts. Coded with the highest 16 bits of the probability, within 32 ... 2^16 - 32. */
+/* Code one bit in one context, which adapts. Coded with the highest 16 bits of the probability, within 32 ... 2^16
+ * - 32. */
 LODE_INLINE int code_bit(bool reads, struct coder *coder, int bit, int32_t *context) {
     bit = coder_narrow(reads, coder, bit, (uint32_t)clamped(*context >> 12, 32, 65504));
     *context = context_after(*context, bit);

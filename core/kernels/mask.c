@@ -45,8 +45,8 @@ LODE_INLINE void code_points(bool reads, struct coder *coder, uint8_t *at, int64
     }
 }
 
-LODE_INLINE int code_rows(bool reads, struct coder *coder, int64_t columns, int64_t first, int64_t last,
-                          uint8_t *field, int32_t *model, int answer) {
+LODE_INLINE int code_rows(bool reads, struct coder *coder, int64_t columns, int64_t first, int64_t last, uint8_t *field,
+                          int32_t *model, int answer) {
     int64_t stride = columns + 2 * BESIDE;
     for (int64_t row = first; row < last; row++) {
         for (int64_t left = 0; left < columns; left += GROUP) {
