@@ -33,8 +33,9 @@ class Bounds(BaseModel):
     max_surfaces: int = _count(100_000, "surfaces on the server")
     owner_bytes: int | None = _follows(
         1,
-        "bytes on disk, uploads and containers, of one owner (a token's name, or all callers without a token together): "
-        "half of what the owner has there plus what is free; no limit while only programs on this machine can write",
+        "bytes on disk, uploads and containers, of one owner (a token's name, or all callers without a token "
+        "together): half of what the owner has there plus what is free; no limit while only programs on this machine "
+        "can write",
     )
     max_connections: int | None = _follows(
         1, "connections of all kinds: 5000, or fewer if the limit of open files (ulimit -n) does not allow as many"
@@ -52,8 +53,8 @@ class Bounds(BaseModel):
     )
     level_disk: int | None = _follows(
         2 << 20,
-        "disk space for levels as files, of which one file may use a quarter: 4 GiB, or a twentieth of the disk if that "
-        "is less",
+        "disk space for levels as files, of which one file may use a quarter: 4 GiB, or a twentieth of the disk if "
+        "that is less",
     )
     max_builds: int = _count(1000, "builds that wait or run")
     build_memory: int | None = _follows(

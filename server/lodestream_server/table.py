@@ -43,7 +43,8 @@ FORMATS = (
     "lode",
 )
 
-# Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can attack.
+# Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can
+# attack.
 _LEFT_OUT = ("usgs-dem", "bpt", "vmec", "text")
 
 _UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
@@ -226,7 +227,14 @@ GROUPS: Mapping[str, str] = {
 _SETTINGS = (
     Setting("host", _TEXT, "127.0.0.1", "address to listen on", "network", metavar="H"),
     Setting("port", _INTEGER, 8000, "port to listen on; 0 takes a free one", "network", 0, 65535, metavar="P"),
-    Setting("data", _PATH, Path("lodestream-data"), "data folder, which holds uploads and containers", "network", metavar="DIR"),
+    Setting(
+        "data",
+        _PATH,
+        Path("lodestream-data"),
+        "data folder, which holds uploads and containers",
+        "network",
+        metavar="DIR",
+    ),
     Setting(
         "root_path",
         _TEXT,
@@ -262,7 +270,9 @@ _SETTINGS = (
         metavar="FILE",
         usual="tokens.json in the data folder",
     ),
-    Setting("public_reads", _SWITCH, False, "allow anyone to list, fetch and stream surfaces without a token", "access"),
+    Setting(
+        "public_reads", _SWITCH, False, "allow anyone to list, fetch and stream surfaces without a token", "access"
+    ),
     Setting(
         "origins",
         _LIST,
@@ -277,8 +287,8 @@ _SETTINGS = (
         "formats",
         _FORMATS,
         tuple(name for name in FORMATS if name not in _LEFT_OUT),
-        f"file formats that the server reads: all, or some of {', '.join(FORMATS)} (vmec are the NetCDF files of VMEC, lode "
-        "are containers)",
+        f"file formats that the server reads: all, or some of {', '.join(FORMATS)} (vmec are the NetCDF files of VMEC, "
+        "lode are containers)",
         "limits",
         usual=f"all but {', '.join(_LEFT_OUT)}",
     ),
