@@ -96,29 +96,34 @@ def _run(command: list[str], flags: list[str], files: list[Path], target: Path) 
 
 
 def compiler() -> list[str]:
-    """The command of the first C compiler that makes a library: ``CC`` if it is set, else the machine's, else zig's.
+    """The command of the C compiler: ``CC``, else the machine's if it makes a library, else zig's.
 
     Raises
     ------
     RuntimeError
-        Where none does; with what was tried, and what each said.
+        Where there is none; with what was tried, and what each said.
     """
     chosen = shlex.split(os.environ.get("CC", ""))
-    found = [[path] for path in map(shutil.which, ("cc", "gcc", "clang")) if path]
-    if importlib.util.find_spec("ziglang"):
-        found.append(zig())
+    if chosen:
+        return chosen
     tried = []
-    with tempfile.TemporaryDirectory() as folder:
-        for command in [chosen] if chosen else found:
-            wrong = _run(command, machine_flags(command), [KERNELS / "library.c"], Path(folder, "library"))
-            if not wrong:
-                return command
-            tried.append(wrong)
-    what = "CC" if chosen else "cc, gcc, clang, or ziglang of this Python"
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name)
+        if path is None:
+            tried.append(f"{name}: not found")
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            wrong = _run([path], machine_flags([path]), [KERNELS / "library.c"], Path(folder, "library"))
+        if not wrong:
+            return [path]
+        tried.append(wrong)
+    if importlib.util.find_spec("ziglang"):
+        return zig()
+    tried.append("ziglang: not installed for this Python")
     raise RuntimeError(
-        f"expected a C compiler that makes a shared library: {what}; "
-        + ("none works:\n" + "\n".join(tried) if tried else "found none")
-        + "\nSet CC to the command of one, install one (on Debian: apt install gcc libc6-dev), or pip install ziglang."
+        "expected a C compiler that makes shared libraries, to compile the kernels of Lodestream. Tried:\n"
+        + "\n".join(tried)
+        + "\nInstall one (on Debian: apt install gcc libc6-dev), or pip install ziglang, or set CC to a compiler."
     )
 
 
