@@ -180,21 +180,22 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
         if self.target_name != "wheel":
             return
         machine = os.environ.get("LODESTREAM_WHEEL_FOR")
+        self._folder = tempfile.TemporaryDirectory()
         try:
             if version == "editable":
                 compile_library(NATIVE / library_name())
             else:
-                self._folder = tempfile.TemporaryDirectory()
                 made = _compile_for_wheel(Path(self._folder.name), machine)
                 build_data["force_include"][str(made)] = f"lodestream/native/{made.name}"
         except (RuntimeError, OSError) as error:
+            self._folder.cleanup()
             raise SystemExit(str(error)) from None
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{_platform_tag() if machine is None else _portable_tag(machine)}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was compiled aside."""
-        if hasattr(self, "_folder"):
+        if self.target_name == "wheel":
             self._folder.cleanup()
 
 

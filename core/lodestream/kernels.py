@@ -35,7 +35,7 @@ class Array:
     types = (ctypes.c_void_p, ctypes.c_int64)
 
     def __init__(self, dtype: DTypeLike, written: bool) -> None:
-        self.dtype = np.dtype(dtype)
+        self.dtype, self.written = np.dtype(dtype), written
         self._needed = _IN_ONE_PIECE | _ALIGNED | (_WRITEABLE if written else 0)
 
     def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
@@ -52,7 +52,7 @@ class Plane:
     types = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 
     def __init__(self, dtype: DTypeLike, written: bool) -> None:
-        self.dtype = np.dtype(dtype)
+        self.dtype, self.written = np.dtype(dtype), written
         self._needed = _ALIGNED | (_WRITEABLE if written else 0)
 
     def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
@@ -60,8 +60,9 @@ class Plane:
         flags = value.flags.num
         if value.dtype is not self.dtype or ~flags & self._needed:
             _check(value, self.dtype, self._needed)
-        rows, columns = value.shape
-        down, across = value.strides
+        if value.ndim != 2:
+            raise ValueError(f"expected two axes, got shape {value.shape}")
+        (rows, columns), (down, across) = value.shape, value.strides
         pitch, rest = divmod(down, value.itemsize) if rows > 1 else (columns, 0)
         if (columns > 1 and across != value.itemsize) or pitch < 0 or rest:
             raise ValueError(f"expected values of a row side by side, got strides {value.strides}")
@@ -145,7 +146,7 @@ class Kernel:
     """
 
     def __init__(self, name: str, *arguments: _Argument) -> None:
-        self.name = name
+        self.name, self.arguments = name, arguments
         self.types = [kind for argument in arguments for kind in argument.types]
         self._passed: list[Callable[[Any], tuple[Any, ...]]] = [argument.passed for argument in arguments]
         self._function: Any = None
