@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rich.progress
 
 import lodestream as ls
 import lodestream_client
@@ -133,8 +134,11 @@ def test_warnings_and_logs_of_libraries() -> None:
     assert harmless(done.stderr)
 
 
-def test_a_progress_bar_takes_no_markup() -> None:
+def test_a_progress_bar_takes_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with progress_bar() as bar:
+        assert isinstance(bar, rich.progress.Progress)
+        assert bar.columns
         assert all(not getattr(column, "markup", False) for column in bar.columns)
 
 
