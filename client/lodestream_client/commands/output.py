@@ -25,6 +25,7 @@ from lodestream.errors import FormatWarning, InputError
 from lodestream.text import printable
 
 if TYPE_CHECKING:
+    import rich.progress
     from rich.console import Console
     from rich.text import Text
 
@@ -194,10 +195,14 @@ def progress_bar() -> Iterator[Progress]:
 
     A task's field ``limit``, if it has one, is the most seconds that it may last.
     """
-    if not sys.stderr.isatty():
+    if sys.stderr.isatty():
+        with _drawn() as bar:
+            yield bar
+    else:
         yield _Unseen()
-        return
 
+
+def _drawn() -> rich.progress.Progress:
     from rich import progress
     from rich.text import Text
 
@@ -210,15 +215,14 @@ def progress_bar() -> Iterator[Progress]:
                 left.append(max(task.fields["limit"] - task.elapsed, 0.0))
             return Text(human_time(min(left)) if left else "", style="progress.remaining")
 
-    with progress.Progress(
+    return progress.Progress(
         progress.TextColumn("{task.description}", markup=False),
         progress.BarColumn(),
         progress.TextColumn("{task.fields[figures]}", markup=False),
         TimeLeft(),
         console=console(stderr=True),
         transient=True,
-    ) as bar:
-        yield bar
+    )
 
 
 def require_folder(path: Path) -> None:
