@@ -245,7 +245,9 @@ class Surface:
 
 def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
     """What is masked of a masked array, of its shape; None where nothing is."""
-    hidden = values.mask if isinstance(values, np.ma.MaskedArray) else np.ma.nomask
+    if type(values) is np.ndarray or not isinstance(values, np.ma.MaskedArray):  # a plain array need not load numpy.ma
+        return None
+    hidden = values.mask
     return np.broadcast_to(hidden, np.shape(values)) if np.any(hidden) else None
 
 

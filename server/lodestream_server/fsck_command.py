@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import os
 import sys
@@ -88,6 +87,8 @@ def _looked_through(folder: Path, args: argparse.Namespace) -> tuple[Report, Map
         report = _first(folder, args)
     if not changes:
         return report, report.records
+    import asyncio
+
     from .command import chosen_settings
     from .repair import compare, rebuild
 

@@ -19,18 +19,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from lodestream.errors import FormatWarning, InputError
 from lodestream.text import printable
 
 if TYPE_CHECKING:
+    import rich.progress
     from rich.console import Console
-    from rich.progress import Progress
     from rich.text import Text
 
 __all__ = [
     "Parser",
+    "Progress",
     "cell",
     "clean_warnings",
     "console",
@@ -162,37 +163,66 @@ def console(*, stderr: bool = False) -> Console:
     return Console(file=stream, width=None if stream.isatty() else 200, soft_wrap=not stream.isatty(), highlight=False)
 
 
+class Progress(Protocol):
+    """A bar for each task that is under way, as rich has them."""
+
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
+        """Begin one; what `update` and `remove_task` know it by."""
+
+    def update(self, task_id: Any, **changes: Any) -> None:
+        """Change what is given: ``completed``, ``total``, ``description``, fields."""
+
+    def remove_task(self, task_id: Any) -> None:
+        """Show it no longer."""
+
+
+class _Unseen:
+    """Bars where there is no terminal."""
+
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
+        return None
+
+    def update(self, task_id: Any, **changes: Any) -> None:
+        pass
+
+    def remove_task(self, task_id: Any) -> None:
+        pass
+
+
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """A progress bar on standard error; nothing at all when that is not a terminal.
 
     A task's field ``limit``, if it has one, is the most seconds that it may last.
     """
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    if sys.stderr.isatty():
+        with _drawn() as bar:
+            yield bar
+    else:
+        yield _Unseen()
+
+
+def _drawn() -> rich.progress.Progress:
+    from rich import progress
     from rich.text import Text
 
-    class TimeLeft(ProgressColumn):
+    class TimeLeft(progress.ProgressColumn):
         max_refresh = 0.5
 
-        def render(self, task: Task) -> Text:
+        def render(self, task: progress.Task) -> Text:
             left = [] if task.time_remaining is None else [task.time_remaining]
             if task.fields.get("limit") is not None and task.elapsed is not None:
                 left.append(max(task.fields["limit"] - task.elapsed, 0.0))
             return Text(human_time(min(left)) if left else "", style="progress.remaining")
 
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[figures]}", markup=False),
+    return progress.Progress(
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.TextColumn("{task.fields[figures]}", markup=False),
         TimeLeft(),
         console=console(stderr=True),
         transient=True,
     )
-    if not sys.stderr.isatty():
-        yield bar  # never started: it counts and shows nothing
-        return
-    with bar:
-        yield bar
 
 
 def require_folder(path: Path) -> None:

@@ -24,11 +24,11 @@ from .terrain import terrain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     from lodestream.decoder import View
 
+    from ..commands.output import Progress
     from ..requests import Description
 
 __all__ = ["show"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,6 +172,8 @@ def _padded(values: NDArray[Any], ends: Sequence[tuple[int, int]], mode: Any) ->
 
 
 def _array(name: str, values: NDArray[Any], offset: int) -> str:
+    from xml.sax.saxutils import quoteattr  # it loads urllib, which writers of other formats need not wait for
+
     kind = f"{_TYPES[values.dtype.kind]}{8 * values.dtype.itemsize}"
     components = values.shape[2] if values.ndim == 3 else 1
     return (
