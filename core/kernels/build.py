@@ -1,19 +1,18 @@
 """Compiles the kernels into one shared library: when the package is installed, and for `make` in a working tree.
 
 ``python core/kernels/build.py`` compiles into ``core/lodestream/native`` unless the library there was made from these
-sources. It takes ``CC``, else the machine's ``cc``, else the C compiler of the ``ziglang`` wheel.
+sources. It takes ``CC``, else the machine's ``cc``, ``gcc`` or ``clang``, else the C compiler of the ``ziglang`` wheel.
 """
 
 from __future__ import annotations
 
-import hashlib
+import importlib.util
 import os
 import platform
 import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,26 @@ try:
 except ImportError:  # run by hand, where hatchling need not be
     BuildHookInterface = object
 
-KERNELS = Path(__file__).resolve().parent
-NATIVE = KERNELS.parent / "lodestream" / "native"
-ZIG = "ziglang>=0.13,<0.17"
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+try:
+    from lodestream.library import KERNELS, NATIVE, fingerprint, library_name
+finally:
+    del sys.path[0]
+
+#: The versions whose C compiler was tried.
+ZIG = "ziglang>=0.15,<0.18"
 
 #: The same bits with every compiler: nothing is fused, and what the flags forbid the code does without.
 FLAGS = [
     *("-std=c11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off"),
     *("-fno-math-errno", "-fno-trapping-math", "-fno-strict-aliasing"),
 ]
-_BASELINE = {"x86_64": ["-march=x86-64-v2"], "AMD64": ["-march=x86-64-v2"]}
+
+#: The processor that x86-64-v2 names, in words that compilers knew before that name.
+_X86_64_V2 = ["-msse4.2", "-mpopcnt", "-mcx16", "-msahf"]
+
+#: The machines for which one wheel serves every Linux.
+PORTABLE = ("x86_64", "aarch64")
 
 
 def sources() -> list[Path]:
@@ -40,36 +49,86 @@ def sources() -> list[Path]:
     return sorted(KERNELS.glob("*.c"))
 
 
-def fingerprint() -> str:
-    """A hash of all that the library is made from: 16 hexadecimal digits."""
-    digest = hashlib.sha256()
-    for path in sorted([*KERNELS.glob("*.[ch]"), Path(__file__)]):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+def _is_zig(command: list[str]) -> bool:
+    return any(Path(word).name in ("zig", "ziglang") for word in command)
 
 
-def library_name(system: str = sys.platform, machine: str = platform.machine()) -> str:
-    """What the library of a platform is called."""
-    suffix = {"darwin": "dylib", "win32": "dll"}.get(system, "so")
-    return f"lodestream-{system}-{machine.lower()}.{suffix}"
-
-
-def compiler() -> list[str] | None:
-    """The command of the C compiler: ``CC``, else ``cc``, else zig's; None where there is none."""
-    if os.environ.get("CC"):
-        return shlex.split(os.environ["CC"])
-    found = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if found:
-        return [found]
-    try:
-        import ziglang  # noqa: F401
-    except ImportError:
-        return None
+def zig() -> list[str]:
+    """The command of the C compiler in the ``ziglang`` wheel."""
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
+def machine_flags(command: list[str], machine: str | None = None) -> list[str]:
+    """What a compiler is told of the machine: the least processor that is served, and to leave out what none needs.
+
+    Parameters
+    ----------
+    command : list of str
+        The compiler. zig takes the processor that it runs on and links a libc unless it is told not to.
+    machine : str or None
+        One of `PORTABLE`, for Linux; None: this one.
+    """
+    wide = (machine or platform.machine()) in ("x86_64", "AMD64")
+    strip = ["-s"] if machine or sys.platform == "linux" else []
+    if not _is_zig(command):
+        return (_X86_64_V2 if wide else []) + strip
+    target = ["-target", f"{machine}-linux-gnu.2.17"] if machine else []
+    alone = ["-nostdlib", "-rtlib=compiler-rt"] if machine or sys.platform == "linux" else []
+    return [*target, "-mcpu=x86_64_v2" if wide else "-mcpu=baseline", *alone, *strip]
+
+
+def _run(command: list[str], flags: list[str], files: list[Path], target: Path) -> str:
+    """Compile aside and rename, so that nobody loads half a library; what went wrong, else nothing."""
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".building-") as folder:
+        made = Path(folder, target.name)
+        define = f'-DLODE_SOURCES="{fingerprint()}"'
+        # zig keeps what it has compiled in the home folder, which a build need not have.
+        environment = {"ZIG_GLOBAL_CACHE_DIR": folder, "ZIG_LOCAL_CACHE_DIR": folder, **os.environ}
+        arguments = [*command, *FLAGS, *flags, define, *map(str, files), "-o", str(made)]
+        try:
+            done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
+        except OSError as error:
+            return f"{shlex.join(command)}: {error.strerror}"
+        if done.returncode or not made.exists():
+            return f"{shlex.join(command)} ended with {done.returncode}:\n{done.stderr.strip()}"
+        made.replace(target)
+    return ""
+
+
+def compiler() -> list[str]:
+    """The command of the C compiler: ``CC``, else the machine's if it makes a library, else zig's.
+
+    Raises
+    ------
+    RuntimeError
+        Where there is none; with what was tried, and what each said.
+    """
+    chosen = shlex.split(os.environ.get("CC", ""))
+    if chosen:
+        return chosen
+    tried = []
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name)
+        if path is None:
+            tried.append(f"{name}: not found")
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            wrong = _run([path], machine_flags([path]), [KERNELS / "library.c"], Path(folder, "library"))
+        if not wrong:
+            return [path]
+        tried.append(wrong)
+    if importlib.util.find_spec("ziglang"):
+        return zig()
+    tried.append("ziglang: not installed for this Python")
+    raise RuntimeError(
+        "expected a C compiler that makes shared libraries, to compile the kernels of Lodestream. Tried:\n"
+        + "\n".join(tried)
+        + "\nInstall one (on Debian: apt install gcc libc6-dev), or pip install ziglang, or set CC to a compiler."
+    )
+
+
 def compile_library(target: Path, command: list[str] | None = None, flags: list[str] | None = None) -> None:
-    """Compile into ``target``, aside and renamed, so that nobody loads half of it.
+    """Compile into ``target``.
 
     Parameters
     ----------
@@ -77,7 +136,7 @@ def compile_library(target: Path, command: list[str] | None = None, flags: list[
     command : list of str or None
         The compiler; None: `compiler`.
     flags : list of str or None
-        Behind `FLAGS`; None: those of this machine's baseline, and what leaves out symbols.
+        Behind `FLAGS`; None: those of this machine.
 
     Raises
     ------
@@ -85,52 +144,96 @@ def compile_library(target: Path, command: list[str] | None = None, flags: list[
         Where there is no compiler, or it fails; with what it said.
     """
     command = command or compiler()
-    if command is None:
-        raise RuntimeError("expected a C compiler: set CC, install cc, or pip install ziglang; found none")
-    if flags is None:
-        flags = _BASELINE.get(platform.machine(), []) + ([] if sys.platform == "win32" else ["-s"])
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".building-") as folder:
-        made = Path(folder) / target.name
-        define = f'-DLODE_SOURCES="{fingerprint()}"'
-        arguments = [*command, *FLAGS, *flags, define, *map(str, sources()), "-o", str(made)]
-        # zig keeps what it has compiled in the home folder, which a build need not have.
-        environment = {"ZIG_GLOBAL_CACHE_DIR": folder, "ZIG_LOCAL_CACHE_DIR": folder, **os.environ}
-        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stderr.strip()}")
-        made.replace(target)
+    wrong = _run(command, machine_flags(command) if flags is None else flags, sources(), target)
+    if wrong:
+        raise RuntimeError(wrong)
 
 
 def is_current(target: Path) -> bool:
     """Whether a library was made from these sources."""
-    return target.exists() and fingerprint().encode() in target.read_bytes()
+    return target.exists() and str(fingerprint()).encode() in target.read_bytes()
 
 
 class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without types where it is not installed
-    """hatchling's part: the library goes into the wheel, which is then one of this platform, for every Python."""
+    """hatchling's part: the library goes into the wheel, which is then one of this platform, for every Python.
+
+    With ``LODESTREAM_WHEEL_FOR=aarch64``, or another of `PORTABLE`, the wheel is one for every Linux on that machine.
+    """
 
     PLUGIN_NAME = "custom"
 
     def dependencies(self) -> list[str]:
-        """What building needs beside hatchling."""
-        return [] if compiler() else [ZIG]
+        """What building needs beside hatchling: zig, unless a compiler is there or was chosen."""
+        if os.environ.get("LODESTREAM_WHEEL_FOR"):
+            return [ZIG]
+        if self.target_name != "wheel" or os.environ.get("CC"):
+            return []
+        try:
+            compiler()
+        except RuntimeError:
+            return [ZIG]
+        return []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, and say what the wheel holds."""
+        """Compile: beside the sources for a package that stays among them, else aside, since those may be read-only."""
         if self.target_name != "wheel":
             return
-        target = NATIVE / library_name()
-        if not is_current(target):
-            compile_library(target)
-        build_data["artifacts"].append(f"core/lodestream/native/{target.name}")
+        machine = os.environ.get("LODESTREAM_WHEEL_FOR")
+        self._folder = tempfile.TemporaryDirectory()
+        try:
+            if version == "editable":
+                compile_library(NATIVE / library_name())
+            else:
+                made = _compile_for_wheel(Path(self._folder.name), machine)
+                build_data["force_include"][str(made)] = f"lodestream/native/{made.name}"
+        except (RuntimeError, OSError) as error:
+            self._folder.cleanup()
+            raise SystemExit(str(error)) from None
         build_data["pure_python"] = False
-        tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
-        build_data["tag"] = f"py3-none-{tag}"
+        build_data["tag"] = f"py3-none-{_platform_tag() if machine is None else _portable_tag(machine)}"
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Remove what was compiled aside."""
+        if self.target_name == "wheel":
+            self._folder.cleanup()
+
+
+def _compile_for_wheel(folder: Path, machine: str | None) -> Path:
+    if machine is None:
+        target = folder / library_name()
+        compile_library(target)
+    elif machine in PORTABLE:
+        target = folder / library_name("linux", machine)
+        compile_library(target, zig(), machine_flags(zig(), machine))
+    else:
+        raise RuntimeError(f"expected LODESTREAM_WHEEL_FOR to be one of {', '.join(PORTABLE)}, got {machine}")
+    return target
+
+
+def _portable_tag(machine: str) -> str:
+    """The library needs no libc, so any that Python runs with will do."""
+    return f"manylinux_2_17_{machine}.manylinux2014_{machine}.musllinux_1_2_{machine}"
+
+
+def _platform_tag() -> str:
+    """The platform of this Python and of no other: hatchling comes with `packaging`."""
+    from packaging.tags import platform_tags
+
+    return next(tag for tag in platform_tags() if not tag.startswith(("manylinux", "musllinux")))
+
+
+def main() -> None:
+    """Compile into the working tree unless that was done."""
+    target = NATIVE / library_name()
+    if is_current(target):
+        return
+    try:
+        compile_library(target)
+    except (RuntimeError, OSError) as error:
+        raise SystemExit(str(error)) from None
+    print(f"compiled {os.path.relpath(target)}")
 
 
 if __name__ == "__main__":
-    LIBRARY = NATIVE / library_name()
-    if not is_current(LIBRARY):
-        compile_library(LIBRARY)
-        print(f"compiled {LIBRARY.relative_to(Path.cwd()) if LIBRARY.is_relative_to(Path.cwd()) else LIBRARY}")
+    main()

@@ -1,6 +1,7 @@
 """Writes ``tables.h``: the constants of the binary coder, and logarithms.
 
-``python core/kernels/tables.py`` makes it again. The tables are defined in docs/format.md, "The range coder"; those of logarithms serve encoders only.
+``python core/kernels/tables.py`` makes it again. docs/format.md, "The range coder", defines the tables; that of
+logarithms serves encoders only.
 """
 
 from __future__ import annotations

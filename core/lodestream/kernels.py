@@ -8,7 +8,9 @@ not fit each other are a fault of the caller, never of a stream.
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from operator import index
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -20,46 +22,106 @@ __all__ = ["MASK_MODEL", "mask"]
 _REFUSED = -(2**63)
 
 
-class Array(NamedTuple):
+#: Bits of `numpy.ndarray.flags`: in one piece, every value at an address that its dtype may have, not read-only.
+_IN_ONE_PIECE, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400
+
+#: What ctypes takes for the address of a buffer: numpy takes four times as long to tell the number.
+_Start: Any = ctypes.c_char * 0
+
+
+class Array:
     """An array in one piece, of any shape: a pointer and its number of elements."""
 
-    dtype: np.dtype[Any]
-    written: bool
+    types = (ctypes.c_void_p, ctypes.c_int64)
+
+    def __init__(self, dtype: DTypeLike, written: bool) -> None:
+        self.dtype, self.written = np.dtype(dtype), written
+        self._needed = _IN_ONE_PIECE | _ALIGNED | (_WRITEABLE if written else 0)
+
+    def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
+        """What the function is given for an array; TypeError or ValueError where it is not such a one."""
+        flags = value.flags.num
+        if value.dtype is not self.dtype or ~flags & self._needed:
+            _check(value, self.dtype, self._needed)
+        return (_Start.from_buffer(value) if flags & _WRITEABLE else value.ctypes.data, value.size)
 
 
-class Plane(NamedTuple):
+class Plane:
     """Rows of values that lie side by side, however far apart the rows: a pointer, rows, columns, pitch."""
 
-    dtype: np.dtype[Any]
-    written: bool
+    types = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+
+    def __init__(self, dtype: DTypeLike, written: bool) -> None:
+        self.dtype, self.written = np.dtype(dtype), written
+        self._needed = _ALIGNED | (_WRITEABLE if written else 0)
+
+    def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
+        """What the function is given for an array of two axes."""
+        flags = value.flags.num
+        if value.dtype is not self.dtype or ~flags & self._needed:
+            _check(value, self.dtype, self._needed)
+        if value.ndim != 2:
+            raise ValueError(f"expected two axes, got shape {value.shape}")
+        (rows, columns), (down, across) = value.shape, value.strides
+        pitch, rest = divmod(down, value.itemsize) if rows > 1 else (columns, 0)
+        if (columns > 1 and across != value.itemsize) or pitch < 0 or rest:
+            raise ValueError(f"expected values of a row side by side, got strides {value.strides}")
+        whole = flags & _WRITEABLE and flags & _IN_ONE_PIECE
+        return (_Start.from_buffer(value) if whole else value.ctypes.data, rows, columns, pitch)
 
 
-class _Integer(NamedTuple):
+def _check(value: NDArray[Any], dtype: np.dtype[Any], needed: int) -> None:
+    # numpy may have several objects for one dtype.
+    if value.dtype != dtype:
+        raise TypeError(f"expected an array of {dtype}, got one of {value.dtype}")
+    missing = ~value.flags.num & needed
+    if missing & _WRITEABLE:
+        raise ValueError("expected an array to be written, got one that is read-only")
+    if missing:
+        raise ValueError(f"expected an aligned array in one piece, got {value.shape} with strides {value.strides}")
+
+
+class _Integer:
     """int64."""
 
+    types = (ctypes.c_int64,)
 
-class _Real(NamedTuple):
+    @staticmethod
+    def passed(value: Any) -> tuple[int]:
+        number = index(value)
+        if number.bit_length() > 63:  # ctypes would leave out the bits beyond
+            raise ValueError(f"expected an integer of 64 bits, got {number}")
+        return (number,)
+
+
+class _Real:
     """float64."""
+
+    types = (ctypes.c_double,)
+
+    @staticmethod
+    def passed(value: Any) -> tuple[float]:
+        return (float(value),)
 
 
 def reads(dtype: DTypeLike) -> Array:
     """An array that a kernel reads."""
-    return Array(np.dtype(dtype), False)
+    return Array(dtype, False)
 
 
 def writes(dtype: DTypeLike) -> Array:
     """An array that a kernel changes."""
-    return Array(np.dtype(dtype), True)
+    return Array(dtype, True)
 
 
 def reads_plane(dtype: DTypeLike) -> Plane:
     """Rows that a kernel reads."""
-    return Plane(np.dtype(dtype), False)
+    return Plane(dtype, False)
 
 
 def writes_plane(dtype: DTypeLike) -> Plane:
     """Rows that a kernel changes."""
-    return Plane(np.dtype(dtype), True)
+    return Plane(dtype, True)
 
 
 INTEGER, REAL = _Integer(), _Real()
@@ -84,57 +146,43 @@ class Kernel:
     """
 
     def __init__(self, name: str, *arguments: _Argument) -> None:
-        self.name = name
-        self._arguments = arguments
+        self.name, self.arguments = name, arguments
+        self.types = [kind for argument in arguments for kind in argument.types]
+        self._passed: list[Callable[[Any], tuple[Any, ...]]] = [argument.passed for argument in arguments]
         self._function: Any = None
 
     def __call__(self, *values: Any) -> int:
         """Call it; ValueError or TypeError where the values are not what was declared."""
         if self._function is None:
-            self._function = self._bound()
-        if len(values) != len(self._arguments):
-            raise TypeError(f"{self.name}: expected {len(self._arguments)} arguments, got {len(values)}")
-        passed: list[Any] = []
-        for place, (value, declared) in enumerate(zip(values, self._arguments, strict=True)):
-            if isinstance(declared, Array):
-                self._check(place, value, declared)
-                if not value.flags.c_contiguous:
-                    raise ValueError(f"{self.name}: expected argument {place} in one piece, got {value.strides}")
-                passed += (value.ctypes.data, value.size)
-            elif isinstance(declared, Plane):
-                self._check(place, value, declared)
-                rows, columns = value.shape
-                if (columns > 1 and value.strides[1] != value.itemsize) or (rows > 1 and value.strides[0] < 0):
-                    raise ValueError(f"{self.name}: expected argument {place} in rows, got {value.strides}")
-                passed += (value.ctypes.data, rows, columns, value.strides[0] // value.itemsize)
-            else:
-                passed.append(value)
-        result: int = self._function(*passed)
+            self._function = library()[f"lode_{self.name}"]
+            self._function.argtypes, self._function.restype = self.types, ctypes.c_int64
+        arguments: list[Any] = []
+        try:
+            for passed, value in zip(self._passed, values, strict=True):
+                arguments += passed(value)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise self._refusal(values, error) from None
+        result: int = self._function(*arguments)
         if result == _REFUSED:
-            raise ValueError(f"{self.name}: lengths or places do not fit each other: {self._described(values)}")
+            raise ValueError(f"{self.name}: lengths or places do not fit each other: {_described(values)}")
         return result
 
-    def _check(self, place: int, value: NDArray[Any], declared: Array | Plane) -> None:
-        if value.dtype != declared.dtype or (declared.written and not value.flags.writeable):
-            kind = "to be written" if declared.written else "to be read"
-            raise TypeError(f"{self.name}: expected argument {place} of {declared.dtype} {kind}, got {value.dtype}")
+    def _refusal(self, values: tuple[Any, ...], first: Exception) -> Exception:
+        """The error, with the place of what is wrong."""
+        if len(values) != len(self._passed):
+            return TypeError(f"{self.name}: expected {len(self._passed)} arguments, got {len(values)}")
+        for place, (passed, value) in enumerate(zip(self._passed, values, strict=True)):
+            try:
+                passed(value)
+            except AttributeError:
+                return TypeError(f"{self.name}: argument {place}: expected an array, got {type(value).__name__}")
+            except (TypeError, ValueError) as error:
+                return type(error)(f"{self.name}: argument {place}: {error}")
+        return first
 
-    def _bound(self) -> Any:
-        function = library()[f"lode_{self.name}"]
-        types: list[Any] = []
-        for declared in self._arguments:
-            if isinstance(declared, Array):
-                types += (ctypes.c_void_p, ctypes.c_int64)
-            elif isinstance(declared, Plane):
-                types += (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-            else:
-                types.append(ctypes.c_double if isinstance(declared, _Real) else ctypes.c_int64)
-        function.argtypes, function.restype = types, ctypes.c_int64
-        return function
 
-    @staticmethod
-    def _described(values: tuple[Any, ...]) -> str:
-        return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
+def _described(values: tuple[Any, ...]) -> str:
+    return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
 _I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64

@@ -1,9 +1,11 @@
-"""Loads the compiled kernels: the shared library that stands in ``native`` since the package was installed."""
+"""Loads the compiled kernels: the shared library that stands in ``native`` since the package was installed.
+
+``core/kernels/build.py`` imports this module before anything is installed: it needs the standard library alone.
+"""
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import platform
 import sys
 from functools import cache
@@ -11,46 +13,50 @@ from pathlib import Path
 
 from .errors import UnavailableError
 
-__all__ = ["library", "library_name", "why_missing"]
+__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "why_missing"]
 
-_NATIVE = Path(__file__).with_name("native")
+#: Where the library stands, and where its sources stand in a working tree.
+NATIVE = Path(__file__).with_name("native")
+KERNELS = Path(__file__).parents[1] / "kernels"
 _REMEDY = "install the package again where there is a C compiler, or from a wheel of this platform"
+_COMPILE = "run `make kernels` in the working tree, or `python core/kernels/build.py`"
 
 
-def library_name(system: str = sys.platform, machine: str = platform.machine()) -> str:
-    """What the library of a platform is called."""
+def library_name(system: str = sys.platform, machine: str | None = None) -> str:
+    """What the library of a platform is called; of this one, unless another is named."""
     suffix = {"darwin": "dylib", "win32": "dll"}.get(system, "so")
-    return f"lodestream-{system}-{machine.lower()}.{suffix}"
+    return f"lodestream-{system}-{(machine or platform.machine()).lower()}.{suffix}"
+
+
+def fingerprint() -> str | None:
+    """A hash of all that the library is made from, 16 hexadecimal digits; None where there are no sources."""
+    if not (KERNELS / "lodestream.h").exists():
+        return None
+    import hashlib  # programs that are installed do without
+
+    digest = hashlib.sha256()
+    for path in sorted([*KERNELS.glob("*.[ch]"), KERNELS / "build.py"]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
 
 
 @cache
 def _load() -> ctypes.CDLL | str:
-    path = _NATIVE / library_name()
+    path, wanted = NATIVE / library_name(), fingerprint()
+    remedy = _COMPILE if wanted else _REMEDY
     if not path.exists():
-        others = sorted(other.name for other in _NATIVE.glob("lodestream-*"))
+        others = sorted(other.name for other in NATIVE.glob("lodestream-*"))
         found = f"found those of other platforms: {', '.join(others)}" if others else "found none"
-        return f"expected the compiled kernels of this platform, {path.name}; {found}: {_REMEDY}"
+        return f"expected the compiled kernels of this platform, {path.name}; {found}: {remedy}"
     try:
         loaded = ctypes.CDLL(str(path))
         loaded.lode_sources.restype = ctypes.c_char_p
         made_from = loaded.lode_sources().decode()
     except (OSError, AttributeError) as error:
-        return f"expected compiled kernels in {path}, which cannot be loaded ({error}): {_REMEDY}"
-    wanted = _fingerprint()
-    if wanted is not None and made_from != wanted:
-        return f"expected kernels compiled from the sources beside them ({wanted}), got {made_from}: run make"
+        return f"expected compiled kernels in {path}, which cannot be loaded ({error}): {remedy}"
+    if wanted and made_from != wanted:
+        return f"expected kernels compiled from the sources beside them ({wanted}), got {made_from}: {remedy}"
     return loaded
-
-
-def _fingerprint() -> str | None:
-    """The hash of the sources in a working tree, see ``kernels/build.py``; None where there are none."""
-    folder = Path(__file__).parents[1] / "kernels"
-    if not (folder / "build.py").exists():
-        return None
-    digest = hashlib.sha256()
-    for path in sorted([*folder.glob("*.[ch]"), folder / "build.py"]):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 def why_missing() -> str | None:

@@ -1,0 +1,267 @@
+"""Building the library of kernels, and what is said where it cannot be used."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from lodestream import library
+from lodestream.errors import UnavailableError
+
+KERNELS = Path(__file__).parents[2] / "core" / "kernels"
+
+
+def module(name: str) -> ModuleType:
+    """A program beside the kernels, which is no part of a package."""
+    spec = importlib.util.spec_from_file_location(f"kernels_{name}", KERNELS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+build, tables = module("build"), module("tables")
+
+
+def script(path: Path, text: str) -> Path:
+    """A program in Python."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!{sys.executable}\n{text}")
+    path.chmod(0o755)
+    return path
+
+
+#: A compiler that fails, and one that takes its time to write what it makes: sources and ``-o FILE`` at the end.
+FAILS = "import sys\nsys.exit('cannot find crti.o')\n"
+SLOW = """
+import sys, time
+with open(sys.argv[-1], "wb", buffering=0) as file:
+    for _ in range(4):
+        file.write(bytes(1000))
+        time.sleep(0.05)
+"""
+
+
+@pytest.fixture
+def nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine without a compiler; the folder on its PATH."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    return folder
+
+
+def test_what_was_tried_is_said_where_there_is_no_compiler(nothing: Path) -> None:
+    script(nothing / "cc", FAILS)
+    with pytest.raises(RuntimeError) as caught:
+        build.compiler()
+    words = str(caught.value)
+    for expected in ("cannot find crti.o", "gcc: not found", "clang: not found", "ziglang: not", "install", "set CC"):
+        assert expected in words
+
+
+def test_a_compiler_that_makes_no_library_is_passed_over(nothing: Path) -> None:
+    script(nothing / "cc", FAILS)
+    script(nothing / "clang", SLOW)
+    assert build.compiler() == [str(nothing / "clang")]
+
+
+def test_zig_comes_last_and_is_asked_for_where_there_is_no_other(
+    nothing: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert hook().dependencies() == [build.ZIG]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "ziglang")
+    assert build.compiler() == [sys.executable, "-m", "ziglang", "cc"]
+    script(nothing / "gcc", SLOW)
+    assert build.compiler() == [str(nothing / "gcc")]
+    assert hook().dependencies() == []
+
+
+def test_the_compiler_of_cc_is_taken_with_its_arguments_and_no_other(
+    nothing: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    script(nothing / "cc", SLOW)
+    monkeypatch.setenv("CC", f"'{script(tmp_path / 'my tools' / 'compiler', FAILS)}' -m32")
+    assert hook().dependencies() == []
+    with pytest.raises(RuntimeError, match=r"my tools/compiler' -m32 ended with 1:\ncannot find crti"):
+        build.compile_library(tmp_path / "library")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(RuntimeError, match="no-such-compiler: No such file"):
+        build.compile_library(tmp_path / "library")
+
+
+@pytest.mark.parametrize("command", [["cc"], ["zig", "cc"], [sys.executable, "-m", "ziglang", "cc"]])
+def test_the_processor_is_named_to_each_compiler_in_its_words(command: list[str]) -> None:
+    flags = build.machine_flags(command, "x86_64")
+    assert ("-msse4.2" in flags) == (command == ["cc"])
+    assert ("-mcpu=x86_64_v2" in flags) == (command != ["cc"])
+    assert "-msse4.2" not in build.machine_flags(command, "aarch64")
+
+
+def test_a_build_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    target = tmp_path / "library"
+    target.write_bytes(b"before")
+    with pytest.raises(RuntimeError, match="crti"):
+        build.compile_library(target, [str(script(tmp_path / "cc", FAILS))])
+    assert target.read_bytes() == b"before"
+    assert {path.name for path in tmp_path.iterdir()} == {"cc", "library"}
+
+
+def test_of_two_builds_at_once_each_leaves_a_whole_library(tmp_path: Path) -> None:
+    target = tmp_path / "native" / "library"
+    slow = [str(script(tmp_path / "cc", SLOW))]
+    with ThreadPoolExecutor(2) as pool:
+        running = [pool.submit(build.compile_library, target, slow) for _ in range(4)]
+        sizes = set()
+        while not all(one.done() for one in running):
+            if target.exists():
+                sizes.add(target.stat().st_size)
+        for one in running:
+            one.result()
+    assert sizes <= {4000}
+    assert target.stat().st_size == 4000
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_the_library_is_made_without_any_package() -> None:
+    # -S: no site-packages; -I: no PYTHONPATH. What is there is current, or becomes so.
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", str(KERNELS / "build.py")], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert build.is_current(library.NATIVE / library.library_name())
+
+
+def hook() -> Any:
+    """hatchling's hook, whether hatchling is there or not."""
+
+    class Hook(build.Hook):  # type: ignore[name-defined, misc]
+        target_name = "wheel"
+
+        def __init__(self) -> None:
+            """Nothing that hatchling gives is used."""
+
+    return Hook()
+
+
+def test_a_wheel_gets_its_library_from_outside_the_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(build, "NATIVE", tmp_path / "native")
+    monkeypatch.setenv("CC", str(script(tmp_path / "cc", SLOW)))
+    data: dict[str, Any] = {"force_include": {}}
+    building = hook()
+    building.initialize("standard", data)
+    ((made, place),) = data["force_include"].items()
+    assert place == f"lodestream/native/{library.library_name()}"
+    assert Path(made).stat().st_size == 4000
+    assert data["tag"].startswith("py3-none-")
+    assert not data["tag"].endswith("-any")
+    assert not data["pure_python"]
+    building.finalize("standard", data, "")
+    assert not Path(made).exists()
+    assert not build.NATIVE.exists()
+    building.initialize("editable", data)
+    building.finalize("editable", data, "")
+    assert [path.name for path in build.NATIVE.iterdir()] == [library.library_name()]
+
+
+def test_an_installation_that_fails_ends_without_a_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", str(script(tmp_path / "cc", FAILS)))
+    with pytest.raises(SystemExit, match="crti"):
+        hook().initialize("standard", {"force_include": {}})
+    monkeypatch.setenv("LODESTREAM_WHEEL_FOR", "pdp11")
+    with pytest.raises(SystemExit, match="expected LODESTREAM_WHEEL_FOR to be one of x86_64, aarch64, got pdp11"):
+        hook().initialize("standard", {"force_include": {}})
+
+
+@pytest.fixture
+def native(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """An empty folder in the place of that of the library, which is loaded anew from there."""
+    monkeypatch.setattr(library, "NATIVE", tmp_path)
+    library._load.cache_clear()
+    yield tmp_path
+    library._load.cache_clear()
+
+
+OURS = (library.NATIVE / library.library_name()).read_bytes()
+
+
+def refused() -> str:
+    """Why the library cannot be used."""
+    reason = library.why_missing()
+    assert reason is not None
+    assert "\n" not in reason
+    with pytest.raises(UnavailableError) as caught:
+        library.library()
+    assert str(caught.value) == reason
+    return reason
+
+
+def test_a_library_that_is_not_there(native: Path) -> None:
+    assert "found none" in refused()
+
+
+def test_a_library_of_another_platform_is_named(native: Path) -> None:
+    (native / library.library_name("plan9", "pdp11")).write_bytes(OURS)
+    reason = refused()
+    assert library.library_name() in reason
+    assert "found those of other platforms: lodestream-plan9-pdp11.so" in reason
+
+
+@pytest.mark.parametrize("content", [b"", b"no library", OURS.replace(b"lode_sources", b"lode_sourceX")])
+def test_what_cannot_be_loaded_is_refused(native: Path, content: bytes) -> None:
+    (native / library.library_name()).write_bytes(content)
+    assert "cannot be loaded" in refused()
+
+
+def test_a_library_of_other_sources_is_refused_with_the_remedy(native: Path) -> None:
+    current = str(library.fingerprint()).encode()
+    assert OURS.count(current) == 1
+    (native / library.library_name()).write_bytes(OURS.replace(current, b"0123456789abcdef"))
+    reason = refused()
+    assert f"({current.decode()}), got 0123456789abcdef" in reason
+    assert "make kernels" in reason
+    assert "build.py" in reason
+
+
+def test_a_library_without_sources_beside_it_is_loaded_as_it_is(
+    native: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(library, "KERNELS", tmp_path / "none")
+    (native / library.library_name()).write_bytes(OURS.replace(str(build.fingerprint()).encode(), b"f" * 16))
+    assert library.why_missing() is None
+    assert isinstance(library.library(), ctypes.CDLL)
+
+
+def test_the_remedy_of_an_installed_package_is_another_installation(
+    native: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(library, "KERNELS", tmp_path / "none")
+    assert "install the package again" in refused()
+
+
+def test_nothing_is_hashed_or_run_where_the_package_is_installed(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from lodestream import library\n"
+        f"library.KERNELS = Path({str(tmp_path)!r})\n"
+        "library.library(); print({'hashlib', 'subprocess', 'tempfile'} & set(sys.modules))"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(KERNELS.parent)}
+    done = subprocess.run([sys.executable, "-S", "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout == "set()\n", done.stderr
+
+
+def test_tables_are_those_of_their_program() -> None:
+    assert tables.TABLES.read_text() == tables.text()
