@@ -76,11 +76,11 @@ LODE_API int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int
  *
  * Returns 0.
  */
-LODE_API int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, int64_t rows,
-                                       int64_t columns, int64_t channels, const int32_t *coordinates,
-                                       int64_t coordinates_count, int64_t height, int64_t pitch, const double *rules,
+LODE_API int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type,
+                                       const int32_t *coordinates, int64_t coordinates_count, const double *rules,
                                        int64_t rules_count, const uint8_t *counted, int64_t counted_count,
-                                       int64_t first, int64_t last, double *figures, int64_t figures_count);
+                                       double *figures, int64_t figures_count, int64_t rows, int64_t columns,
+                                       int64_t channels, int64_t height, int64_t pitch, int64_t first, int64_t last);
 
 #define LODE_PART_ROWS 128
 #define LODE_PART_COLUMNS 512

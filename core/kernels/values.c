@@ -319,11 +319,11 @@ static void part_figures(const struct comparison *c, int64_t top, int64_t bottom
     }
 }
 
-int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, int64_t rows,
-                              int64_t columns, int64_t channels, const int32_t *coordinates, int64_t coordinates_count,
-                              int64_t height, int64_t pitch, const double *rules, int64_t rules_count,
-                              const uint8_t *counted, int64_t counted_count, int64_t first, int64_t last,
-                              double *figures, int64_t figures_count) {
+int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, const int32_t *coordinates,
+                              int64_t coordinates_count, const double *rules, int64_t rules_count,
+                              const uint8_t *counted, int64_t counted_count, double *figures, int64_t figures_count,
+                              int64_t rows, int64_t columns, int64_t channels, int64_t height, int64_t pitch,
+                              int64_t first, int64_t last) {
     int64_t geometric = rules_count / RULE_NUMBERS;
     if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || geometric < 1 ||
         geometric > channels || !is_shape(coordinates_count, height, pitch, geometric) || height < rows ||

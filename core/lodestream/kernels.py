@@ -241,10 +241,7 @@ mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), wr
 PART_ROWS, PART_COLUMNS = 128, 512
 store_values = Kernel("store_values", reads_plane(_I32), writes_values(), *[INTEGER] * 5, *[REAL] * 3)
 square_distances = Kernel(
-    "square_distances",
-    *(reads_values(), *[INTEGER] * 3),
-    *(reads(_I32), INTEGER, INTEGER),
-    *(reads(_F64), reads(_BOOL), INTEGER, INTEGER, writes(_F64)),
+    "square_distances", reads_values(), reads(_I32), reads(_F64), reads(_BOOL), writes(_F64), *[INTEGER] * 7
 )
 
 # holes.c
@@ -257,8 +254,9 @@ CLASSES, INDICES = 30, 16
 classify = Kernel("classify", reads(_I64), reads(_I64), reads(_I32), writes(_F64), writes(_I8))
 choose = Kernel(
     "choose",
-    *(reads(_I64), reads(_F64), reads(_I8), reads(_F64), REAL),
-    *(writes(_I32), writes(_F64), writes(_I32), writes(_U8)),
+    *[reads(_I64), reads(_F64), reads(_I8), reads(_F64)],
+    REAL,
+    *[writes(_I32), writes(_F64), writes(_I32), writes(_U8)],
 )
 
 # lzf.c

@@ -140,7 +140,8 @@ def _distances(original: Original, coordinates: NDArray[np.int32], rules: NDArra
     count = -(-rows // kernels.PART_ROWS) * -(-columns // kernels.PART_COLUMNS)
     figures = np.empty((count, 2))
     counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
-    compared = original.points, rows, columns, channels, coordinates, *coordinates.shape[1:], rules, counted
+    arrays = original.points, coordinates, rules, counted, figures
+    shapes = rows, columns, channels, *coordinates.shape[1:]
     for first in range(0, count, _PARTS):
-        kernels.square_distances(*compared, first, min(first + _PARTS, count), figures)
+        kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, count))
     return math.fsum(figures[:, 0]), float(figures[:, 1].max())
