@@ -15,7 +15,16 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "mask"]
+__all__ = [
+    "DIFFERENCES_MEMORY",
+    "DIFFERENCES_MODEL",
+    "MASK_MODEL",
+    "OFFSETS_MODEL",
+    "differences",
+    "mask",
+    "most_bits",
+    "offsets",
+]
 
 _REFUSED = -(2**63)
 
@@ -142,3 +151,16 @@ _I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
+
+# differences.c
+DIFFERENCES_MODEL = 256 + 4 + 16 + 1 + 1 + 16
+DIFFERENCES_MEMORY = 1 << 14
+_of_values = reads(_I64), writes(_I64), reads(_I32), writes(_U8)
+_room = writes(_I32), writes(_I64)
+_coded = writes(_U8), writes(_U8), writes(_I64)
+differences = Kernel("differences", INTEGER, *_of_values, INTEGER, INTEGER, *_room, *_coded)
+most_bits = Kernel("most_bits", reads(_I64), reads(_I32), reads(_U8))
+
+# offsets.c
+OFFSETS_MODEL = 16 + 1 + 64 + 2 * 8 + 16 + 34
+offsets = Kernel("offsets", INTEGER, reads(_F64), reads(_I64), INTEGER, writes(_I64), writes(_I32), writes(_U8))
