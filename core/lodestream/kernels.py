@@ -19,15 +19,21 @@ from .library import library
 
 __all__ = [
     "CLASSES",
+    "DIFFERENCES_MEMORY",
+    "DIFFERENCES_MODEL",
     "INDICES",
     "MASK_MODEL",
+    "OFFSETS_MODEL",
     "PART_COLUMNS",
     "PART_ROWS",
     "VALUE_TYPES",
     "choose",
     "classify",
+    "differences",
     "lzf",
     "mask",
+    "most_bits",
+    "offsets",
     "pull",
     "push",
     "relax",
@@ -261,3 +267,16 @@ choose = Kernel(
 
 # lzf.c
 lzf = Kernel("lzf", reads(_U8), writes(_U8), INTEGER, writes(_I64))
+
+# differences.c
+DIFFERENCES_MODEL = 256 + 4 + 16 + 1 + 1 + 16
+DIFFERENCES_MEMORY = 1 << 14
+_of_values = reads(_I64), writes(_I64), reads(_I32), writes(_U8)
+_room = writes(_I32), writes(_I64)
+_coded = writes(_U8), writes(_U8), writes(_I64)
+differences = Kernel("differences", INTEGER, *_of_values, INTEGER, INTEGER, *_room, *_coded)
+most_bits = Kernel("most_bits", reads(_I64), reads(_I32), reads(_U8))
+
+# offsets.c
+OFFSETS_MODEL = 16 + 1 + 64 + 2 * 8 + 16 + 34
+offsets = Kernel("offsets", INTEGER, reads(_F64), reads(_I64), INTEGER, writes(_I64), writes(_I32), writes(_U8))
