@@ -15,7 +15,7 @@ from .source import number
 __all__ = ["decompress"]
 
 #: Bytes that one call of the kernel makes.
-_AT_ONCE = 1 << 24
+_AT_ONCE = 1 << 22
 
 
 def decompress(content: bytes, size: int) -> NDArray[np.uint8]:
