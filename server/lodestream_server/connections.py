@@ -1,8 +1,8 @@
-"""HTTP connections that do not wait for ever, and read only so much that nobody wants.
+"""HTTP connections with limits on waiting and reading.
 
-They wait for the head of a request, and for a client to take an answer, only so long. What comes is looked at in small
-pieces, so that others have their turn between them. Of a request that was answered before it was whole a bounded rest
-is read, so that the client sees the answer; then the connection is cut.
+The head of a request must arrive in time, and a client must read its answer in time. Received data are processed in
+small pieces, so that other connections get their turn. If a request is answered before all of it has arrived, a bounded
+rest is read so that the client sees the answer; then the connection is cut.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _TITLES = {
 
 
 def connections(settings: Settings, cuts: Cuts, pace: Pace) -> type[H11Protocol]:
-    """The class of a server's connections; uvicorn makes one for each."""
+    """The class of a server's HTTP connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         head_seconds = settings.head_seconds

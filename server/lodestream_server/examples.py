@@ -1,4 +1,4 @@
-"""What OpenAPI shows: one surface through its life, and the shapes of bodies that the framework does not see."""
+"""Examples for OpenAPI: one surface in each state, and the shapes of bodies that the framework does not know."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ PROBLEM_SCHEMA: dict[str, Any] = {
 
 
 def answer(description: str, example: dict[str, Any], *, location: bool = False) -> dict[str, Any]:
-    """A response of OpenAPI with an example."""
+    """An OpenAPI response with an example."""
     documented: dict[str, Any] = {
         "description": description,
         "content": {"application/json": {"schema": {"type": "object"}, "example": example}},

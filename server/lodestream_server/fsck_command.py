@@ -1,4 +1,4 @@
-"""``lodestream fsck``, which the command line finds through the entry points of the group ``lodestream.commands``."""
+"""The command ``lodestream fsck``, found through the entry points of the group ``lodestream.commands``."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def register(subparsers: Any) -> None:
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, repair it if asked to, and print what was found; the exit code.
+    """Check a folder, repair it if requested, and print what was found; returns the exit code.
 
     Raises
     ------
     LodestreamError
-        When it is no folder of a server, or another process works in it.
+        If it is not the data folder of a server, or another process uses it.
     """
     from .folders import Folders
 

@@ -1,19 +1,19 @@
-"""Levels as files: made one at a time in a process of its own, under limits, for as long as somebody waits for them.
+"""Levels as files: made one at a time, each in its own process, under limits, while somebody waits for them.
 
-What becomes of a request:
+What happens to a request:
 
 ======================================  ================================================================================
-the file is there                       it is lent at once
-the same level is being made            it waits for that
-otherwise                               it waits its turn: callers take turns, whatever each of them asks for; what
-                                        several wait for is made in the first turn of any of them
-the client goes                         it leaves the queue; when nobody else waits, the process is killed
-the level is too large, its file too    413
-long, or it takes too long
-one caller asks for too much            429
-too many wait, slow readers hold all    503
-the room, or the process dies
-the disk has no room                    507
+the file exists                         it is lent at once
+the same level is being made            the request waits for it
+otherwise                               it waits its turn: callers take turns; a level that several of them wait for is
+                                        made in the first turn of any of them
+the client disconnects                  it leaves the queue; if nobody else waits, the process is killed
+the level needs too much memory or      413
+time, or its file is too large
+one caller has too many requests        429
+too many requests wait, slow readers    503
+occupy the room, or the process dies
+the disk is full                        507
 ======================================  ================================================================================
 """
 
@@ -84,7 +84,7 @@ class _Job:
 
 
 class Loan:
-    """A file that is lent to a caller, who is counted until it is given back.
+    """A level file that is lent to a caller; it counts for the caller until it is released.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Loan:
         self._gave_back: Callable[[], None] | None = gave_back
 
     def release(self) -> None:
-        """Give it back; once is enough."""
+        """Release the file; further calls do nothing."""
         gave_back, self._gave_back = self._gave_back, None
         if gave_back is not None:
             self._lease.release()
@@ -108,18 +108,15 @@ class Loan:
 
 
 class _ReplacedError(Exception):
-    """The container is another file than the one that the process was allowed to read."""
+    """The container was replaced by another file than the one that the process may read."""
 
 
 class LevelQueue:
-    """Who waits for which level, and the process that makes them.
+    """The queue of requests for level files, and the process that makes them.
 
     Parameters
     ----------
-    settings : Settings
-    storage : Storage
-    files : LevelFiles
-    fork_server : ForkServer
+    settings : Settings storage : Storage files : LevelFiles fork_server : ForkServer
     """
 
     def __init__(self, settings: Settings, storage: Storage, files: LevelFiles, fork_server: ForkServer) -> None:
@@ -136,36 +133,36 @@ class LevelQueue:
         self._closing = False
 
     async def borrow(self, request: Request, key: Key, caller: str) -> Loan:
-        """A file, made if it is not there, unless the client goes meanwhile.
+        """A level file, made if it does not exist; given up if the client disconnects meanwhile.
 
         Parameters
         ----------
         request : Request
-            Whose body was not read.
+            Its body must not have been read.
         key : Key
-            A level and a format that there are.
+            An existing level and format.
         caller : str
-            Key of whoever asks.
+            Key of the caller.
 
         Raises
         ------
         TooManyError
-            When this caller asks for as many as one may, or holds too many bytes.
+            If this caller has too many requests, or holds too many bytes.
         BusyError
-            When too many wait, or the room is held by readers.
+            If too many requests wait, or readers occupy the disk space.
         FullError
-            When the disk has no room.
+            If the disk is full.
         TooLargeError
-            When the level needs more memory, bytes or time than one may have.
+            If the level needs more memory, bytes or time than allowed.
         ClientDisconnect
-            When the client has gone.
+            If the client has disconnected.
         LodestreamError
-            As decoding and writing do.
+            From decoding and writing.
         """
         return await _while_there(request, self.take(key, caller))
 
     async def take(self, key: Key, caller: str) -> Loan:
-        """The same for somebody who stays."""
+        """Like `borrow`, for a caller that does not disconnect."""
         self._check_caller(caller)
         self._callers[caller] += 1
         try:
@@ -184,7 +181,7 @@ class LevelQueue:
         return Loan(lease, partial(self._gave_back, caller, lease.size))
 
     async def close(self) -> None:
-        """Kill what is under way, and remove the files."""
+        """Kill the process that makes a level, and remove the files."""
         self._closing = True
         if self._working is not None:
             task = self._working[1]
@@ -199,7 +196,7 @@ class LevelQueue:
         await asyncio.to_thread(self._files.close)
 
     def forget(self, container: str) -> None:
-        """Remove the files of a container that is gone."""
+        """Remove the files of a deleted container."""
         self._files.forget(container)
         for key, job in self._jobs.items():
             if key.container == container:

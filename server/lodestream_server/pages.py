@@ -34,7 +34,7 @@ lodestream pull URL out.npy --until-rms 1e-3d
 @readable(router, "/", include_in_schema=False)
 @needs(None)
 async def home() -> Response:
-    """What this is, for whoever opens it in a browser."""
+    """A start page for browsers."""
     return html_page("Lodestream", _HOME)
 
 
@@ -71,9 +71,9 @@ async def healthz() -> Response:
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Say whether the kernels are compiled; before that the server works, but the first build waits for them.
+    """Whether the kernels are compiled. Before that the server works, but the first build waits for them.
 
-    ``confinement`` is what the kernel holds builds to: ``landlock+seccomp``, one of the two, or ``none``.
+    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``.
     """
     confinement = parts.builder.confinement
     if parts.builder.ready:
@@ -90,7 +90,7 @@ async def readyz(parts: Parts) -> Response:
 )
 @needs("admin")
 async def metrics(parts: Parts) -> Response:
-    """What the server has counted and measured since it started."""
+    """All metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
 
 

@@ -1,4 +1,4 @@
-"""Errors as answers: one table from classes to statuses, and problem documents (RFC 9457) made from it."""
+"""Errors as HTTP answers: one table from exception classes to statuses, and problem documents (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -65,59 +65,59 @@ class BuildFailedError(LodestreamError):
 
 
 class PostponedError(LodestreamError):
-    """The surface could not be built for a reason that may pass, and waits."""
+    """The surface could not be built for a reason that may pass; it waits for a retry."""
 
 
 class MissingError(LodestreamError):
-    """What the server has promised to keep is not on its disk now."""
+    """Data that the server should have are not on its disk now."""
 
     headers: ClassVar = {"retry-after": "60"}
 
 
 class NotOwnerError(LodestreamError):
-    """The surface is somebody else's."""
+    """The surface belongs to another owner."""
 
 
 class SlowUploadError(LodestreamError):
-    """Nothing, or too little, came of an upload for too long."""
+    """An upload was too slow, or stopped."""
 
 
 class NoTokenError(LodestreamError):
-    """A token is needed, and none came."""
+    """A token is needed, and there is none."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream"'}
 
 
 class BadTokenError(LodestreamError):
-    """A token came that is not known, or no longer."""
+    """The token is unknown, expired or revoked."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="invalid_token"'}
 
 
 class SmallScopeError(LodestreamError):
-    """A token came that does not allow this."""
+    """The token's scope does not allow this."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="insufficient_scope"'}
 
 
 class ForeignOriginError(LodestreamError):
-    """The page of another site asks."""
+    """A page of another site made the request."""
 
 
 class TooManyError(LodestreamError):
-    """One client has as much at the same time as it may."""
+    """One client has as much in progress as allowed."""
 
     headers: ClassVar = {"retry-after": "5"}
 
 
 class BusyError(LodestreamError):
-    """The server has as much at the same time as it can."""
+    """The server has as much in progress as it can handle."""
 
     headers: ClassVar = {"retry-after": "10"}
 
 
 class RestartingError(LodestreamError):
-    """The server ends, and will be back."""
+    """The server is ending and will be back."""
 
     headers: ClassVar = {"retry-after": "5"}
 
@@ -184,7 +184,7 @@ def install(app: FastAPI) -> None:
 
 
 def problem(error: Exception) -> tuple[int, str, str, str]:
-    """Status, code, title and detail for an error; an unforeseen one tells nothing of the server's inside."""
+    """Status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
     for kind, answer in _ANSWERS:
         if isinstance(error, kind):
             return answer.status, answer.code, answer.title, str(error)
@@ -194,7 +194,7 @@ def problem(error: Exception) -> tuple[int, str, str, str]:
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What OpenAPI says of routes that answer with these problems."""
+    """OpenAPI responses of routes that answer with these problems."""
     return {
         status: {
             "description": http.HTTPStatus(status).phrase,

@@ -1,8 +1,8 @@
-"""Putting a folder in order after `fsck` has found damage.
+"""Repairing a folder in which `fsck` has found damage.
 
-What is damaged is set aside, never deleted. A container is built again from its upload, a record is taken from the copy
-beside the upload. Where the upload itself is damaged, its surface is served as long as its container is whole. Then the
-folder is looked through again, and only what is found no more counts as repaired.
+Damaged files are moved away, never deleted. Containers are built again from their uploads, records are restored from
+the copies beside the uploads. If an upload is damaged, its surface is served as long as its container is sound. Then
+the folder is checked again; only what this check does not find any more counts as repaired.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ __all__ = ["compare", "rebuild", "set_aside"]
 
 
 def set_aside(report: Report) -> None:
-    """Move what is damaged out of the way, and write records that are true of what remains.
+    """Move damaged files away, and write records that match what remains.
 
-    `rebuild` has to follow, or a server's start: what lacks its container is built again then, and what no record
-    speaks of is adopted or set aside.
+    `rebuild` or a server start must follow: it builds missing containers, and adopts or moves away what no record
+    refers to.
 
     Raises
     ------
     OSError
-        When something cannot be moved or written; what was not done stays as it was.
+        If something cannot be moved or written; the rest stays as it was.
     """
     at = Folders(report.folder)
     # Records first: those of an upload that is moved away are told so, whichever of them were lost.
@@ -46,23 +46,22 @@ def set_aside(report: Report) -> None:
 
 
 async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> dict[str, Record]:
-    """Build every surface that is queued, as a server would; the records of all surfaces after that.
+    """Build all queued surfaces, as a server would; returns the records of all surfaces after that.
 
-    Those for which there is no room on the disk stay in the queue.
+    Builds for which there is no disk space stay in the queue.
 
     Parameters
     ----------
-    folder : Path
-    settings : Settings
+    folder : Path settings : Settings
     retry : bool
-        Those that wait for another attempt as well.
+        Whether to build waiting surfaces too.
 
     Raises
     ------
     LodestreamError
-        When another process works in the folder, or not all of it is there.
+        If another process uses the folder, or it is not complete.
     OSError
-        When it cannot be read or written.
+        If it cannot be read or written.
     """
     storage = await asyncio.to_thread(Storage, folder)
     try:
@@ -77,16 +76,16 @@ async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> d
 
 
 def compare(report: Report, again: Report, records: dict[str, Record]) -> None:
-    """Say of each finding what became of it, and add those that only the second look found.
+    """Record what became of each finding, and add findings that only the second check made.
 
     Parameters
     ----------
     report : Report
-        Of the first look; changed.
+        The first check; changed.
     again : Report
-        Of the look after everything was done.
+        The check after the repair.
     records : dict of Record
-        What `rebuild` gave.
+        The result of `rebuild`.
     """
     left = {finding.key: finding for finding in again.findings}
     for number, finding in enumerate(report.findings):

@@ -1,7 +1,7 @@
-"""The WebSocket route: a loop that moves bytes between a socket, a file and a `Sender`.
+"""The WebSocket route: moves bytes between a socket, a file and a `Sender`.
 
-A receiving task runs beside the sending one, so that a `stop` or a lost peer is noticed at once, whatever the other is
-doing. Every wait has an end.
+A receiving task runs beside the sending one, so that a `stop` or a lost client is noticed at once. Every wait has a
+time limit.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _token(message: bytes) -> str | None:
 
 
 class _SilentError(LodestreamError):
-    """The client said nothing, or took nothing, for too long."""
+    """The client sent nothing, or did not read, for too long."""
 
 
 class _Session:
