@@ -82,15 +82,15 @@ class Access:
         self._tokens = Tokens(settings.tokens)
         if not (settings.insecure or self._tokens.used or is_loopback(settings.host)):
             raise LodestreamError(
-                f"expected a token, since others can reach {settings.host}, and there is none in {settings.tokens}: "
-                "make one with `lodestream token create`, or serve everything to everybody with --insecure"
+                f"expected a token in {settings.tokens}, since others can reach {settings.host}, got none; create one "
+                "with `lodestream token create`, or allow everything to everybody with --insecure"
             )
 
         anywhere = _ANY_SITE & set(settings.origins)
         if anywhere and not self._tokens.used:
             raise LodestreamError(
-                f"expected a token, since LODESTREAM_ORIGINS={min(anywhere)} lets the pages of all sites in, and there "
-                f"is none in {settings.tokens}: make one with `lodestream token create`, or name the sites"
+                f"expected a token in {settings.tokens}, since LODESTREAM_ORIGINS={min(anywhere)} allows the pages of "
+                "all sites, got none; create one with `lodestream token create`, or name the sites"
             )
 
     @property
@@ -110,7 +110,7 @@ class Access:
             named = self._settings.origins
             if origin not in named and "*" not in named and not _is_own(origin, connection):
                 raise ForeignOriginError(
-                    f"expected a page of this server or of its origins to ask, got {origin[:80]!a}"
+                    f"expected the origin of this server or one of its setting origins, got {origin[:80]!a}"
                 )
 
     def authorize(self, connection: HTTPConnection, scope: str) -> Caller:
@@ -129,7 +129,7 @@ class Access:
             return self._holder(text, scope)
         hindrance = self._hindrance(connection, scope)
         if hindrance is not None:
-            raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none, and {hindrance}")
+            raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none; {hindrance}")
         return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
@@ -154,7 +154,7 @@ class Access:
             If there is no token, it is not known, or it does not allow reading.
         """
         if text is None or not self._tokens.used:
-            raise NoTokenError("expected a token with the handshake or in open as the first message, got neither")
+            raise NoTokenError("expected a token in the handshake or in open as the first message, got neither")
         return self._holder(text, "read")
 
     def check(self, caller: Caller) -> None:
@@ -171,9 +171,9 @@ class Access:
     def _holder(self, text: str, scope: str) -> Caller:
         token = self._tokens.find(text)
         if token is None:
-            raise BadTokenError("expected a token that this server knows, got one that it does not, or no longer")
+            raise BadTokenError("expected a valid token, got one that is unknown, expired or revoked")
         if not token.allows(scope):
-            raise SmallScopeError(f"expected a token that allows to {scope}, got one for {', '.join(token.scopes)}")
+            raise SmallScopeError(f"expected a token with the scope {scope}, got one with {', '.join(token.scopes)}")
         return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
     def _hindrance(self, connection: HTTPConnection, scope: str) -> str | None:
@@ -181,7 +181,7 @@ class Access:
         if scope == "read" and self._settings.public_reads:
             return None
         if self._tokens.used:
-            return f"this server wants one from whoever wants to {scope}"
+            return f"this server needs one for the scope {scope}"
         if self._settings.insecure:
             return None
         return next(_signs_of_others(connection, self._settings), None)

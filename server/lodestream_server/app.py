@@ -32,7 +32,7 @@ __all__ = ["create_app"]
 _DESCRIPTION = """Structured surfaces, coarsest level first.
 
 Upload a surface, wait until it is ready, stream it: `WS /v1/surfaces/{id}/stream`, subprotocol `lodestream.v1`,
-MessagePack messages, described in `docs/protocol.md`. Errors are problem documents (RFC 9457)."""
+MessagePack messages, see `docs/protocol.md`. Errors are problem documents (RFC 9457)."""
 
 
 # What levels take of the disk where the settings say nothing, unless the disk is small.

@@ -96,12 +96,12 @@ class CountedConnection(h11.Connection):
         if event.chunk_start:
             self.chunks += 1
             if not self._allowed.take():
-                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on the whole, got smaller ones")
+                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on average, got smaller ones")
             if self._came > 2 * self._taken + _FRAMING:
                 self._refuse(
-                    f"less around chunks than in them, got {self._came} bytes with {self._taken} bytes of body"
+                    f"less framing than data in a chunked body, got {self._came} bytes with {self._taken} bytes of data"
                 )
 
     def _refuse(self, words: str) -> None:
-        self.offence = f"expected {words}; send larger chunks, or the length of the body with it"
+        self.offence = f"expected {words}; send larger chunks, or Content-Length"
         raise h11.RemoteProtocolError(self.offence)

@@ -138,7 +138,7 @@ class Containers:
             if taken + size > self._most:
                 raise BusyError(
                     f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
-                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; come back soon"
+                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; try again soon"
                 )
             self._coming += size
         try:

@@ -35,7 +35,7 @@ def tell(storage: Storage, sha256: str, error: StreamError) -> None:
     more = f" and {len(surfaces) - _MOST_NAMES} more" if len(surfaces) > _MOST_NAMES else ""
     event(
         _log,
-        f"{storage.place_of(sha256)} is damaged, the container of surface {named}{more}: stop the server and run "
+        f"{storage.place_of(sha256)}, the container of surface {named}{more}, is damaged: stop the server and run "
         f"lodestream fsck --repair {storage.root}, which builds it again from its upload",
         logging.ERROR,
         problem=str(error),

@@ -157,7 +157,7 @@ def discard(path: Path) -> None:
     try:
         remove(path)
     except OSError as error:
-        _log.warning("%s is not needed any more, and could not be removed: %s", path, error.strerror or error)
+        _log.warning("%s is no longer needed, but could not be removed: %s", path, error.strerror or error)
 
 
 def sync_folder(path: Path) -> None:

@@ -71,23 +71,23 @@ UPLOAD: dict[str, Any] = {
         for name, description, values, example in (
             (
                 "precision",
-                "greatest error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P is for "
-                "the attribute NAME; may be repeated",
+                "maximum error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P sets it "
+                "for the attribute NAME; may be repeated",
                 None,
                 "1e-4d",
             ),
             (
                 "rms",
-                "root mean square error, in the same words: the shortest stream that has it at most, made for nothing "
-                "else; not beside a precision of the points",
+                "encode for this root mean square error, in the same notation; cannot be combined with a precision of "
+                "the points",
                 None,
                 "1e-3d",
             ),
-            ("closed", "axes that wrap", ["auto", "none", "rows", "cols", "both"], None),
-            ("name", "what to call the surface", None, "Jacksboro"),
-            ("filename", "name of a raw body's file", None, "jacksboro.npy"),
-            ("array", "of an NPZ file: name of the array", None, None),
-            ("band", "of a GeoTIFF file: number of the band", None, None),
+            ("closed", "closed axes", ["auto", "none", "rows", "cols", "both"], None),
+            ("name", "name of the surface", None, "Jacksboro"),
+            ("filename", "name of the file of a raw body", None, "jacksboro.npy"),
+            ("array", "NPZ: name of the array", None, None),
+            ("band", "GeoTIFF: number of the band", None, None),
         )
     ],
     "requestBody": {

@@ -139,7 +139,7 @@ class _File(FileResponse):
             if not complete:
                 raise
             # The connection would be cut, perhaps with the client's next request on it.
-            _log.warning("%s was sent, and could not be closed: %s", self.path, error.strerror or error)
+            _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
 
 
 class _Borrowed(_File):
@@ -172,12 +172,12 @@ def ready(parts: State, surface: str) -> Record:
     if record.state == "failed":
         raise BuildFailedError(f"{surface} could not be built: {record.reason}")
     if record.state == "waiting":
-        raise PostponedError(f"{surface} could not be built and waits for another attempt: {record.reason}")
+        raise PostponedError(f"{surface} could not be built and waits for a retry: {record.reason}")
     if record.state == "missing":
-        raise MissingError(f"expected {surface} on the server's disk: {record.reason}")
+        raise MissingError(f"{surface} is not on the server's disk now: {record.reason}")
     if record.state != "ready":
         state, progress = parts.builder.state(record)
-        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); come back soon")
+        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); try again soon")
     return record
 
 

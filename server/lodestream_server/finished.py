@@ -77,10 +77,7 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
     if len(files) > 1:
         raise FormatError(f"expected a container by itself, got it among {len(files)} files")
     for option in options:
-        raise OptionError(
-            "expected no option but name and filename with a container, which says all else itself, "
-            f"got {option[:80]!a}"
-        )
+        raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
     _check_metadata(files[0])
     return Format("lode", (".lode",), lambda head, suffix: False)
 
@@ -164,5 +161,5 @@ def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
         told: dict[str, Any] = plain(info)
         json.dumps(told, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise CorruptStreamError(f"expected metadata that JSON can tell: {error}"[:300], place.offset) from None
+        raise CorruptStreamError(f"expected metadata that JSON can express: {error}"[:300], place.offset) from None
     return told

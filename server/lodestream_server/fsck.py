@@ -205,7 +205,7 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
         # Where its bytes are not those of its name, that is what the text says.
         yield Finding("version" if index == other_version(path) else "container", path, record.id, index)
     elif figures_of(index, record.info, at.files(record)) != record.info:
-        problem = "expected the figures that the container has, got others"
+        problem = "expected the description that the container gives, got another"
         yield Finding("figures", at.record(record.id), record.id, problem)
 
 
@@ -270,13 +270,17 @@ def _strays(at: Folders, report: Report) -> Iterator[Finding]:
             if record.id not in deleted and not is_file(at.record(record.id)):
                 yield Finding("record", at.record(record.id), record.id, "expected a record, got none")
         if not (owned or unusable or upload.name in folders):
-            yield Finding("leftover", upload, None, "expected what a record refers to, got something else")
+            yield Finding(
+                "leftover", upload, None, "expected a file that a record refers to, got one that no record refers to"
+            )
     for container in () if unusable else stray_containers(at, report.records.values()):
-        yield Finding("leftover", container, None, "expected what a record refers to, got something else")
+        yield Finding(
+            "leftover", container, None, "expected a file that a record refers to, got one that no record refers to"
+        )
     for path in at.tombstones():
         yield Finding("leftover", path, path.stem, "expected no surface that is still being deleted, got one")
     for path in at.unfinished():
         yield Finding("leftover", path, None, "expected a record, got a file that was being written")
     for folder in (at.incoming, at.work, at.levels):
         for path in sorted(folder.iterdir()) if is_folder(folder) else ():
-            yield Finding("leftover", path, None, "expected nothing under way, got something")
+            yield Finding("leftover", path, None, "expected no unfinished uploads, builds or levels, got one")

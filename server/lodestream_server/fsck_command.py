@@ -144,7 +144,7 @@ def _print(report: Report, waiting: Sequence[Record]) -> None:
     problems = "nothing is damaged" if not found else f"{found} damaged"
     problems += f", {repaired} of these repaired" if repaired else ""
     problems += f", {lost} lost" if lost else ""
-    problems += f", {len(waiting)} surfaces wait for another attempt" if waiting else ""
+    problems += f", {len(waiting)} surfaces wait for a retry" if waiting else ""
     others = sum(finding.what == "version" and finding.repair is None for finding in report.findings)
     problems += f", {others} of another version, which the next start builds again" if others else ""
     leftovers = sum(finding.what == "leftover" for finding in report.findings)

@@ -90,7 +90,7 @@ class _LaterError(Exception):
     def of(cls, number: int | None) -> _LaterError:
         """What stands behind an error of the system."""
         return cls(
-            "room on the server's disk" if number in _ROOM else f"the server's system ({os.strerror(number or 0)})"
+            "space on the server's disk" if number in _ROOM else f"the server's system ({os.strerror(number or 0)})"
         )
 
 
@@ -305,8 +305,8 @@ class Builder:
             _log.info("builds are confined by landlock and seccomp")
         else:
             _log.warning(
-                "builds are not confined as they should be: the kernel has %s, of landlock and seccomp; whatever takes "
-                "a reader over can do what this server can",
+                "builds are not fully confined: of landlock and seccomp the kernel has %s; a file that exploits its "
+                "reader has all rights of this server",
                 "neither" if held == "none" else f"only {held}",
             )
         if problem is None:
@@ -336,8 +336,8 @@ class Builder:
                 delay = min(2 * delay, _LONGEST_DELAY)
                 continue
             except Exception:
-                _log.exception("the build of %s failed for a reason that nobody foresaw", record.id)
-                state = await self._postpone(record, "the build failed inside")
+                _log.exception("the build of %s failed unexpectedly", record.id)
+                state = await self._postpone(record, "the build failed with an internal error")
             if self._finished is not None:
                 self._finished(state, time.monotonic() - started)
             return
@@ -378,7 +378,7 @@ class Builder:
             try:
                 await self._check_owner(record.owner)
             except FullError as error:
-                raise _LaterError(f"the room of its owner: {error}") from None
+                raise _LaterError(f"disk space of its owner: {error}") from None
 
     async def _attempt(self, record: Record) -> State:
         folder = self._storage.work_folder(record.id)
@@ -410,8 +410,8 @@ class Builder:
         except UnforeseenError as error:
             if error.errno in _PASSING:
                 raise _LaterError.of(error.errno) from None
-            _log.error("a build failed for a reason that nobody foresaw: %s", error.traceback)
-            return worker.Refused(f"the build failed inside: {error.kind}", final=False)
+            _log.error("a build failed unexpectedly: %s", error.traceback)
+            return worker.Refused(f"the build failed with an internal error: {error.kind}", final=False)
         except OSError as error:
             # No folder could be made, or no process started.
             return _not_now(error)
@@ -435,7 +435,7 @@ class Builder:
         if problem is not None:
             return await self._postpone(record, problem)
         if record.info is not None:
-            return await self._postpone(record, f"it was ready, and cannot be built again: {reason}")
+            return await self._postpone(record, f"it was ready before, and cannot be built again: {reason}")
         _log.info("%s failed: %s", record.id, reason)
         await asyncio.to_thread(self._storage.failed, record.id, reason)
         return "failed"
@@ -446,15 +446,15 @@ class Builder:
             problem = await asyncio.to_thread(check_upload, self._storage.upload_files(record), record)
         except OSError as error:
             problem = error.strerror
-        return None if problem is None else f"the upload cannot be read as it came: {problem}"
+        return None if problem is None else f"the upload is damaged or cannot be read: {problem}"
 
     async def _postpone(self, record: Record, reason: str) -> State:
-        _log.warning("%s waits for somebody to try again: %s", record.id, reason)
+        _log.warning("%s waits for a retry: %s", record.id, reason)
         await asyncio.to_thread(self._storage.postpone, record.id, reason)
         return "waiting"
 
     def _out_of_memory(self) -> str:
-        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
+        return f"the build needed more memory than its share, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
 
     def _job(self, record: Record, folder: Path) -> worker.Job:
         options = dict(record.options)

@@ -190,7 +190,7 @@ class LevelQueue:
                 await task
         for job in self._jobs.values():
             if not job.done.done():
-                job.done.set_exception(RestartingError("expected a level before the server ended; ask again"))
+                job.done.set_exception(RestartingError("the server ended before the level was made; ask again"))
                 job.done.exception()
         await asyncio.to_thread(self._pool.close)
         await asyncio.to_thread(self._files.close)
@@ -206,8 +206,8 @@ class LevelQueue:
         most = self._settings.max_client_level_requests
         if self._callers[caller] >= most:
             raise TooManyError(
-                f"expected at most {most} requests for levels of one client at the same time, those included of which "
-                "the answer is on the way; come back when some are done"
+                f"expected at most {most} requests for levels of one client at the same time, including answers that "
+                "are still being sent; try again when some are done"
             )
         self._check_bytes(caller)
 
@@ -215,7 +215,7 @@ class LevelQueue:
         # So that one client that reads slowly leaves room for the others.
         if self._lent[caller] >= self._files.most // 4:
             raise TooManyError(
-                f"expected less than {self._files.most // 4} bytes of levels on the way to one client, got "
+                f"expected less than {self._files.most // 4} bytes of levels that one client is reading, got "
                 f"{self._lent[caller]}; read them first"
             )
 
@@ -232,7 +232,7 @@ class LevelQueue:
     async def _wait(self, key: Key, caller: str) -> Lease:
         most = self._settings.max_level_requests
         if self._waiting >= most:
-            raise BusyError(f"expected at most {most} requests for levels at the same time; come back soon")
+            raise BusyError(f"expected at most {most} requests for levels at the same time; try again soon")
         job = self._jobs.get(key)
         if job is None:
             job = self._jobs[key] = _Job(key)
@@ -299,7 +299,7 @@ class LevelQueue:
     def _worked(self, task: asyncio.Task[None]) -> None:
         self._working = None
         if not task.cancelled() and task.exception() is not None:
-            _log.error("a level could not be made for a reason that nobody foresaw", exc_info=task.exception())
+            _log.error("making a level failed unexpectedly", exc_info=task.exception())
         self._go_on()
 
     async def _work(self, job: _Job) -> None:
@@ -339,7 +339,7 @@ class LevelQueue:
             except (ProcessDiedError, _ReplacedError) as error:
                 _log.warning("level %d of %s: %s", key.level, key.container, error)
                 await asyncio.to_thread(_empty, wanted.folder)
-        raise BusyError("the process that made the level was ended, or its container replaced; come back soon")
+        raise BusyError("the process that made the level was killed, or its container was replaced; try again soon")
 
     async def _run(self, wanted: LevelJob, key: Key) -> int:
         advice = "ask for a coarser level, or stream the surface"
@@ -359,11 +359,11 @@ class LevelQueue:
                 raise self._no_room(0) from None
             if error.errno == errno.EACCES and os.access(wanted.container, os.R_OK):
                 raise _ReplacedError("its container was deleted and built again meanwhile") from None
-            _log.error("a level could not be made for a reason that nobody foresaw: %s", error.traceback)
+            _log.error("making a level failed unexpectedly: %s", error.traceback)
             raise
         except OSError as error:
             # No process could be started.
-            raise BusyError(f"the server's system lacks what a process needs: {error.strerror}") from error
+            raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
         if isinstance(made, MadeLevel):
             return await asyncio.to_thread(_checked_size, wanted, made)
         if made.kind == TooLargeError.__name__:
@@ -378,10 +378,11 @@ class LevelQueue:
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.
         if 2 * most + self._files.size + _LEAST_ROOM >= self._files.most:
-            return BusyError(f"expected room for a level, got {most} bytes beside those that others read; come back")
-        return FullError(
-            f"expected room on the disk for a level, got {most} bytes; remove surfaces or enlarge the disk"
-        )
+            return BusyError(
+                f"expected disk space for a level, got {most} bytes beside files that others are reading; try again "
+                "soon"
+            )
+        return FullError(f"expected disk space for a level, got {most} bytes; delete surfaces or enlarge the disk")
 
 
 def _allowed(wanted: LevelJob, memory: int) -> Allowed:

@@ -94,7 +94,7 @@ class Limits:
         """
         most, most_each = self._settings.max_streams, self._settings.max_client_streams
         if self._streams.total() >= most:
-            raise BusyError(f"expected at most {most} streams at the same time; come back in a few seconds")
+            raise BusyError(f"expected at most {most} streams at the same time; try again in a few seconds")
         if self._streams[client] >= most_each:
             raise TooManyError(f"expected at most {most_each} streams of one client at the same time; end one of them")
         self._streams[client] += 1
@@ -121,11 +121,13 @@ class Limits:
         """
         most, there, own = self._settings.max_streams, self._openings.total(), self._openings[client]
         if there >= most:
-            raise BusyError(f"expected at most {most} connections that show no token yet; come back in a few seconds")
+            raise BusyError(
+                f"expected at most {most} connections that have not sent a token yet; try again in a few seconds"
+            )
         if own >= most - there:
             raise TooManyError(
-                f"expected no more connections of one address that show no token yet than are left to others, "
-                f"got {own} and {most - there} left of {most}"
+                f"expected one address to leave as many connections without a token to others as it has, got {own}, "
+                f"with {most - there} of {most} left"
             )
         self._openings[client] += 1
         try:
@@ -151,7 +153,7 @@ class Limits:
         RestartingError
             If the server ends meanwhile.
         """
-        self._check_share("uploads at the same time", self._settings.max_uploads, self._count(caller.key), caller)
+        self._check_share("uploads in progress", self._settings.max_uploads, self._count(caller.key), caller)
         if stored:
             self.check_builds(caller)
             self._check_surfaces()
@@ -189,7 +191,7 @@ class Limits:
         BusyError, TooManyError
             If the server, or the caller, has as many as allowed.
         """
-        self._check_share("builds to do", self._settings.max_builds, self._builds(caller.key), caller)
+        self._check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
 
     async def check_disk(self, caller: Caller, *, new: bool) -> None:
         """Check that everything that a caller has announced fits on the disk.
@@ -211,8 +213,8 @@ class Limits:
         promised = self._promised[caller.key]
         if free < promised:
             raise FullError(
-                f"expected room for the upload beside the {kept} bytes that stay free on the server's disk, got "
-                f"{max(free, 0)} bytes for all uploads of {caller.name}; remove surfaces or enlarge the disk"
+                f"expected disk space for the upload beside the {kept} bytes that the server keeps free, got "
+                f"{max(free, 0)} bytes for all uploads of {caller.name}; delete surfaces or enlarge the disk"
             )
         if new:
             self._check_bytes(caller.owner, free, promised)
@@ -240,12 +242,12 @@ class Limits:
         if most is None:
             if self._alone():
                 return
-            most, why = (has + free) // 2, ", half of what they have there and what is free"
+            most, why = (has + free) // 2, ", half of what they use there plus what is free"
         if has + promised > most:
             whose = "those without a token" if owner is None else owner
             raise FullError(
                 f"expected at most {most} bytes of {whose} on the server's disk{why}, got {has} bytes and {promised} "
-                "to come; remove some of their surfaces"
+                "to come; delete some of their surfaces"
             )
 
     def took(self, room: _Room, size: int) -> None:
@@ -263,17 +265,17 @@ class Limits:
     def _check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
         everybody, own = there
         if everybody >= most:
-            raise BusyError(f"expected at most {most} {what} on this server, and there are as many; come back soon")
+            raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
         if own >= most - everybody and not self._alone():
             raise TooManyError(
-                f"expected no more {what} of {caller.name} than are left to others, got {own} of theirs and "
-                f"{most - everybody} left of {most}; come back when some of theirs are done"
+                f"expected {caller.name} to leave as many {what} to others as they have, got {own}, with "
+                f"{most - everybody} of {most} left; try again when some are done"
             )
 
     def _check_surfaces(self) -> None:
         most = self._settings.max_surfaces
         if self._surfaces() >= most:
-            raise FullError(f"expected at most {most} surfaces on this server; remove some of them")
+            raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
 
 
 class _Room:

@@ -156,7 +156,10 @@ class _Patient(logging.Handler):
                     continue
                 self._idle.clear()
             if self._lost:
-                line, self._lost = f"{self._lost} lines of the log were lost, since nobody took them\n{line}", 0
+                line, self._lost = (
+                    f"{self._lost} log lines were dropped, because the reader of the log was too slow\n{line}",
+                    0,
+                )
             data = f"{line}\n".encode("utf-8", "backslashreplace")
             try:
                 # Not through Python's own stream, whose lock would be held when the process ends.

@@ -47,8 +47,8 @@ def establish(at: Folders) -> str:
     problem = fault(at)
     if problem is not None:
         raise LodestreamError(
-            f"{problem}. Is a disk not mounted? Nothing was changed. Where the folders were moved here on purpose, "
-            f"`lodestream fsck --adopt {at.root}` says that they belong together"
+            f"{problem}. Is a disk not mounted? Nothing was changed. If the folders were moved here on purpose, run "
+            f"`lodestream fsck --adopt {at.root}`"
         )
     found = identity(at.records)
     if marking is None and found is not None and all(identity(folder) for folder in at.kept):
@@ -108,13 +108,15 @@ def _fault_of_unmarked(at: Folders) -> str | None:
         if any(at.tombstones()) or not (has_uploads or has_containers):
             return None
         there = " and ".join(name for name, has in (("uploads/", has_uploads), ("containers/", has_containers)) if has)
-        return f"expected records in records/ of {at.root}, which has no marker yet, got none beside what is in {there}"
+        return (
+            f"expected records in records/ of {at.root}, which has no marker yet, got none although there are {there}"
+        )
     needed = _needed(at)
     for folder, has in ((at.uploads, has_uploads), (at.containers, has_containers)):
         if folder in needed and not has:
             return (
-                f"expected in {folder.name}/ of {at.root}, which has no marker yet, what {needed[folder]} of its "
-                "records speak of, got nothing"
+                f"expected in {folder.name}/ of {at.root}, which has no marker yet, the files that {needed[folder]} of "
+                "its records refer to, got none"
             )
     return None
 

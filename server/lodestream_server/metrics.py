@@ -34,28 +34,34 @@ class Metrics:
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         self._requests = self._counter("requests", "HTTP requests answered", "method", "route", "status")
-        self._request_seconds = self._histogram("request_seconds", "from a request to the end of its answer", _SECONDS)
-        self._errors = self._counter("errors", "requests and streams refused or failed, by kind", "kind")
+        self._request_seconds = self._histogram(
+            "request_seconds", "time from a request to the end of its answer", _SECONDS
+        )
+        self._errors = self._counter("errors", "refused or failed requests and streams, by kind", "kind")
         self._streams_open = Gauge("lodestream_streams_open", "streams open now", registry=self._registry)
-        self._streams = self._counter("streams", "streams ended, by how", "result")
+        self._streams = self._counter("streams", "ended streams, by result", "result")
         self._first_surface = self._histogram(
-            "first_surface_seconds", "from the open of a stream to the first drawable surface being sent", _SECONDS
+            "first_surface_seconds",
+            "time from the open of a stream until the first drawable surface was sent",
+            _SECONDS,
         )
         self._sent = self._counter("stream_bytes", "bytes of containers sent in streams")
         self._saved = self._counter(
             "stream_saved_bytes",
-            "bytes of surfaces that clients did not hold and were not sent, since they had seen enough",
+            "bytes that were not sent because the target was met or the client stopped, without those it held",
         )
         self._uploaded = self._counter("upload_bytes", "bytes of uploads received")
         self._build_seconds = self._histogram(
-            "build_seconds", "duration of builds, by what became of them", _BUILD_SECONDS, "state"
+            "build_seconds", "duration of builds, by resulting state", _BUILD_SECONDS, "state"
         )
 
     def watch(self, folder: Path, surfaces: Callable[[], int], builds: Callable[[], int]) -> None:
         """Set the sources of gauges: the disk of a folder, the number of surfaces, the number of builds."""
         self._gauge("surfaces", "surfaces in the data folder", surfaces)
         self._gauge("builds_pending", "builds that wait or run", builds)
-        self._gauge("disk_free_bytes", "free space where the data lies", lambda: shutil.disk_usage(folder).free)
+        self._gauge(
+            "disk_free_bytes", "free space on the disk of the data folder", lambda: shutil.disk_usage(folder).free
+        )
 
     def answered(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count an HTTP request that was answered."""

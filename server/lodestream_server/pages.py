@@ -18,10 +18,10 @@ __all__ = ["router"]
 router = APIRouter(tags=["server"])
 
 _HOME = f"""<h1>Lodestream {lodestream.__version__}</h1>
-<p>This server sends structured surfaces over the network, coarsest level first. The error is known at every moment.</p>
+<p>This server streams structured surfaces, coarsest level first. The error is known at each step.</p>
 <pre>
 lodestream push surface.npy HOST      upload
-lodestream list HOST                  what is here
+lodestream list HOST                  list the surfaces
 lodestream pull URL out.npy --until-rms 1e-3d
 </pre>
 <ul>

@@ -57,16 +57,18 @@ def tighten(folder: Path, known: Collection[str]) -> None:
     if not mode & _OTHERS:
         return
     strange = sorted(name for name in os.listdir(folder) if name not in known)
-    reason = f"it holds {strange[0]!a}, which is not ours" if strange else None
+    reason = f"it contains {strange[0]!a}, which is not a file of Lodestream" if strange else None
     if reason is None:
         try:
             folder.chmod(mode & ~_OTHERS)
         except OSError as error:
             reason = error.strerror
     if reason is None:
-        _log.info("%s was open to others (mode %03o) and is its owner's alone now", folder, mode)
+        _log.info("removed the rights of other users to %s (mode %03o)", folder, mode)
     else:
-        _log.warning("others can look into %s (mode %03o), which stays so (%s): chmod 700 it", folder, mode, reason)
+        _log.warning(
+            "other users have access to %s (mode %03o), which was not changed (%s): run chmod 700", folder, mode, reason
+        )
 
 
 def check_writable(*folders: Path) -> None:

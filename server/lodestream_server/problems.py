@@ -138,25 +138,25 @@ class _Answer:
 #: The first row whose class fits says what is answered. The codes of streams (`lodestream.messages.CODES`) are the same
 #: words where they mean the same.
 _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
-    (TooLargeError, _Answer(413, "too-large", "More than is allowed")),
-    (OptionError, _Answer(422, "bad-option", "An option that does not exist, or a value that it does not take")),
-    (FormatError, _Answer(422, "bad-file", "Not a file of a structured surface")),
-    (InputError, _Answer(422, "bad-input", "Input that cannot be used")),
-    (UnavailableError, _Answer(501, "unavailable", "This server lacks what that needs")),
+    (TooLargeError, _Answer(413, "too-large", "The request is too large")),
+    (OptionError, _Answer(422, "bad-option", "An option does not exist, or its value is not valid")),
+    (FormatError, _Answer(422, "bad-file", "The file cannot be read as a structured surface")),
+    (InputError, _Answer(422, "bad-input", "The input cannot be used")),
+    (UnavailableError, _Answer(501, "unavailable", "This server lacks a library that this needs")),
     (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
-    (SlowUploadError, _Answer(408, "idle", "Nothing was heard for too long")),
+    (SlowUploadError, _Answer(408, "idle", "The client was too slow")),
     (NoTokenError, _Answer(401, "no-token", "A token is needed")),
-    (BadTokenError, _Answer(403, "bad-token", "A token that is not known, or no longer")),
-    (SmallScopeError, _Answer(403, "small-scope", "A token that does not allow this")),
+    (BadTokenError, _Answer(403, "bad-token", "The token is unknown, expired or revoked")),
+    (SmallScopeError, _Answer(403, "small-scope", "The token's scope does not allow this")),
     (NotOwnerError, _Answer(403, "not-owner", "Only the owner of a surface and an admin may do this")),
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
-    (TooManyError, _Answer(429, "too-many", "More at the same time than one client may have")),
-    (BusyError, _Answer(503, "busy", "As much to do as the server can; come back")),
-    (RestartingError, _Answer(503, "restarting", "The server is restarting; come back")),
-    (FullError, _Answer(507, "full", "There is no room for more")),
+    (TooManyError, _Answer(429, "too-many", "The client has too much in progress")),
+    (BusyError, _Answer(503, "busy", "The server is busy; try again later")),
+    (RestartingError, _Answer(503, "restarting", "The server is restarting; try again")),
+    (FullError, _Answer(507, "full", "There is no space for more")),
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
-    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; ask for another attempt")),
+    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; it waits for a retry")),
     (MissingError, _Answer(503, "missing", "The surface is not on the server's disk now")),
     (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
 )
@@ -189,7 +189,7 @@ def problem(error: Exception) -> tuple[int, str, str, str]:
         if isinstance(error, kind):
             return answer.status, answer.code, answer.title, str(error)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return _FULL.status, _FULL.code, _FULL.title, "nothing was stored; remove surfaces or enlarge the disk"
+        return _FULL.status, _FULL.code, _FULL.title, "nothing was stored; delete surfaces or enlarge the disk"
     return _INTERNAL.status, _INTERNAL.code, _INTERNAL.title, "the server's log says more"
 
 
@@ -224,7 +224,7 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
 
 async def _gone(request: HTTPConnection, error: Exception) -> Response:
     # Nobody is there to read it.
-    return _document(request, 400, "gone", "The client has gone", "the body ended before it was whole", {})
+    return _document(request, 400, "gone", "The client has gone", "the body ended before it was complete", {})
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -255,7 +255,7 @@ async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     places = [(".".join(map(str, item["loc"])), item["msg"]) for item in error.errors()]
     detail = "; ".join(f"{place}: {message}" for place, message in places)
-    return _document(request, 422, "bad-option", "A parameter that cannot be used", detail, {})
+    return _document(request, 422, "bad-option", "A parameter is not valid", detail, {})
 
 
 def _document(

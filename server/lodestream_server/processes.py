@@ -78,7 +78,7 @@ class WrongAnswerError(ProcessDiedError):
 
     def __init__(self, words: str) -> None:
         super().__init__(0)
-        self.args = (f"its process gave an answer that cannot be used: {words}",)
+        self.args = (f"the process gave an invalid answer: {words}",)
 
 
 class UnforeseenError(LodestreamError):

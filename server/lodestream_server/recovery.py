@@ -89,7 +89,7 @@ def present(at: Folders, record: Record) -> Record:
             _log.info("%s is built again: %s", record.id, other)
         return replace(record, state="queued", reason=None)
     if other is not None:
-        return replace(record, state="waiting", reason=f"{other}; its upload is not here to build it again from")
+        return replace(record, state="waiting", reason=f"{other}; its upload is missing, so it cannot be built again")
     if record.state == "missing":  # its record cannot be used, which is the reason
         return record
     reason = "neither its upload nor its container is on the server's disk"
@@ -184,7 +184,7 @@ def _finish(at: Folders, tombstone: Path, records: dict[str, Record], unusable: 
             and all(other.container != record.container for other in others),
         )
     except OSError as error:
-        _log.warning("what is left of %s, which was deleted, could not be removed: %s", record.id, error)
+        _log.warning("the remaining files of %s, which was deleted, could not be removed: %s", record.id, error)
 
 
 def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) -> None:
@@ -194,17 +194,17 @@ def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) ->
             try:
                 record = read_record(path)
             except ValueError as error:
-                _log.warning("%s is no record and is left alone: %s", path, error)
+                _log.warning("%s is not a record and is ignored: %s", path, error)
                 continue
             if record.folder != upload.name or record.id in records or record.id in deleted:
                 continue
             if record.id in unusable:
                 where = set_aside(at, at.record(record.id))
                 _log.warning(
-                    "the record of %s cannot be used (%s) and is now %s", record.id, unusable[record.id], where
+                    "the record of %s cannot be used (%s) and was moved to %s", record.id, unusable[record.id], where
                 )
             write_file(at.record(record.id), serialize(record))
-            _log.warning("%s had no record and has that which lies beside its upload, %s", record.id, path)
+            _log.warning("%s had no record; the copy beside its upload is used: %s", record.id, path)
             records[record.id] = record
 
 
@@ -248,11 +248,11 @@ def _set_strays_aside(at: Folders, records: dict[str, Record]) -> None:
     everything |= {_folder_of(path) for path in at.tombstones()}
     for upload in at.all_uploads():
         if upload.name not in everything and all(record.filenames for record in records.values()):
-            _try_aside(at, upload, "no record speaks of it, and it has none of its own")
+            _try_aside(at, upload, "no record refers to it, and it has no record of its own")
     if any(not record.filenames for record in records.values()):
         return  # it may be that of a record that cannot be used
     for container in stray_containers(at, records.values()):
-        _try_aside(at, container, "no record speaks of it")
+        _try_aside(at, container, "no record refers to it")
 
 
 def _folder_of(tombstone: Path) -> str:
@@ -263,6 +263,6 @@ def _folder_of(tombstone: Path) -> str:
 
 def _try_aside(at: Folders, path: Path, reason: str) -> None:
     try:
-        _log.warning("%s is set aside as %s: %s", path, set_aside(at, path), reason)
+        _log.warning("%s was moved to %s: %s", path, set_aside(at, path), reason)
     except OSError as error:
-        _log.warning("%s could not be set aside (%s) and stays: %s", path, reason, error)
+        _log.warning("%s could not be moved away (%s) and stays: %s", path, reason, error)

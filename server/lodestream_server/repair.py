@@ -102,13 +102,13 @@ def _after(finding: Finding, found_again: bool, record: Record | None) -> Findin
     if found_again:
         missing = record is not None and record.state == "missing"
         why = "" if record is None or not record.reason else f": {record.reason}"
-        done.append("there is nothing to make it again from" if missing else f"still so{why}")
+        done.append("there is nothing to build it from" if missing else f"not repaired{why}")
         return replace(finding, repair="; ".join(done), lost=finding.lost or missing)
     if finding.what == "leftover":
-        return replace(finding, repair="removed, or set aside", repaired=True)
+        return replace(finding, repair="removed, or moved away", repaired=True)
     if record is None or record.state == "ready":
         if finding.what in ("container", "record"):
-            done.append("whole again")
+            done.append("sound again")
         elif finding.what == "version":
             done.append("built again")
         return replace(finding, repair="; ".join(done) or "gone", repaired=True)
@@ -135,11 +135,11 @@ def _record(at: Folders, report: Report, finding: Finding) -> Finding:
     surface = finding.surface or ""
     copy = _copy_of(at, surface)
     if copy is None:
-        return replace(finding, repair="left as it is, since there is no other record of this surface", lost=True)
+        return replace(finding, repair="not changed, because there is no other record of this surface", lost=True)
     words = _move(at, finding.path) if is_file(finding.path) else "written again"
     # A container of the surface may be whole, and is found by the hash that its record would name: it is built again.
     _write(at, report, copy)
-    return replace(finding, repair=f"{words}; that beside the upload was taken")
+    return replace(finding, repair=f"{words}; restored from the copy beside the upload")
 
 
 def _copy_of(at: Folders, surface: str) -> Record | None:
@@ -166,19 +166,19 @@ def _upload(at: Folders, report: Report, finding: Finding) -> Finding:
         for other in others:
             _write(at, report, replace(other, upload_lost=True))
     elif report.records[record.id].upload_lost:
-        words = "set aside, as said above"
+        words = "moved away, see above"
     else:
-        return replace(finding, repair="left as it is, since nothing of it is here: is it elsewhere?")
+        return replace(finding, repair="not changed, because none of its files are here")
     if record.state == "ready" and not any(
         other.what == "container" and other.surface == record.id for other in report.findings
     ):
-        return replace(finding, repair=f"{words}; the container is whole and is served")
+        return replace(finding, repair=f"{words}; the container is sound and is served")
     return replace(finding, repair=words)
 
 
 def _container(at: Folders, report: Report, finding: Finding) -> Finding:
     # Another surface with the same container may have set it aside already.
-    return replace(finding, repair=_move(at, finding.path) if finding.path.exists() else "set aside, or gone")
+    return replace(finding, repair=_move(at, finding.path) if finding.path.exists() else "moved away, or missing")
 
 
 def _figures(at: Folders, report: Report, finding: Finding) -> Finding:
@@ -199,7 +199,7 @@ _ACTIONS: dict[str, Callable[[Folders, Report, Finding], Finding]] = {
 
 
 def _move(at: Folders, path: Path) -> str:
-    return f"set aside as {aside.set_aside(at, path).relative_to(at.root)}"
+    return f"moved to {aside.set_aside(at, path).relative_to(at.root)}"
 
 
 def _write(at: Folders, report: Report, record: Record) -> None:

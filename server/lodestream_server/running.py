@@ -100,7 +100,7 @@ async def _listen(host: str, port: int, backlog: int) -> list[socket.socket]:
         for ours in found:
             ours.close()
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
-        raise LodestreamError(f"expected an address to listen at, got {host} port {port}: {reason}") from None
+        raise LodestreamError(f"cannot listen on {host} port {port}: {reason}") from None
     return found
 
 
@@ -215,9 +215,7 @@ def running_server(data: Path, **settings: Any) -> Iterator[str]:
         if server.refusal is not None:
             raise server.refusal
         if not address:
-            raise LodestreamError(
-                f"expected a server that starts within {_START_SECONDS:g} s; its log says why it did not"
-            )
+            raise LodestreamError(f"the server did not start within {_START_SECONDS:g} s; see its log")
         yield address[0]
     finally:
         server.should_exit = True

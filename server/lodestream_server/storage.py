@@ -174,7 +174,7 @@ class Storage:
             if other is not None:
                 return MissingError(other)
             _log.error("the container %s is not on the disk", sha256)
-            return MissingError(f"expected the container {sha256} on the server's disk, where it is not now")
+            return MissingError(f"the container {sha256} is not on the server's disk now")
         return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
 
     def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
@@ -204,7 +204,7 @@ class Storage:
             known = self._catalog.find(record.id)
             if known is not None and not _may_be(known, record):
                 raise InputError(
-                    f"expected an upload whose id no other has, got one with that of {record.id}; give it another name"
+                    f"expected an upload with a new id, got one with the id of {record.id}; give it another name"
                 )
             if known is not None and known.state not in _STOPPED and has_upload(self._at, known):
                 discard(upload)
@@ -293,7 +293,7 @@ class Storage:
             before = None if record.container == sha256 else record.container
             outdated = before is not None and other_version(self._at.container(before)) is not None
             if before is not None and not outdated:
-                _log.warning("%s was built again as another container, %s, than before", surface, sha256)
+                _log.warning("building %s again gave another container than before: %s", surface, sha256)
             made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
             serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
             container = self._at.container(sha256)
@@ -409,7 +409,9 @@ class Storage:
                     last_container=not self.has_container(record.container) and not self._unusable,
                 )
             except OSError as error:
-                _log.warning("what is left of %s, which was deleted, goes at the next start: %s", surface, error)
+                _log.warning(
+                    "the remaining files of %s, which was deleted, are removed at the next start: %s", surface, error
+                )
 
     def _check_mounted(self) -> None:
         """Refuse to change anything while a folder is not there: what is written then would be under its mount."""
@@ -451,7 +453,7 @@ def claim(root: Path) -> int:
     except BlockingIOError:
         os.close(handle)
         raise LodestreamError(
-            f"expected a folder in which no server works, got {root}, in which another works"
+            f"expected a folder that no other process uses, got {root}, which another one uses"
         ) from None
     except OSError:
         os.close(handle)

@@ -34,7 +34,7 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
     "",
     status_code=202,
     summary="Upload a surface",
-    response_description="The surface will be built; Location is where to look",
+    response_description="The surface will be built; Location is its address",
     openapi_extra=examples.UPLOAD,
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
@@ -85,8 +85,8 @@ async def upload(request: Request, parts: Parts) -> Response:
 async def page(
     request: Request,
     parts: Parts,
-    limit: Annotated[int, Query(ge=1, le=1000, description="most surfaces on the page")] = 100,
-    after: Annotated[str | None, Query(pattern=_PLACE, description="as `next` of the page before says")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
+    after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
 ) -> Response:
     """Surfaces without their layers and levels; `next` is the address of the next page, or null."""
     start = _position(after)
@@ -102,8 +102,11 @@ async def page(
 @readable(
     router,
     "/{surface}",
-    summary="Look at a surface",
-    responses={200: examples.answer("State, and once ready the figures", examples.READY), **responses(404)},
+    summary="Describe a surface",
+    responses={
+        200: examples.answer("Its state and, once it is ready, its description", examples.READY),
+        **responses(404),
+    },
 )
 @needs("read")
 async def look(request: Request, parts: Parts, surface: str) -> Response:
@@ -121,7 +124,7 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
 @router.post(
     "/{surface}/retry",
     status_code=202,
-    summary="Try again to build a surface",
+    summary="Retry the build of a surface",
     response_description="The surface will be built",
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
@@ -152,8 +155,10 @@ async def delete(request: Request, parts: Parts, surface: str) -> Response:
     record = parts.storage.get(surface)
     caller = caller_of(request)
     if caller is None or not caller.may_delete(record.owner):
-        whose = "nobody's" if record.owner is None else "somebody else's"
-        raise NotOwnerError(f"expected the owner of {surface} or an admin, got {_called(caller)}: it is {whose}")
+        whose = "nobody" if record.owner is None else "another owner"
+        raise NotOwnerError(
+            f"expected the owner of {surface} or an admin, got {_called(caller)}: it belongs to {whose}"
+        )
     await parts.builder.delete(surface)
     if record.container is not None and not parts.storage.has_container(record.container):
         parts.levels.forget(record.container)

@@ -123,7 +123,7 @@ class TokenFile:
             return tuple(Token.from_json(values) for values in document["tokens"])
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"  # its repr may hold all of the file
-            raise LodestreamError(f"expected a file of tokens, got {self.path}, which is none: {why}") from None
+            raise LodestreamError(f"expected a token file, got {self.path}: {why}") from None
 
     def create(self, name: str, scopes: tuple[str, ...], days: float | None = None) -> tuple[str, Token]:
         """Add a token; returns the token itself, which is stored nowhere, and its stored data.
@@ -252,7 +252,7 @@ class Tokens:
         except (LodestreamError, OSError) as error:
             self._tokens = ()
             self._met = True
-            _log.error("no token is accepted until this is mended: %s", error)
+            _log.error("no token is accepted until the token file is repaired: %s", error)
         self._met = self._met or bool(self._tokens)
 
     def _look(self) -> tuple[int, ...] | None:

@@ -62,7 +62,7 @@ ATTRIBUTE = "precision="
 UNNAMED = "upload"
 
 #: What is said to whoever brings a file of a format that is switched off.
-ALLOWED_BY = "on this server; its setting formats (LODESTREAM_FORMATS) says which are read"
+ALLOWED_BY = "on this server; its setting LODESTREAM_FORMATS lists those that are read"
 
 # Errors of the system that say nothing of what is in a file.
 _LOCAL = {
