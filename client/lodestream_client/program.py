@@ -1,4 +1,4 @@
-"""The command ``lodestream``: its parser, and what becomes of errors."""
+"""The command ``lodestream``: its parser, and how errors are reported."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
-"""How much memory a container may have its reader take, told from its header before any is taken.
+"""Limits on the memory that decoding a container may take, computed from its header before memory is allocated.
 
-A header of a few hundred bytes can promise a surface of billions of points, so what it promises is counted first:
+A header of a few hundred bytes can announce a surface of billions of points. So the memory that it implies is added up
+first:
 
-- of each block, point by point: what the coder keeps of a coefficient (7 bytes, and more in blocks of few rows or
-  columns, whose bands have edges), two integers of a picture and its successor (16 bytes), and the value twice, for
-  every channel, attributes included; 4 bytes where there are masks;
+- for each point of each block and for every channel, attributes included: what the coder keeps of a coefficient (7
+  bytes; more in blocks of few rows or columns, because of the edges of their bands), an integer each in a
+  reconstruction and in the next one (16 bytes), and the value twice; with masks 4 bytes more;
 - for each tile of each channel, and for each block: 2 KiB.
 
-What is read is counted as it comes: every byte, and what stands in tables as many times as it grows when it is read.
-Of either there may be as much as the capacity. Surfaces and views that the caller keeps are not counted, nor is what a
-format needs to write them.
+A second budget of the same size counts what is read: every byte, and tables with the size they have after parsing.
+Surfaces and views that the caller keeps are not counted, nor is memory for writing a file.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ Extent = tuple[tuple[int, int], Iterable[int]]
 
 
 class Capacity:
-    """What a container may take; it counts what has been read.
+    """A memory limit for one container; it counts what has been read.
 
     Parameters
     ----------
     max_vertices : int or None
-        At most this many vertices, and `BYTES_PER_VERTEX` for each, whatever they are of, with 16 MiB in any case.
-        None: as many as take two fifths of the memory that this process can have, see `memory_limit`.
+        Allows this many vertices and `BYTES_PER_VERTEX` bytes for each, plus 16 MiB. None: two fifths of the memory
+        available to this process, see `memory_limit`.
 
     Attributes
     ----------
     bytes : int
-        For the surface, and again for what is read.
+        Bytes allowed for the surface, and again for what is read.
     """
 
     def __init__(self, max_vertices: int | None = None) -> None:
@@ -62,18 +62,18 @@ class Capacity:
         self._read = 0
 
     def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
-        """Refuse a surface that takes more than this.
+        """Refuse a surface that needs more memory than this.
 
         Parameters
         ----------
         vertices : int
-            Of what is decoded.
+            Vertices to be decoded.
         grids : iterable of ((rows, columns), bytes of a number in each channel)
-            What is decoded.
+            Grids to be decoded.
         masked : int
-            Points of which masks are kept.
+            Points for which masks are kept.
         tables : int
-            Tiles of all channels, and blocks.
+            Tiles of all channels, plus blocks.
 
         Raises
         ------
@@ -95,12 +95,12 @@ class Capacity:
             )
 
     def take(self, count: int) -> None:
-        """Count bytes that are read and kept, or what they become.
+        """Count bytes that are read and kept, or that tables take after parsing.
 
         Raises
         ------
         TooLargeError
-            When there are more than a surface of this size has.
+            If there are more than a surface of this size can have.
         """
         self._read += count
         if self._read > self.bytes:
@@ -116,7 +116,7 @@ class Capacity:
 
 
 def memory_limit() -> int:
-    """Bytes of memory that this process can have: the machine's, its control group's or its own limit."""
+    """Memory available to this process, in bytes: the least of the limits of machine, control group and process."""
     return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
 
 

@@ -1,4 +1,4 @@
-"""A container of which nothing is believed: every section, the index, every value, and the errors that it tells."""
+"""Checking a container from an untrusted source: every section, the index, every value, and the recorded errors."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ _UNUSABLE = (InputError, TypeError, ValueError, LookupError, AttributeError, Ari
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found of a container that is sound.
+    """The result of checking a container that is sound.
 
     Attributes
     ----------
     index : Index
     errors_checked : bool
-        The errors that it records are those of its layers and levels. Only the values that were encoded can tell, and
-        only an exact container has them; of others the errors are what its maker says.
+        Whether the recorded errors were measured again. This needs the original values, which only an exact container
+        has; otherwise the errors are what the container's maker claims.
     """
 
     index: Index
@@ -74,10 +74,11 @@ class _Found:
 def inspect(
     file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None] = lambda fraction: None
 ) -> Inspection:
-    """Look a whole container through, and decode it once.
+    """Check a whole container, and decode it once.
 
-    Nothing is decoded before the header has said how many vertices there are. Of an exact container each layer and
-    level is drawn and compared with the complete surface, about as much work as its encoder had with them.
+    Nothing is decoded before the header has announced the number of vertices. For an exact container each layer and
+    level is decoded and compared with the complete surface, which takes about as long as measuring them did in the
+    encoder.
 
     Parameters
     ----------
@@ -86,18 +87,18 @@ def inspect(
     max_vertices : int
         Larger surfaces are refused.
     progress : callable
-        Called now and then with the fraction done, 0 to 1.
+        Called from time to time with the fraction done, 0 to 1.
 
     Raises
     ------
     CorruptStreamError
-        When it is damaged, does not say the same of itself everywhere, or more follows after its end; with the offset.
+        If it is damaged, contradicts itself, or is followed by more bytes; with the offset.
     TruncatedStreamError
-        When it is cut short; the message names the offset.
+        If it is cut short; the message names the offset.
     UnsupportedVersionError
-        When it has a version that this program does not read.
+        If this program does not read its version.
     TooLargeError
-        When it has more vertices than allowed.
+        If it has more vertices than allowed.
     """
     size = file.seek(0, os.SEEK_END)
     # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.

@@ -1,7 +1,6 @@
-"""What to send of a container, in which order: one pure function for server and client.
+"""What to send of a container, and in which order: one pure function for server and client.
 
-What travels is always slices of the file, so that pushing over WebSocket, fetching by HTTP Range, resuming and caching
-share this piece of logic.
+Only slices of the file are ever sent. So WebSocket streams, HTTP Range, resuming and caching share this module.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ def plan(
     target: Target = Target(),  # noqa: B008 - an immutable value
     held: RangeSet | None = None,
 ) -> Plan:
-    """Decide what a receiver with this target, which holds these bytes of the container, gets.
+    """The slices that a receiver with this target gets, if it holds these bytes of the container.
 
     Raises
     ------
     OptionError
-        When there is no such level or region, or not even the first layer fits into the bytes allowed.
+        If there is no such level or region, or not even the first layer fits into the allowed bytes.
     """
     chosen = _whole(index, target)
     if target.first is not None:

@@ -1,4 +1,4 @@
-"""Which segments and pieces of a container a receiver takes that wants a window, or some attributes only."""
+"""Which segments and pieces of a container are needed for a window or for some attributes."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ __all__ = ["Selection", "Wish", "restored", "select", "wish_of"]
 
 @dataclass(frozen=True)
 class Wish:
-    """What of a surface is wanted: a window of its points (None: all), and attributes by name (None: all)."""
+    """The requested part of a surface: a window of its points (None: all) and attributes by name (None: all)."""
 
     region: Region | None = None
     attributes: tuple[str, ...] | None = None
 
     def check(self, header: Header) -> None:
-        """Refuse what the surface does not have.
+        """Refuse a region or attributes that the surface does not have.
 
         Raises
         ------
         OptionError
-            When the region is not inside it, or there is no such attribute.
+            If the region is not inside the surface, or there is no such attribute.
         """
         if self.region is not None:
             if len(header.blocks) > 1:

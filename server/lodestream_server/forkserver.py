@@ -1,12 +1,13 @@
-"""The process from which the processes of calls are forked: it has loaded everything, and reads nothing of strangers.
+"""The fork server: a process that has loaded everything and reads no untrusted data.
 
-It has one thread, so that forking is safe. Each call has a process to itself, which gives up what the call does not
-need before the call begins (`lodestream.confinement`) and ends with it: whatever a file did to its reader is gone
-before the next one is read.
+The processes of calls are forked from it. It has one thread, so forking is safe. Each call gets a process of its own,
+which gives up all rights that the call does not need before it begins (`lodestream.confinement`), and ends with it. So
+whatever a file does to its reader is gone before the next file is read.
 
-Over one socket come calls: a connection of their own, and the pipe for the answer. Over its connection comes what is
-to be called; back go a line when its process is there and one when it has ended, and when the other side closes it the
-process is killed. What the process itself says goes over the pipe, as JSON, and nobody here listens to it.
+Calls arrive over one socket, each with a connection of its own and the pipe for its answer. Over its connection comes
+the request. The fork server sends one line there when the process exists and one when it has ended. When the other side
+closes the connection, the process is killed. The process itself sends its answer through the pipe, as JSON; the fork
+server does not read it.
 """
 
 from __future__ import annotations
@@ -50,23 +51,23 @@ _TRACEBACK = 20_000
 
 @dataclass(frozen=True)
 class Allowed:
-    """What the process of a call may touch and take.
+    """Rights and limits of the process of a call.
 
     Attributes
     ----------
     read : tuple of Path
-        Files and folders, beside Python and its libraries.
+        Files and folders that it may read, in addition to Python and its libraries.
     write : Path or None
-        A folder, in which its temporary files lie too.
+        A folder that it may write to, also used for temporary files.
     processes : bool
-        Whether it may start processes, which have the same limits each.
+        Whether it may start processes; each has the same limits.
     memory : int or None
-        Bytes that it can write to and shares with nobody: neither code nor files that are mapped for reading. Beyond
-        them it gets MemoryError, or ends.
+        Bytes of private writable memory; code and files mapped for reading do not count. Beyond it the process gets
+        MemoryError or ends.
     seconds : float or None
-        Of processor time.
+        Processor time.
     file_bytes : int or None
-        Of each file that it writes.
+        Largest file that it may write.
     """
 
     read: tuple[Path, ...] = ()
@@ -85,7 +86,7 @@ class _Request:
 
 
 def main() -> None:
-    """Fork for each call that comes over the socket whose number is the first argument, until it is closed."""
+    """Fork for each call that arrives over a socket until it is closed; its number is the first argument."""
     control = socket.socket(fileno=int(sys.argv[1]))
     # Ctrl-C, and the end of a service, reach every process: this one is its parent's to end.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -284,19 +285,19 @@ def _limit(allowed: Allowed) -> None:
 
 
 def resolve(name: str) -> Callable[..., Any]:
-    """The function of this name, ``module:qualified.name``."""
+    """The function with this name, ``module:qualified.name``."""
     module, _, qualified = name.partition(":")
     function: Callable[..., Any] = attrgetter(qualified)(importlib.import_module(module))
     return function
 
 
 def receive_exactly(connection: socket.socket, length: int) -> bytes:
-    """So many bytes.
+    """Receive exactly so many bytes.
 
     Raises
     ------
     EOFError
-        When fewer come.
+        If fewer arrive.
     """
     data = bytearray()
     while len(data) < length:

@@ -1,4 +1,4 @@
-"""``lodestream fsck``, which the command line finds through the entry points of the group ``lodestream.commands``."""
+"""The command ``lodestream fsck``, found through the entry points of the group ``lodestream.commands``."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def register(subparsers: Any) -> None:
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, repair it if asked to, and print what was found; the exit code.
+    """Check a folder, repair it if requested, and print what was found; returns the exit code.
 
     Raises
     ------
     LodestreamError
-        When it is no folder of a server, or another process works in it.
+        If it is not the data folder of a server, or another process uses it.
     """
     from .folders import Folders
 
@@ -145,7 +145,7 @@ def _print(report: Report, waiting: Sequence[Record]) -> None:
     problems = "nothing is damaged" if not found else f"{found} damaged"
     problems += f", {repaired} of these repaired" if repaired else ""
     problems += f", {lost} lost" if lost else ""
-    problems += f", {len(waiting)} surfaces wait for another attempt" if waiting else ""
+    problems += f", {len(waiting)} surfaces wait for a retry" if waiting else ""
     others = sum(finding.what == "version" and finding.repair is None for finding in report.findings)
     problems += f", {others} of another version, which the next start builds again" if others else ""
     leftovers = sum(finding.what == "leftover" for finding in report.findings)

@@ -1,6 +1,7 @@
-"""``lodestream token``: make, list and revoke the tokens of a server, found through the entry points.
+"""The command ``lodestream token``: create, list and revoke the tokens of a server; found through the entry points.
 
-It works on the file, not on the server: whoever may write the file may do it, and a server that runs takes notice.
+It edits the token file and does not contact the server. So everybody who can write the file can use it, and a running
+server notices the change.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}", re.ASCII)
 
 
 def register(subparsers: Any) -> None:
-    """Add ``token`` and what can be done with one to the sub-commands of a parser."""
+    """Add ``token`` and its actions to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "token",
         help="create, list or revoke the tokens of a server",
@@ -61,7 +62,7 @@ def register(subparsers: Any) -> None:
 
 
 def create(args: argparse.Namespace) -> int:
-    """Make a token and print it."""
+    """Create a token and print it."""
     file = TokenFile(chosen_settings(args).tokens)
     scopes = tuple(dict.fromkeys(scope for group in args.scope or [("read",)] for scope in group))
     text, token = file.create(args.name or f"token-{secrets.token_hex(3)}", scopes, args.days)
@@ -75,7 +76,7 @@ def create(args: argparse.Namespace) -> int:
 
 
 def list_tokens(args: argparse.Namespace) -> int:
-    """Print a line for each token."""
+    """Print one line for each token."""
     file = TokenFile(chosen_settings(args).tokens)
     tokens = file.load()
     shown = [

@@ -140,7 +140,7 @@ def test_a_variable_of_the_environment_sets_what_the_command_line_does_not(monke
 def test_a_folder_that_another_server_has_is_refused(tmp_path: Path) -> None:
     with (
         running_server(tmp_path),
-        pytest.raises(LodestreamError, match="in which another works"),
+        pytest.raises(LodestreamError, match="which another one uses"),
         running_server(tmp_path),
     ):
         pass

@@ -138,7 +138,7 @@ def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         line = refused_program("serve", "--port", port, "--data", tmp_path)
-        assert line == (f"lodestream: expected an address to listen at, got 127.0.0.1 port {port}: {os.strerror(98)}")
+        assert line == (f"lodestream: cannot listen on 127.0.0.1 port {port}: {os.strerror(98)}")
         # In the same process the folder is free again.
         for _ in range(2):
             with pytest.raises(LodestreamError, match=f"port {port}"), running_server(tmp_path, port=port):

@@ -189,7 +189,7 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) -> None:
-    """Add ``--max-vertices``; without decoding only the container's tables count."""
+    """Add ``--max-vertices``; if nothing is decoded, only the container's tables count."""
     what = (
         "refuse a surface that has more than N vertices or needs more than about 128 N bytes of memory, before that "
         "memory is allocated"
@@ -205,7 +205,7 @@ def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) ->
 
 
 def add_surface_options(parser: argparse.ArgumentParser) -> None:
-    """Add what says how a file becomes a surface."""
+    """Add the options that decide how a file becomes a surface."""
     group = parser.add_argument_group("surface options")
     group.add_argument(
         "--precision",
@@ -245,9 +245,9 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
 
 
 def surface_options(args: argparse.Namespace) -> dict[str, str]:
-    """The ``-o`` options given.
+    """The ``-o`` options.
 
-    A key that is given twice ends the program: the command line alone shows it to be wrong.
+    Ends the program if a key is given twice.
     """
     options: dict[str, str] = {}
     for key, value in args.options:
@@ -258,10 +258,9 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
 
 
 def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
-    """The precision of the points, and those of attributes by their names.
+    """The precision of the points, and those of attributes by name.
 
-    One that is given twice, or for the points beside ``--rms``, ends the program: the command line alone shows it to be
-    wrong.
+    Ends the program if one is given twice, or one of the points together with ``--rms``.
     """
     found: dict[str | None, Tolerance] = {}
     for name, tolerance in args.precisions:
@@ -287,7 +286,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def add_target_options(parser: argparse.ArgumentParser) -> None:
-    """Add what says where to stop and in which order."""
+    """Add the options that decide what to decode, where to stop, and in which order."""
     group = parser.add_argument_group(
         "target",
         "What to decode and where to stop. The first limit that is met ends it. E is a number in the surface's unit, "
@@ -325,7 +324,7 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
 
 
 def target_of(args: argparse.Namespace) -> Target:
-    """The target given; ends the program when its limits exclude each other."""
+    """The target of the command line; ends the program if its limits exclude each other."""
     try:
         target = Target(
             level=args.level,

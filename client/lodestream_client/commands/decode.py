@@ -1,4 +1,4 @@
-"""``lodestream decode``: a container, or as much of it as is wanted, into a file."""
+"""``lodestream decode``: a container, or the requested part of it, into a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``lodestream demo``: everything once, on this machine."""
+"""``lodestream demo``: all of Lodestream once, on this machine."""
 
 from __future__ import annotations
 

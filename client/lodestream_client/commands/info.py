@@ -1,4 +1,4 @@
-"""``lodestream info``: what a container, or a surface on a server, says of itself."""
+"""``lodestream info``: the description of a container, or of a surface on a server."""
 
 from __future__ import annotations
 

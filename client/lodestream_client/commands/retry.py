@@ -1,4 +1,4 @@
-"""``lodestream retry``: have a surface built that waits."""
+"""``lodestream retry``: have a server build a waiting surface again."""
 
 from __future__ import annotations
 
