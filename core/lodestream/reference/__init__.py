@@ -7,7 +7,7 @@ tests can hold the compiled decoder to it; where that cannot be loaded, it decod
 `lifting`, `reconstruction` and `decoder`; 9.1 and 9.2 `exactness`; 9.3 `offsets`.
 """
 
-from .container import Container, Index, Segment, read_container, read_index
+from .container import Container, Index, Segment, read_container, read_index, read_section
 from .decoder import Decoder, Shown, decode
 from .exactness import restore
 from .header import Header, read_header
@@ -25,5 +25,6 @@ __all__ = [
     "read_container",
     "read_header",
     "read_index",
+    "read_section",
     "restore",
 ]

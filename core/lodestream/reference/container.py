@@ -15,7 +15,18 @@ from .fields import Fields
 from .header import Header, read_header
 from .masks import Masks, no_holes, read_masks
 
-__all__ = ["Container", "Entry", "Exactness", "Index", "Layer", "Segment", "Window", "read_container", "read_index"]
+__all__ = [
+    "Container",
+    "Entry",
+    "Exactness",
+    "Index",
+    "Layer",
+    "Segment",
+    "Window",
+    "read_container",
+    "read_index",
+    "read_section",
+]
 
 MAGIC = b"\xf5LODE\r\n"
 VERSION = 0

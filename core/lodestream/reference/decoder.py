@@ -11,7 +11,7 @@ from .container import Container, Exactness, Segment, windows
 from .exactness import restore
 from .header import Header
 from .levels import Levels
-from .masks import Masks
+from .masks import Masks, no_holes
 from .reconstruction import EIGHTHS, Channel, Values, block_places, plane_value, put_together, rounded, value
 from .tiles import units_of
 
@@ -32,9 +32,9 @@ class Decoder:
     `states` has, after 0, 1, 2, ... calls of `take`, the passes that remain of each unit; -1 where it is not known.
     """
 
-    def __init__(self, header: Header, masks: Masks) -> None:
+    def __init__(self, header: Header, masks: Masks | None = None) -> None:
         self.header = header
-        self.masks = masks
+        self.masks = masks or no_holes(header.blocks)
         self.levels = Levels(header)
         self.units = units_of(header, self.levels)
         self.states = [self._state(-1)]

@@ -88,6 +88,7 @@ def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
                 wide = *above2[c - 2 : c + 3], *above[c - 3 : c + 4], *here[c - 4 : c]
                 near = *above2[c - 1 : c + 2], *above[c - 2 : c + 3], *here[c - 2 : c]
                 here[c] = model.mixed(wide, near, "mask")  # they differ in length
-        found.append(here[MARGIN : MARGIN + columns])
+        found.append(np.array(here[MARGIN : MARGIN + columns], bool))
         above2, above = above, here
-    return np.array(found, bool)
+    model.finish()
+    return np.stack(found)

@@ -84,4 +84,5 @@ def with_offsets(fields: Fields, bits: int, values: NDArray[Any]) -> NDArray[Any
     for x in map(float, values):
         place = clamp(offsets.place(x, float(np.rint(x / step)) * step), -(2**31), 2**31 - 1)
         patterns.append((-1 - place) | 1 << 31 if place < 0 else place)
+    offsets.model.finish()
     return np.array(patterns, "<u4").view(values.dtype)

@@ -6,6 +6,8 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Hashable
 
+from ..errors import StreamError
+
 __all__ = ["Model", "RangeDecoder", "clamp"]
 
 #: The table L, from which `squash` is interpolated.
@@ -36,11 +38,11 @@ class RangeDecoder:
     """Section 7.1: a range-coded string, behind whose end everything is 0."""
 
     def __init__(self, string: bytes) -> None:
-        self._bytes = iter(string)
+        self.unread = iter(string)
         self._width = 2**32 - 1
         self._low = 0
         for _ in range(4):
-            self._low = self._low * 256 + next(self._bytes, 0)
+            self._low = self._low * 256 + next(self.unread, 0)
 
     def bit(self, probability: int) -> int:
         """The next bit, whose probability of being 1 is `probability` / 2^16."""
@@ -53,7 +55,7 @@ class RangeDecoder:
             self._low -= bound
             self._width -= bound
         while self._width < 2**24:
-            self._low = self._low * 256 + next(self._bytes, 0)
+            self._low = self._low * 256 + next(self.unread, 0)
             self._width *= 256
         return bit
 
@@ -72,6 +74,11 @@ class Model:
     def begin(self, string: bytes) -> None:
         """Go on with another string."""
         self._coder = RangeDecoder(string)
+
+    def finish(self) -> None:
+        """The string has no bytes that decoding has not read."""
+        if next(self._coder.unread, None) is not None:
+            raise StreamError("expected no more bytes of a range-coded string than decoding reads, got more")
 
     def bit(self, *context: Hashable) -> int:
         """A bit with a single context."""
