@@ -86,6 +86,8 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
         When there are options of formats, or an option has a value that it does not take.
     InputError
         When it cannot be encoded.
+    UnavailableError
+        Where the compiled kernels are missing.
     """
     for option in asked.options:
         raise OptionError(f"expected no options of a file's format for a surface in memory, got {option}")

@@ -114,6 +114,7 @@ def test_a_server_does_not_start(bare: Bare, tmp_path: Path) -> None:
     data = tmp_path / "data"
     assert "serving surfaces is not possible here" in bare.refused("serve", "--data", data, "--port", "0")
     assert not data.exists()
+    assert "serving surfaces is not possible here" in bare.refused("demo", "--out", tmp_path / "demo")
     (data / "records").mkdir(parents=True)
     for change in ("--repair", "--adopt", "--retry"):
         bare.refused("fsck", data, change)

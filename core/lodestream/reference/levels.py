@@ -145,12 +145,11 @@ class Levels:
             self.grids.append(GridLevels(number, grid, [level[number] for level in levels], lacks))
         steps = [*product(range(1, self.last + 1), ((0, False), (1, False), (0, True)))]
         fitted = [(level, *which) for level, which in steps if self._is_fitted(level, *which)]
-        every = [
-            (n, *step) for n in range(header.channels) for step in fitted if n < header.coordinates or not step[-1]
-        ]
-        if len(every) != len(header.predictors):
-            raise StreamError(f"expected {len(every)} predictors, got {len(header.predictors)}")
-        self._predictors = dict(zip(every, header.predictors, strict=True))
+        every = [(n, *step) for n in range(header.channels) for step in fitted]
+        coded = [step for step in every if step[0] < header.coordinates or not step[-1]]
+        if len(coded) != len(header.predictors):
+            raise StreamError(f"expected {len(coded)} predictors, got {len(header.predictors)}")
+        self._predictors = dict(zip(coded, header.predictors, strict=True))
 
     def _is_fitted(self, level: int, axis: int, of_curves: bool) -> bool:
         axes = [grid.axes[level][axis] for grid in self.grids if grid.is_curve == of_curves]
