@@ -87,6 +87,8 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
         If there are format options, or an option has an invalid value.
     InputError
         If the surface cannot be encoded.
+    UnavailableError
+        If the compiled kernels are missing.
     """
     for option in asked.options:
         raise OptionError(f"expected no options of a file's format for a surface in memory, got {option}")

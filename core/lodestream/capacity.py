@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from .errors import TooLargeError
+from .library import why_missing
 
 __all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
 
@@ -29,7 +30,9 @@ BYTES_PER_VERTEX = 128
 _LEAST = 16 * 1024 * 1024
 
 # Of the memory that this process can have: the surface takes as much, and what is read of its container as well.
+# Plain Python takes up to five times as much for a surface as the compiled kernels, for which this counts.
 _SHARE = 0.4
+_PLAIN_SHARE = 0.08
 
 _COEFFICIENT, _PICTURE, _MASKS, _TABLE = 7, 16, 4, 2048
 _EDGE = 12  # rows or columns
@@ -56,7 +59,8 @@ class Capacity:
     def __init__(self, max_vertices: int | None = None) -> None:
         self.max_vertices = max_vertices
         if max_vertices is None:
-            self.bytes = max(int(memory_limit() * _SHARE), _LEAST)
+            self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
+            self.bytes = max(int(memory_limit() * self._share), _LEAST)
         else:
             self.bytes = _LEAST + max_vertices * BYTES_PER_VERTEX
         self._read = 0
@@ -112,7 +116,7 @@ class Capacity:
     def _words(self) -> str:
         if self.max_vertices is not None:
             return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
-        return f"{_SHARE:.0%} of the memory there is"
+        return f"{self._share:.0%} of the memory there is"
 
 
 def memory_limit() -> int:

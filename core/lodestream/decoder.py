@@ -18,6 +18,7 @@ from .container.reader import INDEX_GROWTH, index_from, read_metadata, with_leve
 from .container.slices import Slices, State
 from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
+from .library import why_missing
 from .reconstruction import Coded, Progress, Reconstruction
 from .selection import Wish, select
 from .spreading import UNANNOUNCED
@@ -240,7 +241,7 @@ class Decoder:
     def _begin(self, header: Header) -> None:
         self._wanted = self._wish.tiles(header)
         self._progress = Progress(header)
-        self._reconstruction = Reconstruction(header)
+        self._reconstruction = _reconstruction(header)
         self._level = 0
 
     def _take_masks(self, frame: Frame, header: Header) -> None:
@@ -379,6 +380,14 @@ class Decoder:
         frame = self._slices.metadata()
         if frame is not None:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+
+
+def _reconstruction(header: Header) -> Reconstruction:
+    if why_missing() is None:
+        return Reconstruction(header)
+    from .fallback import PlainReconstruction
+
+    return PlainReconstruction(header)
 
 
 def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | None = None) -> Surface:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from . import metadata
 from .encoding import Encoding, UnreachableError
 from .errors import FormatWarning, OptionError
+from .library import require
 from .losses import at_holes
 from .preparation import Preparation
 from .surface import Surface
@@ -60,7 +61,10 @@ def encode(
         `lodestream.metadata.MAX_BYTES`.
     OptionError
         If there is no attribute of a given name, or both a precision and an error are given.
+    UnavailableError
+        If the compiled kernels are missing; it says how to get them.
     """
+    require("encoding")
     if not isinstance(surface, Surface):
         surface = Surface(surface)
     metadata.check(surface.metadata)

@@ -19,6 +19,7 @@ from .container.pieces import windows
 from .decoder import Decoder
 from .errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
 from .heights import to_xyz
+from .library import require
 from .measure import extent_of
 from .picture import coordinate_distances, originals_of
 from .reconstruction import Reconstruction, initial_state
@@ -99,7 +100,10 @@ def inspect(
         If this program does not read its version.
     TooLargeError
         If it has more vertices than allowed.
+    UnavailableError
+        If the compiled kernels are missing.
     """
+    require("looking a container through")
     size = file.seek(0, os.SEEK_END)
     # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.
     decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()

@@ -11,6 +11,7 @@ from .capacity import Capacity
 from .container.model import Header, Index, Piece, Segment
 from .container.pieces import windows
 from .errors import OptionError
+from .library import why_missing
 from .reach import check_region, needed_tiles
 from .target import Region, Target
 
@@ -64,7 +65,8 @@ class Wish:
         """
         sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
         layout = header.layout
-        if self.region is not None and header.arrangement is None:
+        # Without the compiled kernels a window is cut out of the whole surface.
+        if self.region is not None and header.arrangement is None and why_missing() is None:
             rows, columns = restored(header, self.region)
             shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
         elif level is not None and level < layout.levels:

@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
 import lodestream
+from lodestream.library import require
 
 from . import files, interface, pages, problems, streams, surfaces
 from .access import Access
@@ -56,8 +57,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     Raises
     ------
     LodestreamError, OSError
-        If there is no token although one is needed, or the token file cannot be used.
+        If the compiled kernels are missing, there is no token although one is needed, or the token file cannot be used.
     """
+    require("serving surfaces")
     chosen = Settings() if settings is None else settings
     access, metrics, pace = Access(chosen), Metrics(), Pace()
 

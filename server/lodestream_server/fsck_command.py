@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import LodestreamError, OptionError
+from lodestream.library import require
 from lodestream.text import printable
 
 if TYPE_CHECKING:
@@ -58,11 +59,14 @@ def fsck(args: argparse.Namespace) -> int:
     Raises
     ------
     LodestreamError
-        If it is not the data folder of a server, or another process uses it.
+        If it is not the data folder of a server, or another process uses it; or if the folder is to be changed and the
+        compiled kernels are missing.
     """
     from .folders import Folders
 
     folder: Path = args.data
+    if args.repair or args.adopt or args.retry:
+        require("building surfaces again")
     if args.adopt and args.repair:
         raise OptionError("expected --adopt or --repair, got both: adopt first, and see that all is there")
     if not any(place.is_dir() for place in Folders(folder).kept):

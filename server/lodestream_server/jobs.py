@@ -152,7 +152,7 @@ class Builder:
         return len(self._tasks), self._pending.get(caller, 0)
 
     def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
-        """Start the process that builds come from, and continue with the builds that were queued when the server last ended.
+        """Start the process that builds come from, and continue builds queued when the server last ended.
 
         Parameters
         ----------

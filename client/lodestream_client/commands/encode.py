@@ -41,6 +41,9 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     if args.out == "-" and args.json:
         args.parser.error("argument --json: standard output is taken by the container")
+    from lodestream.library import require
+
+    require("encoding")
     options = surface_options(args)
     precision, attribute_precision = precisions(args)
     if args.out != "-":
