@@ -83,9 +83,7 @@ class Incoming:
         coding = str(response.headers.get("content-encoding", "identity"))
         self._read = coding == "identity"
         if self._fine and not self._read:
-            raise RemoteProtocolError(
-                f"expected an answer of {asked} as it is, got it encoded with {coding}, which was not asked for"
-            )
+            raise RemoteProtocolError(f"expected an unencoded answer of {asked}, got one encoded with {coding}")
 
     def take(self, piece: bytes) -> bool:
         """Take a piece of the body; returns whether more is needed."""
@@ -134,9 +132,9 @@ def parse(data: bytes) -> Mapping[str, Any]:
     try:
         found = json.loads(data, parse_float=_finite, parse_constant=_finite)
     except RecursionError:
-        raise ValueError("lists and objects in each other") from None
+        raise ValueError("lists and objects nested too deeply") from None
     if not isinstance(found, dict):
-        raise ValueError("no object")
+        raise ValueError("not an object")
     within: list[Any] = [found]
     for _ in range(_DEEPEST):
         within = [
@@ -147,7 +145,7 @@ def parse(data: bytes) -> Mapping[str, Any]:
         ]
         if not within:
             return found
-    raise ValueError("lists and objects in each other")
+    raise ValueError("lists and objects nested too deeply")
 
 
 def _finite(text: str) -> float:
@@ -167,7 +165,7 @@ def check_figures(document: Mapping[str, Any], url: str) -> None:
     for name, fits in _FIGURES.items():
         value = document.get(name)
         if value is not None and not fits(value):
-            raise RemoteProtocolError(f"expected the figures of a surface from {url}, got {name} {value!a:.80}")
+            raise RemoteProtocolError(f"expected the description of a surface from {url}, got {name} {value!a:.80}")
 
 
 def _is_count(value: Any) -> bool:

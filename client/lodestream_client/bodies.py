@@ -110,7 +110,7 @@ def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, f
     kinds = [in_memory(source) for source in sources]
     if any(kinds):
         if len(sources) > 1:
-            raise InputError(f"expected one surface in memory by itself, got it among {len(sources)} sources")
+            raise InputError(f"expected a surface in memory as the only source, got {len(sources)} sources")
         return Parcel((("surface.lode", encoded(sources[0], asked, progress)),))
     return Parcel(tuple(("", cast("File", source)) for source in sources), _parameters(asked))
 
@@ -138,7 +138,7 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
                 files.append((name, source))
         options = [option for option in parcel.parameters if option != "name"]
         if options and any(_is_container(file) for _, file in files):
-            raise OptionError(f"expected no {options[0]} for a container (.lode), which says it already")
+            raise OptionError(f"expected no {options[0]} for a container (.lode), which is encoded already")
         yield Body(files, sent)
 
 

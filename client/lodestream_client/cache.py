@@ -215,7 +215,7 @@ def _check_ours(handle: int, path: Path) -> None:
     own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
     # A program that was killed may have left less than a head.
     if not own or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
-        raise FileExistsError(errno.EEXIST, "not a file that an earlier pull left; it is left alone", str(path))
+        raise FileExistsError(errno.EEXIST, "not a file of an earlier pull; it is not changed", str(path))
 
 
 def _is_at(handle: int, path: Path) -> bool:

@@ -61,7 +61,7 @@ def in_memory(source: object) -> bool:
         return True
     found = "a file open for text" if isinstance(source, io.TextIOBase) else type(source).__name__
     raise InputError(
-        f"expected a file's name, an open binary file, the bytes of one, a Surface or an array of points, got {found}"
+        f"expected the name of a file, an open binary file, its bytes, a Surface or an array of points, got {found}"
     )
 
 

@@ -144,7 +144,7 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
         return from_response(response.status_code, response.reason_phrase, bytes(response.body or b""), url)
     if isinstance(error, ws.InvalidURI):  # ours is one
         use = addresses.counterpart(url, addresses.stream_url(url), error.uri)
-        return RemoteProtocolError(f"{url} redirects its stream to what is no WebSocket's address; use {use}")
+        return RemoteProtocolError(f"{url} redirects its stream to an address that is not a WebSocket's; use {use}")
     if isinstance(error, (ws.InvalidHandshake, httpx.RemoteProtocolError, httpx.DecodingError)):
         return RemoteProtocolError(f"{url} does not answer like a Lodestream server: {error}")
     if isinstance(error, (ssl.SSLError, ssl.CertificateError)):

@@ -312,7 +312,7 @@ def identify(url: str) -> Flow[Identity]:
             raise RemoteError("not-ready", f"expected {url} to be ready, got {surface.state}")
         if not _CONTAINER.fullmatch(container) or size is True or not 0 < size <= _LARGEST_FILE:
             raise RemoteProtocolError(
-                f"expected the SHA-256 and the bytes of a container from {url}, got {container!a:.80} and {size!r:.80}"
+                f"expected the SHA-256 and size of a container from {url}, got {container!a:.80} and {size!r:.80}"
             )
         return Identity(container, container, size)
     answer = _refuse((yield Call("HEAD", url, headers={"Accept-Encoding": "identity"})), url)
@@ -354,7 +354,9 @@ def _refuse(answer: Answer | None, url: str) -> Answer:
         raise AssertionError("a call was resumed without its answer")
     if answer.status in _MOVED and (location := answer.headers.get("location")):
         place = addresses.counterpart(url, url, addresses.resolved(url, location))
-        raise RemoteProtocolError(f"{url} redirects what would change something; use {place} if that is meant")
+        raise RemoteProtocolError(
+            f"{url} redirects a request that changes something, which is not followed; use {place}"
+        )
     if not 200 <= answer.status < 300:
         error = problems.from_response(answer.status, answer.reason, answer.content, url)
         error.args = (f"{error}{answer.withheld}", *error.args[1:])

@@ -487,7 +487,7 @@ class BaseStream:
         """Raise what the end of a WebSocket stands for."""
         if error.rcvd is None and error.sent is not None and error.sent.code in _OFFENCES:
             raise RemoteProtocolError(
-                f"{self.url} sent what is no WebSocket message of the stream: {error.sent.reason or error.sent.code}"
+                f"{self.url} sent an invalid WebSocket message: {error.sent.reason or error.sent.code}"
             )
         if self._download is not None:
             try:

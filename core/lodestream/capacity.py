@@ -109,14 +109,14 @@ class Capacity:
         self._read += count
         if self._read > self.bytes:
             raise TooLargeError(
-                f"expected a container of which at most {_size(self.bytes)} are kept ({self._words}), got more"
+                f"expected a container whose data take at most {_size(self.bytes)} ({self._words}), got more"
             )
 
     @property
     def _words(self) -> str:
         if self.max_vertices is not None:
             return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
-        return f"{self._share:.0%} of the memory there is"
+        return f"{self._share:.0%} of the available memory"
 
 
 def memory_limit() -> int:

@@ -235,9 +235,7 @@ def _compare(index: Index, found: _Found) -> None:
         wrong = [k for k, (a, b) in enumerate(zip(told, real, strict=False)) if a != b]
         if wrong or len(told) != len(real):
             number = wrong[0] if wrong else min(len(told), len(real))
-            raise CorruptStreamError(
-                f"expected an index of what stands in the file, got another {word} {number}", offset
-            )
+            raise CorruptStreamError(f"expected an index that matches the file, got another {word} {number}", offset)
     last = found.figures or (found.layers[-1].rms, found.layers[-1].max_error)
     if (index.levels[-1].rms, index.levels[-1].max_error) != last:
         raise CorruptStreamError(f"expected errors {last} of the complete surface in the index, got others", offset)
@@ -280,7 +278,7 @@ def _check_metadata(decoder: Decoder, index: Index, complete: Surface) -> None:
         except _UNUSABLE as error:
             problem = f"{type(error).__name__}: {error}"
             raise CorruptStreamError(
-                f"expected metadata that say how level {level} is restored, got others ({problem:.200})",
+                f"expected metadata with which level {level} can be restored, got others ({problem:.200})",
                 index.metadata.offset,
             ) from None
 

@@ -75,7 +75,9 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
     for mark in marks:
         if target.max_bytes is not None and mark.bytes > target.max_bytes:
             if not kept:
-                raise OptionError(f"expected at least the {mark.bytes} bytes of the first step, got {target.max_bytes}")
+                raise OptionError(
+                    f"expected at least the {mark.bytes} bytes of the first layer or level, got {target.max_bytes}"
+                )
             return kept, "bytes"
         kept.append(mark)
         if mark is marks[-1]:

@@ -35,7 +35,7 @@ class Wish:
         """
         if self.region is not None:
             if len(header.blocks) > 1:
-                raise OptionError(f"expected no region of a surface of {len(header.blocks)} blocks")
+                raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
             check_region(self.region, header.shape)
         names = [kind.name for kind in header.attributes]
         for name in self.attributes or ():

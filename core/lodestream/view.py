@@ -145,7 +145,7 @@ class View:
         digest = self._digest.get(DIGEST)
         region = self._wish.region
         if not finest and region is not None:
-            raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")
+            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
         chosen = self._wish.channels(header)
         if region is None:
             grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)

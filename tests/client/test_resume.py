@@ -261,7 +261,7 @@ def test_a_pull_that_breaks_is_gone_on_with_by_the_next(
     with linked(surface, lambda number: Fault() if number == 0 else Fault(cut_down=9000)) as link:
         code, _, stderr = run("pull", link.url, tmp_path / "o.npy", "--resume", "--retry", "0", "--transport", "ws")
     assert code == 1
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     assert np.load(tmp_path / "o.npy").shape == terrain.shape, "as far as it came"
     kept = parts(folder)[0].stat().st_size
     assert kept > 4000

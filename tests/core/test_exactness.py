@@ -175,12 +175,12 @@ def test_offsets_that_repeat_cost_little(step: float) -> None:
 
 def test_offsets_of_damaged_pieces_are_those_of_the_reference() -> None:
     rng, step = np.random.default_rng(3), 0.02
-    offsets = np.repeat(rng.normal(size=16) * 100, 64)
+    offsets = np.repeat(rng.normal(size=16) * 100 * (np.arange(16) % 4 > 0), 64)
     original = (np.rint(9 * rng.normal(size=offsets.size)) * step + offsets).astype(np.float32)
     restored = (np.rint(original.astype(np.float64) / step) * step).astype(np.float32)
     piece = encode_piece(original, restored, step)
     assert piece[0] & 3 == 3
-    zeros = 0
+    assert np.count_nonzero(original == 0), "the place of 0 is sought"
     for changed in range(9, len(piece), 3):
         damaged = bytearray(piece)
         damaged[changed] ^= 85
@@ -189,8 +189,6 @@ def test_offsets_of_damaged_pieces_are_those_of_the_reference() -> None:
         except StreamError:
             continue  # the damaged string ends sooner
         assert values.tobytes() == decode_piece(restored, bytes(damaged), 0).tobytes()
-        zeros += np.count_nonzero(values == 0)
-    assert zeros, "the place of 0 was sought"
 
 
 def test_a_step_without_offsets_changes_nothing() -> None:

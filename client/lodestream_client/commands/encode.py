@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     if args.out == "-" and args.json:
-        args.parser.error("argument --json: standard output is taken by the container")
+        args.parser.error("argument --json: standard output is used for the container")
     from lodestream.library import require
 
     require("encoding")

@@ -17,7 +17,7 @@ from .output import cell, console, human_size, point_words, print_json
 __all__ = ["register", "run"]
 
 # Of a surface that was uploaded as a container.
-_ERRORS = {"checked": "checked by the server", "told": "as told by whoever uploaded them"}
+_ERRORS = {"checked": "checked by the server", "told": "stated by the uploader, not checked"}
 
 _MOST_KINDS = 12  # sizes of blocks that are named
 
@@ -78,7 +78,7 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
         except (StreamError, TooLargeError) as error:
             cut = isinstance(error, TruncatedStreamError)
             raise named(
-                error, args.what, "lodestream decode --partial writes what is whole of it" if cut else ""
+                error, args.what, "lodestream decode --partial writes its last complete layer" if cut else ""
             ) from None
 
 
@@ -118,7 +118,7 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     if details.get("exact") is not None:
         lost = (details.get("holes") or 0) - (details.get("non_finite") or 0)
         exact = "yes, bit for bit" + (" wherever there is a value" if lost else "")
-        facts.append(("exact", exact if details["exact"] else "no, within the error asked for"))
+        facts.append(("exact", exact if details["exact"] else "no, within the error that was asked for"))
     if errors := _ERRORS.get(str(details.get("errors"))):
         facts.append(("errors", errors))
     if details.get("sha256"):

@@ -85,7 +85,7 @@ class Kept:
     def words(self) -> str:
         """A message for the user: how much is kept, or why nothing is."""
         if self._total:
-            return f"{human_size(self._total)} are kept; pull --resume goes on from there"
+            return f"{human_size(self._total)} are kept; pull --resume continues from there"
         return f"nothing is kept: {self._why_not}" if self._why_not else ""
 
     def use(self, identity: Identity) -> None:
@@ -97,21 +97,21 @@ class Kept:
             If another program has them open, or the folder cannot be written.
         """
         if identity.name is None or identity.size is None:
-            self._why_not = "the server does not tell one version of the file from another"
+            self._why_not = "the server does not identify versions of the file"
             note(self.words)
             return
         try:
             self.store = self._part = _opened(identity.name, identity.size)
         except LodestreamError as error:
-            raise LodestreamError(f"{error}; wait for it, or do without --resume") from None
+            raise LodestreamError(f"{error}; wait for it, or leave out --resume") from None
         except OSError as error:
             raise LodestreamError(
-                f"expected a folder for what comes (LODESTREAM_CACHE), got {_reason(error)}; "
-                "choose another, or do without --resume"
+                f"expected a folder for received data (LODESTREAM_CACHE), got {_reason(error)}; "
+                "choose another, or leave out --resume"
             ) from None
         self.identity = identity
         if self._total:
-            note(f"{human_size(self._total)} are here from before")
+            note(f"{human_size(self._total)} are here from an earlier pull")
 
     def follow(self, stream: Stream) -> None:
         """Set the stream whose data `write` receives."""
@@ -128,7 +128,7 @@ class Kept:
                 self._part.write(start, data[start - offset : start - offset + length])
         except OSError as error:
             self._full = True
-            note(f"no more is kept for pull --resume: {_reason(error)}")
+            note(f"no more data are kept for pull --resume: {_reason(error)}")
 
     def read(self, offset: int, length: int) -> bytes | None:
         """Stored bytes of the container; None if they are not stored."""
@@ -157,7 +157,7 @@ class Kept:
     def _begin(self) -> None:
         identity = self._stream.identity if self._stream is not None else None
         if identity is None or identity.name is None or identity.size is None:
-            self._why_not = "the server does not tell one version of the file from another"
+            self._why_not = "the server does not identify versions of the file"
             return
         try:
             part = _opened(identity.name, identity.size)
@@ -167,7 +167,7 @@ class Kept:
             return
         except OSError as error:
             self._why_not = _reason(error)
-            note(f"what comes is not kept for pull --resume: {self._why_not}")
+            note(f"received data are not kept for pull --resume: {self._why_not}")
             return
         self._part, self._fresh = part, not part.ranges.total
         folder = part.folder

@@ -31,7 +31,7 @@ def check_out(args: argparse.Namespace) -> None:
     """
     if args.out == "-":
         if args.json:
-            args.parser.error("argument --json: standard output is taken by the surface")
+            args.parser.error("argument --json: standard output is used for the surface")
         return
     path = Path(args.out)
     require_folder(path)
@@ -65,7 +65,7 @@ def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent:
         return
     for limit, found, name in ((target.until_rms, rms, "RMS"), (target.until_max, max_error, "maximum")):
         if limit is not None and found > limit.absolute(extent):
-            note(f"the {name} error asked for is out of reach: this is the complete surface, with {found:.6g}")
+            note(f"the requested {name} error cannot be reached: the complete surface has {found:.6g}")
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def _show_warning(
 def point_words(details: Mapping[str, Any]) -> str:
     """The number of points and holes of a surface, from the keys of ``info``."""
     total, holes, kept = _points(details), details.get("holes") or 0, details.get("non_finite") or 0
-    words = f", {kept} of these infinite or in part NaN, which come back" if kept else ""
+    words = f", {kept} of these infinite or partly NaN, whose values are kept" if kept else ""
     return f"{total}, {holes} of them holes{words}" if holes else str(total)
 
 

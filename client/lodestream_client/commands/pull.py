@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     """Stream, write, report; of what came before an interruption too."""
     target = target_of(args)
     if args.transport == "ws" and not addresses.is_surface(args.url):
-        args.parser.error("argument --transport: a file's address has no WebSocket")
+        args.parser.error("argument --transport: the URL of a file has no WebSocket")
     check_out(args)
     with interruptible(), Kept(args.resume) as kept:
         return _pull(args, target, kept)
@@ -113,7 +113,7 @@ def _pull(args: argparse.Namespace, target: Target, kept: Kept) -> int:
         kept.done(outcome.ended == "complete" and not part)
     if broke is None:
         return 0
-    note("; ".join(filter(None, (f"what came is written to {name}", kept.words))))
+    note("; ".join(filter(None, (f"the data received so far are written to {name}", kept.words))))
     return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
 
 
@@ -132,7 +132,7 @@ def _written(
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
-                broke.args = (f"{_words(broke)}: the first layer has not come, and {name} is not written",)
+                broke.args = (f"{_words(broke)}: the first layer has not arrived, and {name} is not written",)
             raise broke
         note(_words(broke))
         kept.failed(broke)
@@ -238,7 +238,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
 
     place = stream.metadata_place
     if place is None:  # over HTTP layers may come before it is known
-        note("written without its name and place, which have not come")
+        note("written without metadata such as name and position, which have not arrived")
         return {}, 0
     if (data := kept.read(*place)) is not None:
         return read_metadata(data, ByteRange(*place)), 0
@@ -247,7 +247,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     except LodestreamError as error:
         if isinstance(error, NotFoundError) and not hurried:
             raise
-        note(f"written without its name and place, which could not be fetched: {error}")
+        note(f"written without metadata such as name and position, which could not be fetched: {error}")
         return {}, 0
     kept.write(place[0], data)
     return read_metadata(data, ByteRange(*place)), len(data)

@@ -286,7 +286,7 @@ def read(
         surface.metadata, dropped = metadata.fitted(surface.metadata)
         if dropped:
             words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
-            notes.warn(f"metadata may be {metadata.MAX_BYTES:,} bytes long, hence left out: {words}")
+            notes.warn(f"metadata are limited to {metadata.MAX_BYTES:,} bytes; left out: {words}")
         return surface if chosen is None else _closed(surface, chosen)
     except InputError as error:
         raise _named(error, label) from None
