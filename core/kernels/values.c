@@ -15,8 +15,9 @@
 #include "lodestream.h"
 
 enum {
-    TOGETHER = LODE_PART_COLUMNS, /* values worked on together */
-    ROWS_TOGETHER = 4,            /* rows whose squares are added at a time */
+    TOGETHER = 512,   /* values worked on together */
+    SIDE_BY_SIDE = 4, /* parts whose rows are read from end to end: memory comes faster so */
+    WIDEST = SIDE_BY_SIDE * LODE_PART_COLUMNS,
     RULE_NUMBERS = 4,
 };
 
@@ -293,29 +294,27 @@ static void row_distances(const struct comparison *c, int64_t row, int64_t left,
     }
 }
 
-/* Figures of a part: those of its columns, then of those. */
+/* Figures of parts side by side, together `count` points wide: those of columns, then of those. */
 static void part_figures(const struct comparison *c, int64_t top, int64_t bottom, int64_t left, int64_t count,
                          double *figures) {
-    double squares[ROWS_TOGETHER][TOGETHER], sums[TOGETHER], worst[TOGETHER];
+    double squares[TOGETHER], sums[WIDEST], worst[WIDEST];
     for (int64_t j = 0; j < count; j++)
         sums[j] = worst[j] = 0.0;
-    for (int64_t row = top; row < bottom; row += ROWS_TOGETHER) {
-        for (int64_t k = 0; k < ROWS_TOGETHER; k++)
-            if (row + k < bottom)
-                row_distances(c, row + k, left, count, squares[k]);
-            else
-                memset(squares[k], 0, sizeof squares[k]);
-        for (int64_t j = 0; j < count; j++)
-            for (int64_t k = 0; k < ROWS_TOGETHER; k++) {
-                double own = squares[k][j];
-                sums[j] += own;
-                worst[j] = own > worst[j] ? own : worst[j];
+    for (int64_t row = top; row < bottom; row++)
+        for (int64_t start = 0; start < count; start += TOGETHER) {
+            int64_t some = least(count - start, TOGETHER);
+            row_distances(c, row, left + start, some, squares);
+            for (int64_t j = 0; j < some; j++) {
+                sums[start + j] += squares[j];
+                worst[start + j] = squares[j] > worst[start + j] ? squares[j] : worst[start + j];
             }
-    }
-    figures[0] = figures[1] = 0.0;
+        }
     for (int64_t j = 0; j < count; j++) {
-        figures[0] += sums[j];
-        figures[1] = worst[j] > figures[1] ? worst[j] : figures[1];
+        double *own = figures + 2 * (j / LODE_PART_COLUMNS);
+        if (j % LODE_PART_COLUMNS == 0)
+            own[0] = own[1] = 0.0;
+        own[0] += sums[j];
+        own[1] = worst[j] > own[1] ? worst[j] : own[1];
     }
 }
 
@@ -340,10 +339,12 @@ int64_t lode_square_distances(const void *points, int64_t points_count, int64_t 
     struct comparison comparison = {points,      coordinates, rules,    counted_count ? counted : 0,
                                     points_type, columns,     channels, geometric,
                                     height,      pitch};
-    for (int64_t part = first; part < last; part++) {
+    for (int64_t part = first; part < last;) {
         int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
+        int64_t parts = least(least(across - part % across, last - part), SIDE_BY_SIDE);
         part_figures(&comparison, top, least(top + LODE_PART_ROWS, rows), left,
-                     least(columns - left, LODE_PART_COLUMNS), figures + 2 * part);
+                     least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * part);
+        part += parts;
     }
     return 0;
 }
