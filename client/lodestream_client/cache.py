@@ -21,8 +21,6 @@ import zlib
 from bisect import bisect_right, insort
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
 from lodestream.errors import InputError, LodestreamError
 from lodestream.ranges import RangeSet
 
@@ -47,7 +45,8 @@ class _TakenError(Exception):
 def cache_folder() -> Path:
     """The folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
     chosen = os.environ.get("LODESTREAM_CACHE")
-    return Path(chosen) if chosen else user_cache_path("lodestream", appauthor=False)
+    base = os.environ.get("XDG_CACHE_HOME", "").strip() or os.path.expanduser("~/.cache")
+    return Path(chosen) if chosen else Path(base, "lodestream")
 
 
 def is_name(name: object) -> bool:
