@@ -137,7 +137,7 @@ def test_a_limit_out_of_reach_is_complete_with_a_note(run: Run, terrain_file: Pa
     code, stdout, stderr = run("decode", lossy, tmp_path / "o.npy", "--until-rms", "1e-6", "--json")
     assert code == 0
     assert json.loads(stdout)["ended"] == "complete"
-    assert "out of reach" in stderr
+    assert "cannot be reached" in stderr
 
 
 def test_a_cut_container(

@@ -302,7 +302,7 @@ def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Pat
 
 def test_two_servers_never_share_a_folder(tmp_path: Path) -> None:
     storage = Storage(tmp_path)
-    with pytest.raises(LodestreamError, match="another works"):
+    with pytest.raises(LodestreamError, match="which another one uses"):
         Storage(tmp_path)
     storage.close()
     Storage(tmp_path).close()

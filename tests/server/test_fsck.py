@@ -208,7 +208,7 @@ def test_what_is_damaged_is_set_aside_and_built_again(
     assert (code, report["clean"]) == (0, True)
     repairs = {finding["what"]: finding["repair"] for finding in report["findings"] if finding["what"] != "leftover"}
     assert repairs.keys() == {"container", "record"}
-    assert all(words.endswith("whole again") for words in repairs.values())
+    assert all(words.endswith("sound again") for words in repairs.values())
     assert all(finding["repaired"] for finding in report["findings"])
     assert (data / "damaged" / "containers" / container.name).read_bytes() == damaged
     assert (data / "damaged" / "records" / record.name).read_text() == "{"
@@ -314,7 +314,7 @@ def test_it_refuses_to_work_beside_a_server_or_elsewhere(data: Path, tmp_path: P
     register(parser.add_subparsers())
     storage = Storage(data)
     args = parser.parse_args(["fsck", str(data), "--repair"])
-    with pytest.raises(LodestreamError, match="another works"):
+    with pytest.raises(LodestreamError, match="which another one uses"):
         args.run(args)
     storage.close()
     (tmp_path / "empty").mkdir()
