@@ -28,6 +28,30 @@
 /* The hash of the sources that the library was compiled from, 16 hexadecimal digits and a zero. */
 LODE_API const char *lode_sources(void);
 
+/* lifting.c ------------------------------------------------------------------------------------------------------ */
+
+#define LODE_LIFT_STRIP 64
+
+/* One step of the lifting along an axis of a plane, or its inverse, in place: samples on one side, on the other nodes
+ * of the coarser level and behind them the details. Exact for samples within +-2^27 and for coefficients below 2^29;
+ * what is larger gives numbers without a meaning. The inverse leaves samples within +-2^27.
+ *
+ * axis:      0 along columns, 1 along rows.
+ * midpoints: details, at least 1; `run`: nodes that alternate with them, `midpoints` where the axis wraps, else one
+ *            more. A sample that the axis has beyond these is a node by itself.
+ * table:     20 rows of two: for the ten places before the details and the ten after them, the detail that stands there
+ *            and the sign, -1, 0 or 1, that it takes.
+ * a, b:      of the third step, within +-127; both 0: none.
+ * from:      0, or what the call before for this plane has returned.
+ * work:      kept from call to call: at least 16 + (midpoints + run + 25) lines, where `lines` is LODE_LIFT_STRIP along
+ *            LODE_LIFT_STRIP / 4 or more columns, otherwise 1.
+ * Returns how many nodes are done: `run`, except on very long axes where the plane is one row, one column, or at most
+ * LODE_LIFT_STRIP columns and at least a quarter of them.
+ */
+LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64_t columns, int64_t pitch,
+                           int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a,
+                           int64_t b, int64_t from, int32_t *work, int64_t work_count);
+
 /* mask.c --------------------------------------------------------------------------------------------------------- */
 
 /* Code rows `first` to `last` - 1 of a mask of `rows` x `columns` points.

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "mask"]
+__all__ = ["LIFT_STRIP", "MASK_MODEL", "lift", "mask"]
 
 _REFUSED = -(2**63)
 
@@ -138,6 +138,10 @@ class Kernel:
 
 
 _I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
+
+# lifting.c
+LIFT_STRIP = 64
+lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
 
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
