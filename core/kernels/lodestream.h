@@ -68,4 +68,30 @@ LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t
 
 #define LODE_MASK_MODEL ((1 << 16) + (1 << 10) + 4 + 2)
 
+/* predictor_fit.c ------------------------------------------------------------------------------------------------ */
+
+/* The factors u and w of a and b in what the third step predicts, flat, for as many rows of midpoints as `details` has;
+ * `nodes` has five rows more, the first of them two before that of the first midpoint. `kept` takes the details.
+ *
+ * Returns a number that no magnitude of u and w exceeds, at most 2^31.
+ */
+LODE_API int64_t lode_predictor_factors(const int32_t *nodes, int64_t rows, int64_t columns, int64_t pitch,
+                                        const int32_t *details, int64_t details_rows, int64_t details_columns,
+                                        int64_t details_pitch, int32_t *first, int64_t first_count, int32_t *second,
+                                        int64_t second_count, int32_t *kept, int64_t kept_count);
+
+/* Add to five moments: the sums of u u, u w, w w, u d and w d, each value weighted with 1 / (1 + |d - (a u + b w) /
+ * 256|), or not at all. Good to 1e-12.
+ */
+LODE_API int64_t lode_predictor_moments(const int32_t *first, int64_t first_count, const int32_t *second,
+                                        int64_t second_count, const int32_t *details, int64_t details_count, double a,
+                                        double b, int64_t weighted, double *moments, int64_t moments_count);
+
+/* Add to `bits`, one number, about the bits that the details take with (a, b), each within +-127: the sum of log2(1 +
+ * |e|), good to 3e-6 for each sixteen values. No magnitude of u and w exceeds `largest`, nor 2^28.
+ */
+LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, const int32_t *second,
+                                     int64_t second_count, const int32_t *details, int64_t details_count,
+                                     int64_t largest, int64_t a, int64_t b, double *bits, int64_t bits_count);
+
 #endif

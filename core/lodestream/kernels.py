@@ -15,7 +15,15 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["LIFT_STRIP", "MASK_MODEL", "lift", "mask"]
+__all__ = [
+    "LIFT_STRIP",
+    "MASK_MODEL",
+    "lift",
+    "mask",
+    "predictor_bits",
+    "predictor_factors",
+    "predictor_moments",
+]
 
 _REFUSED = -(2**63)
 
@@ -146,3 +154,8 @@ lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
+
+# predictor_fit.c
+predictor_factors = Kernel("predictor_factors", *[reads_plane(_I32)] * 2, *[writes(_I32)] * 3)
+predictor_moments = Kernel("predictor_moments", *[reads(_I32)] * 3, REAL, REAL, INTEGER, writes(_F64))
+predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, writes(_F64))
