@@ -23,6 +23,7 @@ __all__ = [
     "predictor_bits",
     "predictor_factors",
     "predictor_moments",
+    "spread",
 ]
 
 _REFUSED = -(2**63)
@@ -159,3 +160,7 @@ mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), wr
 predictor_factors = Kernel("predictor_factors", *[reads_plane(_I32)] * 2, *[writes(_I32)] * 3)
 predictor_moments = Kernel("predictor_moments", *[reads(_I32)] * 3, REAL, REAL, INTEGER, writes(_F64))
 predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, writes(_F64))
+
+# spreading.c
+_KNOWN: tuple[_Argument, ...] = (reads(_I32), reads(_I8), reads(_U8))
+spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writes_plane(_I32), INTEGER, INTEGER)
