@@ -178,10 +178,7 @@ class Tiles:
         origin: tuple[int, int] = (0, 0),
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
-        rows, columns = array.shape
-        pitch = array.strides[0] // array.itemsize
-        line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, line, pitch, *origin)
+        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
