@@ -26,8 +26,9 @@ def build_parser() -> argparse.ArgumentParser:
     """The whole command line, with the sub-commands that other packages add through ``lodestream.commands``."""
     parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
-        description="Stream structured surfaces progressively: coarse first, then finer, the error known at each step.",
-        epilog="A path - is standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
+        description="Stream structured surfaces progressively: coarse data first, then finer data, with a known error "
+        "at each step.",
+        epilog="The path - means standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")

@@ -23,8 +23,8 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "serve",
         help="start a server",
-        description="Start a server. Each option is an environment variable too: --upload-bytes is "
-        "LODESTREAM_UPLOAD_BYTES. The command line wins. Sizes may be written like 500MB or 4GiB.",
+        description="Start a server. Each option can also be set by an environment variable: --upload-bytes by "
+        "LODESTREAM_UPLOAD_BYTES. The command line takes precedence. Sizes may be written like 500MB or 4GiB.",
         allow_abbrev=False,
     )
     groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}

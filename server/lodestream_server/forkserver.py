@@ -15,7 +15,6 @@ import ctypes
 import gc
 import importlib
 import json
-import logging
 import math
 import os
 import resource
@@ -46,7 +45,6 @@ _INHERIT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
 _MOST_FILES = 256
 _MOST_SECONDS = 2.0**31
 
-_Warmed = tuple[str | None, str | None]
 _TRACEBACK = 20_000
 
 
@@ -98,8 +96,8 @@ def main() -> None:
     confinement = _try_confinement()
     _say(control, {"confinement": confinement})
     with _ending_with(parent):
-        problem, note = _warm(sys.argv[2]) if sys.argv[2] else (None, None)
-    _say(control, {"problem": problem, "note": note})
+        problem = _preload(sys.argv[2]) if sys.argv[2] else None
+    _say(control, {"problem": problem})
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     _Server(control).run()
@@ -281,12 +279,8 @@ def _limit(allowed: Allowed) -> None:
         most = math.ceil(min(time.process_time() + allowed.seconds, _MOST_SECONDS))
         # Told so by SIGXCPU; who does not listen is killed.
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
-    kernels = sys.modules.get("lodestream.numba_kernels")
-    folders = () if kernels is None else kernels.cache_folders()
-    if kernels is not None:
-        kernels.keep_no_more()
     write = () if allowed.write is None else (allowed.write,)
-    confine(Rights((*allowed.read, *folders), write, allowed.processes))
+    confine(Rights(allowed.read, write, allowed.processes))
 
 
 def resolve(name: str) -> Callable[..., Any]:
@@ -329,26 +323,13 @@ def _try_confinement() -> list[str]:
     return _in_a_fork(lambda: list(confine(Rights()))) or []
 
 
-def _warm(name: str) -> _Warmed:
-    """Call a function once in a process that ends then, and once here."""
-    # Whoever is the parent says it, once.
-    logging.getLogger("lodestream.numba_kernels").disabled = True
+def _preload(name: str) -> str | None:
+    """Call the function of this name; what went wrong, if anything did."""
     try:
-        warm = resolve(name)
+        resolve(name)()
     except Exception:
-        return traceback.format_exc()[-_TRACEBACK:], None
-    # What compiling takes in memory is gone with it; here what it has kept is loaded.
-    first = _in_a_fork(lambda: _attempt(warm))
-    return first if first is not None and first[0] is not None else _attempt(warm)
-
-
-def _attempt(function: Callable[[], object]) -> _Warmed:
-    """What went wrong, and what the function has to say."""
-    try:
-        note = function()
-    except Exception:
-        return traceback.format_exc()[-_TRACEBACK:], None
-    return None, note if isinstance(note, str) else None
+        return traceback.format_exc()[-_TRACEBACK:]
+    return None
 
 
 def _in_a_fork(function: Callable[[], Any]) -> Any:

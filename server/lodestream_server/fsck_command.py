@@ -26,28 +26,28 @@ def register(subparsers: Any) -> None:
     """Add ``fsck`` to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "fsck",
-        help="check a server's folder, and repair it",
-        description="Check everything in a server's folder: records, uploads by the hash that was taken when they "
-        "came, containers by their name, sections and segments. No server may be running there. Exit code 0: all is "
-        "well, or was repaired without a loss; 1: something is damaged, or with --retry waits still.",
+        help="check and repair the data folder of a server",
+        description="Check all records, uploads and containers in the data folder of a server, by their hashes and "
+        "checksums. No server may be running in the folder. Exit code 0: nothing is damaged, or all damage was "
+        "repaired without loss; 1: something is damaged, or (with --retry) a surface still waits.",
         allow_abbrev=False,
     )
-    parser.add_argument("data", metavar="DIR", type=Path, help="folder of a server")
+    parser.add_argument("data", metavar="DIR", type=Path, help="data folder of a server")
     parser.add_argument(
         "--repair",
         action="store_true",
-        help="move what is damaged into DIR/damaged, and build it again from its upload",
+        help="move damaged files to DIR/damaged, and build their containers again from the uploads",
     )
     parser.add_argument(
         "--adopt",
         action="store_true",
-        help="say that records, uploads and containers in DIR belong together, after they were moved there: their "
-        "markers are written anew, and uploads that have a record of their own are taken in",
+        help="declare that records, uploads and containers in DIR belong together, after you moved them there: rewrite "
+        "their identity files, and add uploads that have only their own copy of a record",
     )
     parser.add_argument(
         "--retry",
         action="store_true",
-        help="build again what waits, since it could not be built for a reason that may have passed",
+        help="also build the surfaces that wait because an earlier build failed for a temporary reason",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)

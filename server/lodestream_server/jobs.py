@@ -129,7 +129,7 @@ class Builder:
         self._settings = settings
         self._finished = finished
         self._memory = settings.memory_of_build
-        self.fork_server = ForkServer(worker.warm)
+        self.fork_server = ForkServer(worker.preload)
         self._pool = Pool(settings.workers, self.fork_server)
         self._turns = Turns(settings.workers, _REMEMBERED)
         self._callers: dict[str, str] = {}  # of the builds that wait or run
@@ -137,7 +137,7 @@ class Builder:
         self._pending: Counter[str] = Counter()
         self._running: dict[str, _Running] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._warming: asyncio.Task[None] | None = None
+        self._preloading: asyncio.Task[None] | None = None
         self._room = asyncio.Event()
         self._closing = False
         self._deleting = set[str]()
@@ -152,7 +152,7 @@ class Builder:
         return len(self._tasks), self._pending.get(caller, 0)
 
     def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
-        """Warm the kernels, and take up what was queued when the server went down.
+        """Start the process that builds come from, and take up what was queued when the server went down.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Builder:
             Raises FullError when this owner has more on the disk than one may have: builds of theirs wait meanwhile.
         """
         self._check_owner = check_owner
-        self._warming = asyncio.create_task(self._warm())
+        self._preloading = asyncio.create_task(self._preload())
         queued = [record for record in self._storage.records() if record.state == "queued"]
         # What may have killed a server comes last: everything else is built before it does so again.
         for record in sorted(queued, key=lambda record: record.attempts):
@@ -277,7 +277,7 @@ class Builder:
     async def close(self) -> None:
         """Kill what is running; it is taken up again after a restart."""
         self._closing = True
-        tasks = [*self._tasks.values(), *([self._warming] if self._warming else [])]
+        tasks = [*self._tasks.values(), *([self._preloading] if self._preloading else [])]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -290,14 +290,14 @@ class Builder:
         held = self.fork_server.confinement
         return None if held is None else "+".join(held) or "none"
 
-    async def _warm(self) -> None:
+    async def _preload(self) -> None:
         try:
-            problem, unkept = await asyncio.to_thread(self.fork_server.wait)
+            problem = await asyncio.to_thread(self.fork_server.wait)
         except ProcessDiedError as error:
-            _log.warning("the process that compiles the kernels: %s", error)
+            _log.warning("the process that builds are forked from: %s", error)
             return
         except OSError as error:
-            _log.error("the kernels could not be compiled: %s", error)
+            _log.error("the process that builds are forked from could not be started: %s", error)
             return
         held = self.confinement
         if held == "landlock+seccomp":
@@ -311,9 +311,7 @@ class Builder:
         if problem is None:
             self.ready = True
         else:
-            _log.error("the kernels could not be compiled: %s", problem)
-        if unkept is not None:
-            _log.warning("%s", unkept)
+            _log.error("what builds need could not be loaded: %s", problem)
 
     async def _build(self, record: Record) -> None:
         delay, said, attempts = _FIRST_DELAY, "", 0
@@ -389,7 +387,7 @@ class Builder:
         try:
             result: worker.Built | worker.Refused | None = await self._run(call)
             if isinstance(result, worker.Built):
-                self.ready = True  # as a build shows, whatever became of the process that was to warm them
+                self.ready = True  # as a build shows, whatever was wrong before
                 result = await self._keep(record, job, result)
             if result is None:
                 return "ready"

@@ -47,10 +47,10 @@ _LONGEST_KIND = 100
 
 # What processes that read strangers' files find in their environment: no secret of whoever started the server.
 _ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
-_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "NUMBA_", "PROJ_", "PYTHON")
+_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "PROJ_", "PYTHON")
 
 # Threads of libraries would not be there in a process that is forked, and a build has one processor.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "NUMBA", "OMP", "OPENBLAS")}
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
 
 _PROGRAM = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
 
@@ -170,15 +170,13 @@ class _Started:
         self.settled = threading.Event()
         self.confinement: tuple[str, ...] | None = None
         self.problem: str | None = None
-        self.note: str | None = None
         self.ready = False
         threading.Thread(target=self._listen, name="lodestream-forkserver", daemon=True).start()
 
     def _listen(self) -> None:
         try:
             self.confinement = tuple(self._message()["confinement"])
-            warmed = self._message()
-            self.problem, self.note = warmed["problem"], warmed["note"]
+            self.problem = self._message()["problem"]
             self.ready = True
         except (EOFError, OSError):
             pass
@@ -204,12 +202,12 @@ class ForkServer:
 
     Parameters
     ----------
-    warm : callable or None
-        Called in it without arguments before it forks for the first time; it loads what calls need.
+    preload : callable or None
+        Called in it without arguments before it forks for the first time; it imports what calls need.
     """
 
-    def __init__(self, warm: Callable[[], object] | None = None) -> None:
-        self._warm = "" if warm is None else _name(warm)
+    def __init__(self, preload: Callable[[], object] | None = None) -> None:
+        self._preload = "" if preload is None else _name(preload)
         self._lock = threading.Lock()
         self._started: _Started | None = None
         self._closed = False
@@ -224,13 +222,13 @@ class ForkServer:
         """What the kernel holds the processes of calls to, see `lodestream.confinement`; None before it is known."""
         return None if self._started is None else self._started.confinement
 
-    def wait(self, given_up: Callable[[], bool] = lambda: False) -> tuple[str | None, str | None]:
+    def wait(self, given_up: Callable[[], bool] = lambda: False) -> str | None:
         """Start it, and wait until it is ready, or nobody waits any more.
 
         Returns
         -------
-        (str or None, str or None)
-            What went wrong in `warm`, if anything did; and what it returned, if that is a text.
+        str or None
+            What went wrong in `preload`, if anything did.
 
         Raises
         ------
@@ -242,10 +240,10 @@ class ForkServer:
         started = self._running()
         while not started.settled.wait(_LOOK_SECONDS):
             if given_up():
-                return None, None
+                return None
         if not started.ready:
             raise ProcessDiedError(self._exitcode(started))
-        return started.problem, started.note
+        return started.problem
 
     def fork(self, request: bytes) -> _Process:
         """A process for a call.
@@ -300,7 +298,7 @@ class ForkServer:
             for name, value in os.environ.items()
             if name in _ENVIRONMENT or name.startswith(_ENVIRONMENT_PREFIXES)
         }
-        command = [sys.executable, "-c", program, str(theirs.fileno()), self._warm, path]
+        command = [sys.executable, "-c", program, str(theirs.fileno()), self._preload, path]
         try:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, env=environment | _ONE_THREAD, pass_fds=(theirs.fileno(),)

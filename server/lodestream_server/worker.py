@@ -30,7 +30,6 @@ from lodestream.metadata import with_notes
 
 from . import finished
 from .durable import NewFile
-from .warming import warm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,8 +45,8 @@ __all__ = [
     "Job",
     "Refused",
     "build",
+    "preload",
     "read_progress",
-    "warm",
 ]
 
 _log = logging.getLogger(__name__)
@@ -170,6 +169,22 @@ class Refused:
 
     reason: str
     final: bool = True
+
+
+def preload() -> None:
+    """Import what builds need, so that a process that is forked for one has it at once.
+
+    Raises
+    ------
+    UnavailableError
+        When the compiled kernels cannot be loaded.
+    """
+    import lodestream.encoder
+    import lodestream.inspection
+    import lodestream.mesh.recognise  # noqa: F401
+    from lodestream.library import library
+
+    library()
 
 
 def build(job: Job) -> Built | Refused:

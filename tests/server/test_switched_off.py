@@ -67,7 +67,7 @@ def test_the_setting_knows_every_format_that_is_read() -> None:
 
 @pytest.mark.parametrize("value", ["npy,vml", "NPY", "all,npy", ",", ("npy", "vml"), ()])
 def test_a_name_that_no_format_has_is_refused(value: str | tuple[str, ...]) -> None:
-    with pytest.raises(ValidationError, match="expected all, or names out of npy, npz"):
+    with pytest.raises(ValidationError, match="expected all, or some of npy, npz"):
         Settings.model_validate({"formats": value})
 
 

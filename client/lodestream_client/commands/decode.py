@@ -40,7 +40,7 @@ def register(subparsers: Subparsers) -> None:
         "decode",
         run,
         "decode a container into a file, completely or up to a limit",
-        "The suffix of OUT decides its format; standard output gets NPY.",
+        "The suffix of OUT decides its format. Standard output is NPY.",
     )
     parser.add_argument("container", metavar="IN.lode", help="container to read; - for standard input")
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
@@ -49,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--partial",
         action="store_true",
-        help="accept a truncated or damaged container: write its last complete layer",
+        help="accept a truncated or damaged container, and write its last complete layer",
     )
     add_json_option(parser)
 

@@ -25,10 +25,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "encode",
         run,
-        "encode a surface into a container, from one file or several",
+        "encode one or several files into a container",
         "The content of a file decides its format. Without --precision and --rms the container is lossless.",
     )
-    parser.add_argument("files", nargs="+", metavar="FILE", help="what to read; - for standard input")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")
     add_surface_options(parser)
     add_json_option(parser)

@@ -28,14 +28,14 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "info",
         run,
-        "show size, levels, layers and errors of a container or of a surface on a server",
-        "Levels: bytes of each level and all coarser ones, and the error that they leave.\n"
-        "Layers: bytes of the stream up to the end of each layer, and the error there.",
+        "show the size, levels, layers and errors of a container or of a surface on a server",
+        "Levels: the bytes of each level with all coarser ones, and the error of the surface at that level.\n"
+        "Layers: the bytes of the stream up to the end of each layer, and the error of the surface there.",
     )
     parser.add_argument(
         "what",
         metavar="FILE|URL",
-        help="container, - for standard input, or the address of a surface or of a container on any web server",
+        help="a container; - for standard input; or the URL of a surface, or of a container on any web server",
     )
     add_size_option(parser, decodes=False)
     add_token_option(parser)

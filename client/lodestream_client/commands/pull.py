@@ -55,12 +55,12 @@ def register(subparsers: Subparsers) -> None:
         "pull",
         run,
         "stream a surface from a server into a file, completely or up to a limit",
-        "The suffix of OUT decides its format; standard output gets NPY. A broken connection is opened again and\n"
-        "continues where it broke. After Ctrl-C, or if the server does not come back, OUT is written from what was\n"
-        "received, which is also kept for --resume.",
+        "The suffix of OUT decides its format. Standard output is NPY. If the connection breaks, pull reconnects\n"
+        "and continues where it was. After Ctrl-C, or if the server does not come back, OUT is written from the\n"
+        "data received so far, which are also kept for --resume.",
     )
     parser.add_argument(
-        "url", type=parse_source, metavar="URL", help="the surface's address, or that of a container on any web server"
+        "url", type=parse_source, metavar="URL", help="URL of the surface, or of a container on any web server"
     )
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
     add_target_options(parser)
@@ -69,14 +69,14 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="continue an earlier pull: ask only for what is missing in the folder LODESTREAM_CACHE (default: the "
-        "user's cache folder), and keep what comes there until the whole surface has been written",
+        help="continue an earlier pull: request only the data that are missing in the folder LODESTREAM_CACHE "
+        "(default: the user's cache folder), and keep new data there until the whole surface has been written",
     )
     parser.add_argument(
         "--transport",
         choices=("auto", "ws", "http"),
         default="auto",
-        help="ws: WebSocket; http: HTTP Range requests; auto: WebSocket, or HTTP where that is not possible "
+        help="ws: WebSocket; http: HTTP Range requests; auto: WebSocket, or HTTP if WebSocket is not possible "
         "(default: auto)",
     )
     parser.add_argument(
@@ -84,7 +84,7 @@ def register(subparsers: Subparsers) -> None:
         type=parse_seconds,
         default=60.0,
         metavar="S",
-        help="reconnect when a connection is lost or silent, and give up after S seconds without a byte; 0: never "
+        help="reconnect when the connection is lost or silent, and give up after S seconds without data; 0: never "
         "reconnect (default: 60)",
     )
     add_token_option(parser)
