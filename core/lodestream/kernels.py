@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "mask"]
+__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "passes"]
 
 _REFUSED = -(2**63)
 
@@ -142,3 +142,14 @@ _I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
+
+# bitplanes.c
+PASSES_STATE = 8
+MODEL, TRELLIS_MODEL = 551, 1127
+passes = Kernel(
+    "passes",
+    *[INTEGER] * 2,
+    *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
+    *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
+)
+new_models = Kernel("new_models", INTEGER, writes(_I32))
