@@ -85,4 +85,19 @@ LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *band
 /* Models before their tiles' first passes. Returns 0. */
 LODE_API int64_t lode_new_models(int64_t trellis, int32_t *models, int64_t models_count);
 
+/* gains.c -------------------------------------------------------------------------------------------------------- */
+
+/* Squared error of a tile, by how many of its passes remain.
+ *
+ * bands, early: of the tile, as above; all of it was coded.
+ * weights:      of each band, what a squared error of 1 counts.
+ * truth:        the coefficients.
+ * errors:       for 0, 1, ... passes that remain, up to all of them.
+ *
+ * Returns 0.
+ */
+LODE_API int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, const double *weights,
+                                 int64_t weights_count, const int32_t *truth, int64_t truth_count, const uint8_t *early,
+                                 int64_t early_count, double *errors, int64_t errors_count);
+
 #endif

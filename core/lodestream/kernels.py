@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "passes"]
+__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "pass_gains", "passes"]
 
 _REFUSED = -(2**63)
 
@@ -153,3 +153,6 @@ passes = Kernel(
     *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
 )
 new_models = Kernel("new_models", INTEGER, writes(_I32))
+
+# gains.c
+pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))
