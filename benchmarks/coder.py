@@ -52,23 +52,12 @@ class Channel:
     def code(self, decoding: bool) -> tuple[Tiles, int]:
         """Code all planes of all tiles; returns what is known after that, and the bytes written."""
         tiles, count = Tiles(self.table), 0
+        bands = self.table.first
         for number, (top, data) in enumerate(zip(self.planes, self.room, strict=True)):
-            count += bitplanes.code_passes(
-                decoding,
-                self.table.of_tile(number),
-                bitplanes.pass_count(top) - 1,
-                0,
-                tiles.known,
-                tiles.sign,
-                tiles.flags,
-                tiles.early,
-                self.coefficients,
-                bitplanes.new_model(),
-                data,
-                NO_COSTS,
-                False,
-                np.empty(bitplanes.SUMS, np.uint32),
-            )
+            first, own = bitplanes.pass_count(top) - 1, bands[number + 1] - bands[number]
+            run = np.array([[bands[number], own, number, first, 0, 0, data.size]], np.int64)
+            tiles.code(decoding, run, self.coefficients, data, NO_COSTS)
+            count += int(run[0, -1])
         return tiles, count
 
 

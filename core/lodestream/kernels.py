@@ -46,6 +46,7 @@ __all__ = [
     "square_distances",
     "store_values",
 ]
+__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "pass_gains", "passes"]
 
 _REFUSED = -(2**63)
 
@@ -299,3 +300,17 @@ predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, wr
 # spreading.c
 _KNOWN: tuple[_Argument, ...] = (reads(_I32), reads(_I8), reads(_U8))
 spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writes_plane(_I32), INTEGER, INTEGER)
+
+# bitplanes.c
+PASSES_STATE = 8
+MODEL, TRELLIS_MODEL = 551, 1127
+passes = Kernel(
+    "passes",
+    *[INTEGER] * 2,
+    *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
+    *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
+)
+new_models = Kernel("new_models", INTEGER, writes(_I32))
+
+# gains.c
+pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))

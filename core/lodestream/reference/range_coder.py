@@ -43,6 +43,7 @@ class RangeDecoder:
         self._low = 0
         for _ in range(4):
             self._low = self._low * 256 + next(self.unread, 0)
+        self._low = min(self._low, self._width - 1)
 
     def bit(self, probability: int) -> int:
         """The next bit, whose probability of being 1 is `probability` / 2^16."""
