@@ -39,8 +39,7 @@ class RangeDecoder:
 
     def __init__(self, string: bytes) -> None:
         self.unread = iter(string)
-        self._width = 2**32 - 1
-        self._low = 0
+        self._width, self._low = 2**32 - 1, 0
         for _ in range(4):
             self._low = self._low * 256 + next(self.unread, 0)
         self._low = min(self._low, self._width - 1)
