@@ -57,11 +57,21 @@ LODE_INLINE struct coder coder_start(bool reads, uint8_t *data, int64_t size) {
     return coder;
 }
 
-/* Add 1 to the number that ends before `place`. */
+/* Whether a coder and its weights that a caller has kept since the last call are such as a call leaves behind: from any
+ * others it might run forever, or back out of its bytes. Contexts may hold anything. */
+static inline bool coder_can_go_on(bool reads, const struct coder *coder, const int32_t *weights, int64_t count) {
+    for (int64_t i = 0; i < count; i++)
+        if (weights[i] < -HEAVIEST || weights[i] > HEAVIEST)
+            return false;
+    return coder->width >= NARROWEST && coder->low <= (reads ? coder->width - 1 : 2 * (uint64_t)WIDEST) &&
+           coder->place >= 0 && coder->place <= INT64_MAX / 2;
+}
+
+/* Add 1 to the number that ends before `place`; what is past `size` was not written. */
 static inline void coder_carry(struct coder *coder) {
-    for (int64_t back = coder->place - 1; back >= 0; back--)
-        if (back < coder->size && ++coder->data[back] != 0)
-            break;
+    int64_t back = coder->place < coder->size ? coder->place : coder->size;
+    while (back > 0 && ++coder->data[back - 1] == 0)
+        back--;
 }
 
 /* Move bytes until the interval is wide enough again. */

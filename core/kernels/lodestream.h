@@ -35,7 +35,7 @@ LODE_API const char *lode_sources(void);
  * field:  flat, (rows + 2) x (columns + 6): two rows before and three columns at either side are zeros; 1 is valid.
  * model:  LODE_MASK_MODEL contexts and weights; begun where `first` is 0.
  * data:   writing, at least 64 + 2 rows columns bytes; reading, all there are, those missing count as zeros.
- * state:  four numbers that are handed on from call to call.
+ * state:  four numbers that are handed on from call to call, as the model is; others are refused.
  * Returns the bytes written or looked at so far, all of them once `last` is `rows`.
  */
 LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
