@@ -17,6 +17,7 @@ from lodestream.errors import FormatError
 from lodestream.formats.lzf import decompress
 from lodestream.mesh.recognise import recognise
 from tests.core.meshes import FaceList, collapse, cut_in_two, grid_faces, mesh_of, scrambled, star
+from tests.core.test_mesh_attributes import sphere, with_texture
 from tests.golden.generate import FOLDER, expectations, originals
 
 from .declared import declarations
@@ -74,6 +75,8 @@ def _meshes() -> None:
             mesh = mesh_of(scrambled(faces, vertices, rng), vertices, rng)
             with contextlib.suppress(FormatError):  # what is no surface is refused only after its walks
                 recognise(mesh).surface()
+    for cut in ("", "main"):
+        recognise(with_texture(*sphere(5, 7, cut))).surface()
 
 
 def _compressed_scans() -> None:
