@@ -11,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels test test-lowest torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -28,6 +28,12 @@ test: kernels ## run the tests; ARGS="-k name" for some of them
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
 
+sanitize: kernels ## run tests of the kernels under sanitizers, count their lines, call each with anything; ARGS="--seconds 600"
+	@$(BIN)/python -m tests.kernels.sanitize $(ARGS)
+
+portable: kernels ## compare the kernels' bits from gcc, clang and zig, and on imitated machines, with whatever is there
+	@$(BIN)/python -m tests.kernels.portable --zig $(ARGS)
+
 torture: kernels ## what takes too long for every run, into docs/reliability.md; ARGS="--seconds 300" or "kills fuzz"
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --group torture || true
 	@$(BIN)/python -m tests.torture $(ARGS)
@@ -36,14 +42,25 @@ torture: kernels ## what takes too long for every run, into docs/reliability.md;
 kernels: $(STAMP)
 	@$(BIN)/python core/kernels/build.py
 
-lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
+C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
+CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
+C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
+
+lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and gcc's warnings where it is
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
+	$(CLANG_FORMAT) --dry-run -Werror $(C) || status=1; \
+	if command -v gcc > /dev/null; then \
+		for file in $(filter %.c,$(C)); do gcc $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
+	else \
+		echo "lint: there is no gcc, so nobody has seen its warnings"; \
+	fi; \
 	exit $$status
 
-format: $(STAMP) ## let ruff lay out the code and sort its imports
+format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C
 	@$(BIN)/ruff check --quiet --select I --fix
 	@$(BIN)/ruff format --quiet
+	@$(CLANG_FORMAT) -i $(C)
 
 bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
 	@$(BIN)/python -m benchmarks $(ARGS)
