@@ -1,4 +1,4 @@
-"""The command ``lodestream``: its parser, and what becomes of errors."""
+"""The command ``lodestream``: its parser, and how errors are reported."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     """
     parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
-        description="Stream structured surfaces progressively: coarse first, then finer, the error known at each step.",
-        epilog="A path - is standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
+        description="Stream structured surfaces progressively: coarse data first, then finer data, with a known error "
+        "at each step.",
+        epilog="The path - means standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")

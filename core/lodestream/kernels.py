@@ -17,13 +17,45 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "mask"]
+__all__ = [
+    "CLASSES",
+    "DIFFERENCES_MEMORY",
+    "DIFFERENCES_MODEL",
+    "INDICES",
+    "LIFT_STRIP",
+    "MASK_MODEL",
+    "OFFSETS_MODEL",
+    "PART_COLUMNS",
+    "PART_ROWS",
+    "VALUE_TYPES",
+    "choose",
+    "classify",
+    "differences",
+    "lift",
+    "lzf",
+    "mask",
+    "most_bits",
+    "offsets",
+    "predictor_bits",
+    "predictor_factors",
+    "predictor_moments",
+    "pull",
+    "push",
+    "relax",
+    "spread",
+    "square_distances",
+    "store_values",
+]
+__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "pass_gains", "passes"]
 
 _REFUSED = -(2**63)
 
 
 #: Bits of `numpy.ndarray.flags`: in one piece, every value at an address that its dtype may have, not read-only.
 _IN_ONE_PIECE, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400
+
+#: The types that the values of a surface may have, by the number that kernels know them by.
+VALUE_TYPES = [np.dtype(name) for name in ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")]
 
 #: What ctypes takes for the address of a buffer: numpy takes four times as long to tell the number.
 _Start: Any = ctypes.c_char * 0
@@ -68,6 +100,23 @@ class Plane:
             raise ValueError(f"expected values of a row side by side, got strides {value.strides}")
         whole = flags & _WRITEABLE and flags & _IN_ONE_PIECE
         return (_Start.from_buffer(value) if whole else value.ctypes.data, rows, columns, pitch)
+
+
+class Values:
+    """An array in one piece, of any shape and any of `VALUE_TYPES`: a pointer, elements, the number of its type."""
+
+    types = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+
+    def __init__(self, written: bool) -> None:
+        self.written = written
+        self._arrays = [Array(dtype, written) for dtype in VALUE_TYPES]
+
+    def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
+        """What the function is given for an array."""
+        if value.dtype not in VALUE_TYPES:
+            raise TypeError(f"expected an array of numbers in this machine's order, got one of {value.dtype}")
+        number = VALUE_TYPES.index(value.dtype)
+        return (*self._arrays[number].passed(value), number)
 
 
 def _check(value: NDArray[Any], dtype: np.dtype[Any], needed: int) -> None:
@@ -124,9 +173,19 @@ def writes_plane(dtype: DTypeLike) -> Plane:
     return Plane(dtype, True)
 
 
+def reads_values() -> Values:
+    """Values of any type that a kernel reads."""
+    return Values(False)
+
+
+def writes_values() -> Values:
+    """Values of any type that a kernel changes."""
+    return Values(True)
+
+
 INTEGER, REAL = _Integer(), _Real()
 
-_Argument = Array | Plane | _Integer | _Real
+_Argument = Array | Plane | Values | _Integer | _Real
 
 
 class Kernel:
@@ -185,8 +244,73 @@ def _described(values: tuple[Any, ...]) -> str:
     return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
-_I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
+_BOOL, _I8, _U8, _I32, _I64, _F64 = np.bool_, np.int8, np.uint8, np.int32, np.int64, np.float64
+
+# lifting.c
+LIFT_STRIP = 64
+lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
 
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
+
+# values.c
+PART_ROWS, PART_COLUMNS = 128, 512
+store_values = Kernel("store_values", reads_plane(_I32), writes_values(), *[INTEGER] * 5, *[REAL] * 3)
+square_distances = Kernel(
+    "square_distances", reads_values(), reads(_I32), reads(_F64), reads(_BOOL), writes(_F64), *[INTEGER] * 7
+)
+
+# holes.c
+pull = Kernel("pull", reads(_F64), reads(_BOOL), *[INTEGER] * 4, writes(_F64), writes(_BOOL))
+push = Kernel("push", writes(_F64), reads(_BOOL), *[INTEGER] * 6, reads(_F64))
+relax = Kernel("relax", writes(_F64), reads(_BOOL), *[INTEGER] * 6)
+
+# trellis_choice.c
+CLASSES, INDICES = 30, 16
+classify = Kernel("classify", reads(_I64), reads(_I64), reads(_I32), writes(_F64), writes(_I8))
+choose = Kernel(
+    "choose",
+    *[reads(_I64), reads(_F64), reads(_I8), reads(_F64)],
+    REAL,
+    *[writes(_I32), writes(_F64), writes(_I32), writes(_U8)],
+)
+
+# lzf.c
+lzf = Kernel("lzf", reads(_U8), writes(_U8), INTEGER, writes(_I64))
+
+# differences.c
+DIFFERENCES_MODEL = 256 + 4 + 16 + 1 + 1 + 16
+DIFFERENCES_MEMORY = 1 << 14
+_of_values = reads(_I64), writes(_I64), reads(_I32), writes(_U8)
+_room = writes(_I32), writes(_I64)
+_coded = writes(_U8), writes(_U8), writes(_I64)
+differences = Kernel("differences", INTEGER, *_of_values, INTEGER, INTEGER, *_room, *_coded)
+most_bits = Kernel("most_bits", reads(_I64), reads(_I32), reads(_U8))
+
+# offsets.c
+OFFSETS_MODEL = 16 + 1 + 64 + 2 * 8 + 16 + 34
+offsets = Kernel("offsets", INTEGER, reads(_F64), reads(_I64), INTEGER, writes(_I64), writes(_I32), writes(_U8))
+
+# predictor_fit.c
+predictor_factors = Kernel("predictor_factors", *[reads_plane(_I32)] * 2, *[writes(_I32)] * 3)
+predictor_moments = Kernel("predictor_moments", *[reads(_I32)] * 3, REAL, REAL, INTEGER, writes(_F64))
+predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, writes(_F64))
+
+# spreading.c
+_KNOWN: tuple[_Argument, ...] = (reads(_I32), reads(_I8), reads(_U8))
+spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writes_plane(_I32), INTEGER, INTEGER)
+
+# bitplanes.c
+PASSES_STATE = 8
+MODEL, TRELLIS_MODEL = 551, 1127
+passes = Kernel(
+    "passes",
+    *[INTEGER] * 2,
+    *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
+    *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
+)
+new_models = Kernel("new_models", INTEGER, writes(_I32))
+
+# gains.c
+pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))

@@ -41,7 +41,7 @@ def loaded_after(statement: str, names: Sequence[str]) -> list[str]:
     return [str(name) for name in json.loads(done.stdout.replace(b"'", b'"'))]
 
 
-HEAVY = ("numba", "fastapi", "uvicorn", "rasterio", "matplotlib")
+HEAVY = ("fastapi", "uvicorn", "rasterio", "matplotlib")
 
 
 def test_importing_the_client_is_light() -> None:

@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import fill, kernels
 from lodestream.fill import fill_holes, settle_holes
 from lodestream.layout import Layout
 from lodestream.transform import allocate, forward
@@ -46,6 +47,138 @@ def test_valid_points_stay_and_holes_lie_within_their_range(
         valid = given_[mask]
         assert got.min() >= (valid.min() if valid.size else 0)
         assert got.max() <= (valid.max() if valid.size else 0)
+
+
+def beside(place: int, step: int, length: int, wraps: bool) -> int:
+    return (place + step) % length if wraps else min(max(place + step, 0), length - 1)
+
+
+def plain_fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: tuple[bool, bool], sweeps: int) -> None:
+    """What the kernels do, point by point."""
+    rows, columns = values.shape
+    height, width = (rows + 1) // 2, (columns + 1) // 2
+    coarser, count = np.zeros((height, width)), np.zeros((height, width))
+    whole = np.zeros((height + 2, width + 2), np.bool_)
+    for i, j in np.ndindex(height, width):
+        own = known[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
+        for value in values[2 * i : 2 * i + 2, 2 * j : 2 * j + 2][own]:
+            coarser[i, j] += 0.25 * value
+        count[i, j] = own.sum()
+        coarser[i, j] *= 4.0 / float(count[i, j] or 1)
+        whole[i + 1, j + 1] = own.all()
+    found = count > 0
+    for i, j in np.ndindex(height, width):
+        found[i, j] &= whole[i + 1, j + 1] or not whole[i : i + 3, j : j + 3].any()
+    if not found.all():
+        plain_fill(coarser, found, closed, sweeps + fill._MORE)
+    holes = [(int(i), int(j)) for i, j in np.argwhere(~known)]
+    for i, j in holes:
+        near, here = i // 2, j // 2
+        far = beside(near, 2 * (i % 2) - 1, height, closed[0])
+        there = beside(here, 2 * (j % 2) - 1, width, closed[1])
+        at_near = 0.75 * coarser[near, here] + 0.25 * coarser[near, there]
+        at_far = 0.75 * coarser[far, here] + 0.25 * coarser[far, there]
+        values[i, j] = 0.75 * at_near + 0.25 * at_far
+    for sweep in range(2 * sweeps):
+        step = -1 if sweep % 2 else 1
+        for i, j in holes[::step]:
+            up, down, top, bottom = (values[beside(i, k, rows, closed[0])] for k in (-1, 1, -2, 2))
+            behind, ahead, further_behind, further_ahead = (
+                beside(j, k * step, columns, closed[1]) for k in (-1, 1, -2, 2)
+            )
+            row = values[i]
+            near = (up[j] + down[j]) + row[ahead]
+            corners = (up[behind] + down[ahead]) + (up[ahead] + down[behind])
+            far = (top[j] + bottom[j]) + row[further_ahead]
+            others = 0.56 * near - 0.14 * corners - 0.07 * far - 0.4 * row[j]
+            row[j] = (others - 0.07 * row[further_behind]) + 0.56 * row[behind]
+
+
+@settings(max_examples=60)
+@given(
+    shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    closed=st.tuples(st.booleans(), st.booleans()),
+    share=st.floats(0, 1),
+    at_once=st.integers(1, 300),
+    seed=st.integers(0, 2**32),
+)
+def test_the_kernels_do_what_a_plain_loop_does_in_any_runs(
+    shape: tuple[int, int], closed: tuple[bool, bool], share: float, at_once: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    known = rng.random(shape) < share
+    known[rng.integers(shape[0]), :] = rng.random() < 0.5
+    known.flat[rng.integers(known.size)] = True
+    values = np.where(known, rng.normal(size=shape), 0.0)
+    expected = values.copy()
+    plain_fill(expected, known, closed, 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fill, "_AT_ONCE", at_once)
+        fill._fill(values, known, closed, 2)
+    assert values.tobytes() == expected.tobytes()
+
+
+def test_a_hole_step_goes_beyond_the_plate() -> None:
+    """One step is 1.4 times the way to (8 near - 2 corners - far) / 20."""
+    values, known = np.random.default_rng(1).normal(size=(5, 5)), np.ones((5, 5), np.bool_)
+    known[2, 2] = False
+    near = values[1, 2] + values[3, 2] + values[2, 1] + values[2, 3]
+    corners = values[1, 1] + values[1, 3] + values[3, 1] + values[3, 3]
+    far = values[0, 2] + values[4, 2] + values[2, 0] + values[2, 4]
+    expected = values[2, 2] + 1.4 * ((8 * near - 2 * corners - far) / 20 - values[2, 2])
+    kernels.relax(values, known, 5, 5, 0, 25, False, False)
+    assert values[2, 2] == pytest.approx(expected, rel=1e-14)
+
+
+PULL: dict[str, Any] = {
+    "values": np.zeros((5, 4)),
+    "known": np.zeros((5, 4), np.bool_),
+    "rows": 5,
+    "columns": 4,
+    "first": 0,
+    "last": 6,
+    "coarser": np.zeros((3, 2)),
+    "found": np.zeros((3, 2), np.bool_),
+}
+PUSH: dict[str, Any] = {
+    **dict(list(PULL.items())[:5]),
+    "last": 20,
+    "closed": 0,
+    "wraps": 0,
+    "coarser": np.zeros((3, 2)),
+}
+RELAX: dict[str, Any] = {**dict(list(PUSH.items())[:-1]), "last": 300}
+MISFITS: list[dict[str, Any]] = [
+    {"values": np.zeros(19)},
+    {"known": np.zeros(21, np.bool_)},
+    {"rows": 4},
+    {"rows": -5, "columns": -4},
+    {"rows": 0},
+    {"rows": 2**32, "columns": 2**32},
+    {"first": -1},
+    {"first": 5, "last": 4},
+]
+
+
+@pytest.mark.parametrize("changed", [*MISFITS, {"last": 7}, {"coarser": np.zeros(5)}, {"found": np.zeros(7, np.bool_)}])
+def test_a_pull_that_does_not_fit_is_refused(changed: dict[str, Any]) -> None:
+    assert kernels.pull(*PULL.values()) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.pull(*(PULL | changed).values())
+
+
+@pytest.mark.parametrize("changed", [*MISFITS, {"last": 21}, {"coarser": np.zeros(7)}])
+def test_a_push_that_does_not_fit_is_refused(changed: dict[str, Any]) -> None:
+    assert kernels.push(*PUSH.values()) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.push(*(PUSH | changed).values())
+
+
+@pytest.mark.parametrize("changed", MISFITS)
+def test_sweeps_that_do_not_fit_are_refused(changed: dict[str, Any]) -> None:
+    assert kernels.relax(*RELAX.values()) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.relax(*(RELAX | changed).values())
 
 
 @pytest.mark.parametrize("nothing", [np.nan, np.inf, -1e300])

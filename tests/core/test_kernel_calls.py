@@ -12,7 +12,21 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import kernels
-from lodestream.kernels import INTEGER, REAL, Array, Kernel, Plane, reads, reads_plane, writes, writes_plane
+from lodestream.kernels import (
+    INTEGER,
+    REAL,
+    VALUE_TYPES,
+    Array,
+    Kernel,
+    Plane,
+    Values,
+    reads,
+    reads_plane,
+    reads_values,
+    writes,
+    writes_plane,
+    writes_values,
+)
 
 HEADER = (Path(__file__).parents[2] / "core" / "kernels" / "lodestream.h").read_text()
 CODE = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
@@ -57,6 +71,9 @@ def test_what_is_passed_is_what_the_function_takes(name: str) -> None:
             expected = ELEMENTS.get(element, element.removesuffix("_t"))
             assert argument.dtype == expected or (argument.dtype == bool and expected == "uint8"), pointer.name
             assert pointer.ctype.startswith("const ") != argument.written, pointer.name
+        elif isinstance(argument, Values):
+            assert mine[0].ctype == ("void *" if argument.written else "const void *"), mine[0].name
+            assert mine[2].name == f"{mine[0].name}_type"
 
 
 def test_constants_are_those_of_the_header() -> None:
@@ -138,6 +155,14 @@ def test_a_plane_is_its_address_rows_columns_and_pitch(cut: Any, shape: tuple[in
     assert call(plane, writes_plane("i4")) == (plane.ctypes.data, *shape, pitch)
 
 
+@pytest.mark.parametrize("number", range(len(VALUE_TYPES)))
+def test_values_are_their_address_elements_and_the_number_of_their_type(number: int) -> None:
+    array = np.zeros((2, 3), VALUE_TYPES[number])
+    for declared in (reads_values(), writes_values()):
+        assert call(array, declared) == (array.ctypes.data, 6, number)
+    assert call(read_only(array), reads_values())[1:] == (6, number)
+
+
 def test_numbers_are_passed_as_they_are() -> None:
     for integer in (0, -(2**63) + 1, 2**63 - 1, True, np.int64(-3), np.uint8(200)):
         assert call(integer, INTEGER) == (integer,)
@@ -163,6 +188,13 @@ WRONG: list[tuple[Any, Any, type[Exception], str]] = [
     (np.zeros((3, 3), np.int32)[::-1], reads_plane("i4"), ValueError, "side by side, got strides (-12, 4)"),
     (np.zeros(3, np.int32), reads_plane("i4"), ValueError, "expected two axes, got shape (3,)"),
     (np.zeros(3, np.dtype([("a", "i4"), ("b", "i2")]))["a"].reshape(3, 1), reads_plane("i4"), ValueError, "aligned"),
+    (np.zeros(3, ">f8"), reads_values(), TypeError, "expected an array of numbers in this machine's order, got one of"),
+    (np.zeros(3, np.float16), writes_values(), TypeError, "in this machine's order, got one of float16"),
+    (np.zeros(3, np.bool_), writes_values(), TypeError, "in this machine's order, got one of bool"),
+    (read_only(np.zeros(3, np.uint8)), writes_values(), ValueError, "got one that is read-only"),
+    (np.zeros((3, 3), np.uint8)[:, 1:], reads_values(), ValueError, "in one piece, got (3, 2) with strides (3, 1)"),
+    (misaligned("f8"), reads_values(), ValueError, "expected an aligned array"),
+    ([1, 2], reads_values(), TypeError, "expected an array, got list"),
     ([1, 2], reads("i4"), TypeError, "expected an array, got list"),
     (None, writes_plane("i4"), TypeError, "expected an array, got NoneType"),
     (2.0, INTEGER, TypeError, "'float' object cannot be interpreted as an integer"),

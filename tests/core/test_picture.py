@@ -1,11 +1,17 @@
 from __future__ import annotations
 
 import itertools
+import math
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import kernels, picture
+from lodestream.kernels import PART_COLUMNS, PART_ROWS
 from lodestream.lattice import Lattice
 from lodestream.measure import distances
 from lodestream.picture import Original, coordinate_distances, store_values
@@ -18,6 +24,9 @@ LATTICES = [
     Lattice("decimal", 7.0, 100.0),
     Lattice("affine", 1e300, 1e290),
     Lattice("affine", 0.0, 1e-200),
+    Lattice("affine", 0.0, 0.5),  # halves, which are rounded to even
+    Lattice("affine", 2.0**62, 2.0**40),
+    Lattice("decimal", 1e300, 1e-5),
 ]
 
 
@@ -54,6 +63,173 @@ def test_distances_are_those_of_the_picture(dtype: str) -> None:
                 0.0,
                 0.0,
             )
+
+
+def plain_distances(original: NDArray[Any], picture: NDArray[Any], counted: NDArray[np.bool_]) -> tuple[float, float]:
+    """RMS and largest distance, their sums taken in the order of the kernel."""
+    with np.errstate(over="ignore"):
+        squares = np.zeros(original.shape[:2])
+        for channel in range(picture.shape[2]):
+            delta = original[..., channel].astype(np.float64) - picture[..., channel].astype(np.float64)
+            squares += delta * delta
+    squares[~counted] = 0.0
+    totals = []
+    rows, columns = original.shape[0], original.shape[1]
+    for top, left in itertools.product(range(0, rows, PART_ROWS), range(0, columns, PART_COLUMNS)):
+        part = squares[top : top + PART_ROWS, left : left + PART_COLUMNS]
+        sums = np.zeros(part.shape[1])
+        for row in part:
+            sums += row
+        total = 0.0
+        for own in sums.tolist():
+            total += own
+        totals.append(total)
+    return math.sqrt(math.fsum(totals) / np.count_nonzero(counted)), math.sqrt(squares.max())
+
+
+@pytest.mark.parametrize("dtype", [name for name in DTYPES if name not in ("int64", "uint64")])
+def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for shape, geometric in itertools.product([(259, 1027), (1, 3), (2, 512)], (1, 3)):
+        numbers = coordinates((geometric, *shape))
+        counted = np.random.default_rng(5).random(shape) < 0.8
+        counted[0, 0] = True
+        lattices = [LATTICES[0], LATTICES[2], LATTICES[5]][:geometric]
+        shown = np.zeros((*shape, geometric), dtype)
+        for channel, lattice in enumerate(lattices):
+            store_values(lattice, (numbers[channel, :, : shape[1]], 3), shown, channel)
+        original = np.zeros((*shape, geometric + 1), dtype)
+        original[..., :-1] = np.roll(shown, 1, axis=1)
+        for mask in (None, counted):
+            expected = plain_distances(original, shown, np.ones(shape, np.bool_) if mask is None else mask)
+            for at_once in (1, 16):
+                monkeypatch.setattr(picture, "_PARTS", at_once)
+                found = coordinate_distances([Original(original, mask)], lattices, [numbers], [3] * geometric)
+                assert found == expected
+
+
+@given(
+    shape=st.tuples(st.integers(1, 9), st.integers(1, 30), st.integers(1, 3)),
+    dtype=st.sampled_from(DTYPES),
+    decimal=st.booleans(),
+    origin=st.floats(-1e20, 1e20),
+    step=st.floats(1e-20, 1e20),
+    fraction=st.integers(0, 5),
+    at_once=st.integers(1, 40),
+    seed=st.integers(0, 2**32),
+)
+def test_values_of_any_lattice_come_in_any_runs(
+    shape: tuple[int, int, int],
+    dtype: str,
+    decimal: bool,
+    origin: float,
+    step: float,
+    fraction: int,
+    at_once: int,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows, columns, channels = shape
+    wide = rng.integers(-(2**31), 2**31, (rows, columns + 3)) >> rng.integers(0, 32, (rows, columns + 3))
+    numbers = wide.astype(np.int32)[:, 1 : columns + 1]
+    lattice = Lattice("decimal" if decimal else "affine", origin, step)
+    points = np.zeros(shape, dtype)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(picture, "_AT_ONCE", at_once)
+        store_values(lattice, (numbers, fraction), points, channels - 1)
+    assert points[..., -1].tobytes() == lattice.values(numbers, points.dtype, fraction).tobytes()
+    assert not points[..., :-1].any()
+
+
+GOOD: dict[str, Any] = {
+    "coordinates": np.zeros((3, 4), np.int32),
+    "points": np.zeros((3, 4, 2), np.float32),
+    "channels": 2,
+    "channel": 1,
+    "first": 0,
+    "last": 12,
+    "decimal": 0,
+    "origin": 0.0,
+    "step": 1.0,
+    "scale": 1.0,
+}
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"points": np.zeros((3, 4, 1), np.float32)},
+        {"points": np.zeros((3, 5, 2), np.float32)},
+        {"points": np.zeros(25, np.float32)},
+        {"channels": 0},
+        {"channels": -2},
+        {"channel": 2},
+        {"channel": -1},
+        {"first": -1},
+        {"first": 12, "last": 11},
+        {"last": 13},
+        {"coordinates": np.zeros((3, 4), np.int32)[:0]},
+        {"coordinates": np.zeros((3, 4), np.int32)[:, :0]},
+        {"origin": math.nan},
+        {"origin": math.inf},
+        {"step": 0.0},
+        {"step": -1.0},
+        {"step": math.inf},
+        {"scale": math.nan},
+    ],
+)
+def test_values_that_do_not_fit_are_refused(changed: dict[str, Any]) -> None:
+    assert kernels.store_values(*GOOD.values()) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.store_values(*(GOOD | changed).values())
+
+
+COMPARED: dict[str, Any] = {
+    "points": np.zeros((3, 600, 3), np.float32),
+    "coordinates": np.zeros((2, 3, 602), np.int32),
+    "rules": np.tile([0.0, 0.0, 1.0, 1.0], 2),
+    "counted": np.zeros(0, np.bool_),
+    "figures": np.zeros((2, 2)),
+    "rows": 3,
+    "columns": 600,
+    "channels": 3,
+    "height": 3,
+    "pitch": 602,
+    "first": 0,
+    "last": 2,
+}
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"points": np.zeros((3, 600, 3), np.int64)},
+        {"points": np.zeros((3, 600, 3), np.uint64)},
+        {"points": np.zeros((3, 600, 2), np.float32)},
+        {"rows": 0},
+        {"rows": 2**62},
+        {"columns": -1},
+        {"channels": 1},
+        {"coordinates": np.zeros((1, 3, 602), np.int32)},
+        {"height": 2},
+        {"pitch": 599},
+        {"pitch": 603},
+        {"rules": np.zeros(0)},
+        {"rules": np.ones(7)},
+        {"rules": np.tile([0.0, 0.0, 1.0, 1.0], 4)},
+        {"rules": np.tile([0.0, math.nan, 1.0, 1.0], 2)},
+        {"rules": np.tile([0.0, 0.0, 0.0, 1.0], 2)},
+        {"counted": np.zeros(3 * 599, np.bool_)},
+        {"first": -1},
+        {"first": 2, "last": 1},
+        {"last": 3},
+        {"figures": np.zeros((1, 2))},
+        {"figures": np.zeros(0)},
+    ],
+)
+def test_distances_that_do_not_fit_are_refused(changed: dict[str, Any]) -> None:
+    assert kernels.square_distances(*COMPARED.values()) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.square_distances(*(COMPARED | changed).values())
 
 
 def test_attributes_have_no_part_in_distances() -> None:

@@ -16,7 +16,6 @@ from plyfile import PlyData, PlyElement
 
 from lodestream import formats
 from lodestream.errors import FormatError, TooLargeError
-from lodestream.formats.lzf import decompress
 
 ROWS, COLUMNS = 5, 7
 
@@ -238,22 +237,3 @@ def test_a_compressed_cloud_that_lies_is_refused_before_memory_is_taken(tmp_path
         path.write_bytes(whole[:start] + content)
         with pytest.raises(FormatError, match=message):
             formats.read(path)
-
-
-@pytest.mark.parametrize(
-    ("content", "made"),
-    [
-        (b"\x02abc", b"abc"),
-        (b"\x00a\x20\x00", b"aaaa"),
-        (b"\x01ab\xe0\x05\x01", b"ab" * 8),
-        (b"\x02abc\x40\x02\x00x", b"abcabcax"),
-    ],
-)
-def test_lzf(content: bytes, made: bytes) -> None:
-    assert decompress(content, len(made)).tobytes() == made
-    for size in (len(made) - 1, len(made) + 1):
-        with pytest.raises(FormatError, match="LZF data that make"):
-            decompress(content, size)
-    for cut in range(1, len(content)):
-        with pytest.raises(FormatError, match="LZF data that make"):
-            decompress(content[:cut], len(made))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -16,9 +15,6 @@ from lodestream.container import read_index
 from lodestream.container.fields import FieldWriter
 from lodestream.container.headers import parse_header, serialize_header
 from lodestream.errors import CorruptStreamError, OptionError
-from lodestream.quantiser import MOST_BASE
-from lodestream.rate_distortion import _choose, _laplace, longest_base
-from lodestream.trellis import ODD, TRANSITIONS
 
 
 def waves(rows: int, columns: int) -> NDArray[np.float64]:
@@ -147,51 +143,3 @@ def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
     else:
         quantiser = parse_header(changed, 0, 0).quantiser
         assert (0 if quantiser is None else quantiser.base) == base
-
-
-@settings(max_examples=35)
-@given(
-    sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
-    classes=st.lists(st.integers(0, 29), min_size=5, max_size=5),
-)
-def test_the_cheapest_way_through_the_trellis_is_found(sizes: list[float], classes: list[int]) -> None:
-    bits, worth, count = _laplace(), 0.05, len(sizes)
-    band = np.zeros(10, np.int64)
-    band[:4] = 0, count, 1, count
-    chosen, counts = np.zeros(count, np.int32), np.zeros(bits.shape)
-    groups = np.array(classes[:count], np.int8)
-    _choose(band, np.array(sizes), groups, bits, worth, chosen, counts)
-
-    def cost(indices: tuple[int, ...]) -> float:
-        state, total = 0, 0.0
-        for size, group, k in zip(sizes, classes, indices, strict=False):
-            o = int(ODD[state])
-            error = abs(size) - (k - 0.5 * o if k else 0.0)
-            total += error**2 + worth * (bits[o, group, k] + (1.0 if k else 0.0))
-            state = int(TRANSITIONS[state, k & 1])
-        return total
-
-    nearest = [sorted({0, int(abs(size)), int(abs(size)) + 1, int(abs(size) + 0.5) + 1}) for size in sizes]
-    best = min(cost(way) for way in itertools.product(*nearest))
-    assert cost(tuple(abs(int(k)) for k in chosen)) <= best + 1e-9
-    assert counts.sum() == count
-    assert all(k == 0 or (k > 0) == (size >= 0) for k, size in zip(chosen, sizes, strict=True))
-
-
-@given(power=st.floats(0.3, 2.0), scale=st.floats(1e-3, 1e3), wanted=st.floats(1e-2, 1e2), guess=st.integers(1, 5000))
-def test_the_longest_base_keeps_the_error(power: float, scale: float, wanted: float, guess: int) -> None:
-    def error(base: int) -> float:
-        assert 1 <= base <= MOST_BASE
-        return float(scale * base**power)
-
-    base = longest_base(error, wanted, guess)
-    if base is None:
-        assert error(1) > wanted or error(guess) > wanted
-    else:
-        assert error(base) <= wanted
-
-
-def test_the_longest_base_is_close_to_the_error() -> None:
-    found = longest_base(lambda base: 0.5 * base**0.8, 100.0, 128)
-    assert found is not None
-    assert 0.99 * 100.0 <= 0.5 * found**0.8 <= 100.0

@@ -1,8 +1,8 @@
-"""What a command says and writes: results to standard output, everything else to standard error, files by rename.
+"""Output of the commands: results to standard output, everything else to standard error, files by renaming.
 
-Nothing else of the client writes to a terminal. What is said comes in part from files and servers, so it passes
-`printable` here: in a line by `note` and `say`, in a table by `cell`, which also keeps brackets from being taken for
-markup. JSON is written in ASCII, with escapes of its own, and is exact.
+No other module of the client writes to a terminal. Messages contain text from files and servers, so all text passes
+`printable` here: lines in `note` and `say`, table cells in `cell`, which also keeps brackets from being taken for
+markup. JSON is ASCII with JSON's own escapes, and exact.
 """
 
 from __future__ import annotations
@@ -50,24 +50,24 @@ __all__ = [
 
 
 def note(text: str) -> None:
-    """Say something that is not the result, in a line."""
+    """Print one line that is not part of the result."""
     print(f"lodestream: {printable(' '.join(text.split()))}", file=sys.stderr)
 
 
 def say(text: str) -> None:
-    """Print a line of the result."""
+    """Print one line of the result."""
     print(printable(text))
 
 
 def cell(*lines: object) -> Text:
-    """What stands in a table, or is printed beside one, as it is."""
+    """The contents of a table cell, printed literally."""
     from rich.text import Text
 
     return Text("\n".join(printable(str(line)) for line in lines))
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of the command line whose errors name what was given as it is."""
+    """An argument parser whose error messages are safe to print."""
 
     def error(self, message: str) -> NoReturn:
         """Print usage and message, and end the program with 2."""
@@ -76,7 +76,7 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def clean_warnings() -> Iterator[None]:
-    """Show what warnings and the logs of libraries say, of files for the most part, as `note` does."""
+    """Print warnings and log lines of libraries as `note` does."""
     handler = logging.lastResort  # what is used where nobody has set anything up, as here
     formatter = handler.formatter if handler is not None else None
     with warnings.catch_warnings():
@@ -107,9 +107,9 @@ def _show_warning(
 
 
 def point_words(details: Mapping[str, Any]) -> str:
-    """How many points a surface has, and how many of them are holes, from the keys of ``info``."""
+    """The number of points and holes of a surface, from the keys of ``info``."""
     total, holes, kept = _points(details), details.get("holes") or 0, details.get("non_finite") or 0
-    words = f", {kept} of these infinite or in part NaN, which come back" if kept else ""
+    words = f", {kept} of these infinite or partly NaN, whose values are kept" if kept else ""
     return f"{total}, {holes} of them holes{words}" if holes else str(total)
 
 
@@ -118,13 +118,13 @@ def _points(details: Mapping[str, Any]) -> int:
 
 
 def note_holes(holes: int, total: int) -> None:
-    """Say how many points have no value, if any."""
+    """Report how many points are holes, if any are."""
     if holes:
         note(f"{holes} of {total} points are holes")
 
 
 def note_details(details: Mapping[str, Any]) -> None:
-    """Say what a server noted when it read a surface: what it left out or chose, and holes."""
+    """Report the notes of a server's build: what was left out or chosen, and holes."""
     notes = (details.get("metadata") or {}).get("notes")
     for text in notes if isinstance(notes, list) else ():  # in a container somebody may have put anything there
         note(str(text))
@@ -138,7 +138,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 
 def human_size(size: float) -> str:
-    """A number of bytes with a unit, for reading."""
+    """A number of bytes with a unit."""
     for unit in ("B", "kB", "MB"):
         if size < 1000:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
@@ -147,7 +147,7 @@ def human_size(size: float) -> str:
 
 
 def human_time(seconds: float) -> str:
-    """How long is left, for reading."""
+    """Remaining time as text."""
     whole = math.ceil(seconds)
     if whole < 60:
         return f"{whole} s left"
@@ -156,7 +156,7 @@ def human_time(seconds: float) -> str:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A console for tables; wide where no terminal limits it, so that nothing wraps in a file or pipe."""
+    """A console for tables; wide if the output is not a terminal, so that lines in a file or pipe do not wrap."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
@@ -191,9 +191,9 @@ class _Unseen:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error; nothing at all when that is not a terminal.
+    """A progress bar on standard error; not shown if that is not a terminal.
 
-    A task's field ``limit``, if it has one, is the most seconds that it may last.
+    If a task has a field ``limit``, it is the maximum number of seconds that it may take.
     """
     if sys.stderr.isatty():
         with _drawn() as bar:
@@ -226,7 +226,7 @@ def _drawn() -> rich.progress.Progress:
 
 
 def require_folder(path: Path) -> None:
-    """Refuse early a file whose folder is not there.
+    """Check early that the folder of a file exists.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def require_folder(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write beside `path`, with its suffix, that takes its place when the block ends well."""
+    """A temporary file beside `path`, with the same suffix, that replaces it if the block succeeds."""
     require_folder(path)
     temporary = path.with_name(f".{path.stem[:100]}-{secrets.token_hex(6)}{path.suffix}")
     try:

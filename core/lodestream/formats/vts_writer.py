@@ -123,14 +123,14 @@ def _warn_of_faces(surface: Surface) -> None:
     faces = surface.metadata.get("faces")
     maps = [it for it in (faces if isinstance(faces, list) else [faces]) if isinstance(it, dict)]
     if any("diagonal" in it for it in maps):
-        warn("VTS is written with whole cells in place of the triangles that they were made of")
+        warn("VTS is written with quads in place of the triangles that they were joined from")
     closed = [
         block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < _MIN_CLOSED
     ]
     if closed:
-        warn(f"VTS is written without closure of axes of fewer than {_MIN_CLOSED} points")
+        warn(f"VTS is written with open axes in place of closed ones of fewer than {_MIN_CLOSED} points")
     if _GHOSTS in surface.blocks[0].attributes:
-        warn(f"VTS is written with {_GHOSTS}_ in place of {_GHOSTS}, which says there what is hidden")
+        warn(f"VTS is written with the attribute {_GHOSTS} as {_GHOSTS}_, because VTS uses that name for hidden points")
 
 
 def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:

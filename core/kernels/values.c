@@ -1,0 +1,350 @@
+/* Lattice coordinates into values of any type, and their squared distances from other values (docs/format.md,
+ * "Header", lattices).
+ *
+ * A value is origin + step q, or (origin + q) / step, in float64, rounded after each operation. Into a float32 it is
+ * rounded after it is brought into the range of finite ones; into an integer, to the nearest, halves to even, and
+ * within the range of the type.
+ *
+ * Values are worked on some hundred at a time, loop by loop: what lies in between stays in the cache, and loops that
+ * know one type or one rule are few and fast.
+ */
+#include <float.h>
+#include <stdbool.h>
+#include <string.h>
+
+#include "lodestream.h"
+
+enum {
+    TOGETHER = 512,   /* values worked on together */
+    SIDE_BY_SIDE = 4, /* parts whose rows are read from end to end: memory comes faster so */
+    WIDEST = SIDE_BY_SIDE * LODE_PART_COLUMNS,
+    RULE_NUMBERS = 4,
+};
+
+/* Added to a float64 of less than 2^51, this leaves its integer part, rounded, in the lowest bits. */
+#define WHOLE 0x1.8p52
+
+static int64_t least(int64_t a, int64_t b) {
+    return a < b ? a : b;
+}
+
+/* A lattice, and the least and largest value of the type that is wanted. */
+struct rule {
+    bool decimal;
+    double origin, step, scale, low, high;
+};
+
+static double value_of(int32_t coordinate, const struct rule *rule) {
+    double q = (double)coordinate * rule->scale;
+    return rule->decimal ? (q + rule->origin) / rule->step : q * rule->step + rule->origin;
+}
+
+/* Whether all values are within the range of the type: they rise with their coordinates. */
+static bool are_within(const int32_t *coordinates, int64_t count, const struct rule *rule) {
+    if (value_of(INT32_MIN, rule) >= rule->low && value_of(INT32_MAX, rule) <= rule->high)
+        return true;
+    int32_t first = coordinates[0], last = coordinates[0];
+    for (int64_t j = 0; j < count; j++) {
+        first = coordinates[j] < first ? coordinates[j] : first;
+        last = coordinates[j] > last ? coordinates[j] : last;
+    }
+    return value_of(first, rule) >= rule->low && value_of(last, rule) <= rule->high;
+}
+
+static void evaluate(const int32_t *coordinates, int64_t count, const struct rule *rule, double *values) {
+    double origin = rule->origin, step = rule->step, scale = rule->scale, low = rule->low, high = rule->high;
+    if (rule->decimal)
+        for (int64_t j = 0; j < count; j++)
+            values[j] = ((double)coordinates[j] * scale + origin) / step;
+    else
+        for (int64_t j = 0; j < count; j++)
+            values[j] = (double)coordinates[j] * scale * step + origin;
+    if (!are_within(coordinates, count, rule))
+        for (int64_t j = 0; j < count; j++)
+            values[j] = values[j] < low ? low : values[j] > high ? high : values[j];
+}
+
+typedef float float32_t;
+typedef double float64_t;
+
+enum {
+    NUMBER_int8,
+    NUMBER_int16,
+    NUMBER_int32,
+    NUMBER_int64,
+    NUMBER_uint8,
+    NUMBER_uint16,
+    NUMBER_uint32,
+    NUMBER_uint64,
+    NUMBER_float32,
+    NUMBER_float64,
+    TYPES,
+};
+
+static const struct {
+    int64_t size;
+    double low, high;
+} TYPE[TYPES] = {
+    {1, INT8_MIN, INT8_MAX},
+    {2, INT16_MIN, INT16_MAX},
+    {4, INT32_MIN, INT32_MAX},
+    {8, -0x1p63, 0x1p63},
+    {1, 0, UINT8_MAX},
+    {2, 0, UINT16_MAX},
+    {4, 0, UINT32_MAX},
+    {8, 0, 0x1p64},
+    {4, -(double)FLT_MAX, (double)FLT_MAX},
+    {8, -__builtin_inf(), __builtin_inf()},
+};
+
+/* For each type: `to_`, a value within its range into the type, and `seen_`, what that is as a float64. */
+#define INTEGER(type)                                                                                                  \
+    static inline type##_t to_##type(double value) {                                                                   \
+        double sum = value + WHOLE;                                                                                    \
+        uint64_t bits;                                                                                                 \
+        memcpy(&bits, &sum, sizeof bits);                                                                              \
+        return (type##_t)bits;                                                                                         \
+    }                                                                                                                  \
+    static inline double seen_##type(double value) {                                                                   \
+        return (value + WHOLE) - WHOLE;                                                                                \
+    }
+
+INTEGER(int8)
+INTEGER(int16)
+INTEGER(int32)
+INTEGER(uint8)
+INTEGER(uint16)
+INTEGER(uint32)
+
+/* The nearest whole number of any float64; those of 2^52 and more are whole. */
+static inline double nearest(double value) {
+    double away = value < 0 ? -0x1p52 : 0x1p52;
+    return value > -0x1p52 && value < 0x1p52 ? (value + away) - away : value;
+}
+
+static inline int64_t to_int64(double value) {
+    value = nearest(value);
+    return value >= 0x1p63 ? INT64_MAX : (int64_t)value;
+}
+
+static inline uint64_t to_uint64(double value) {
+    value = nearest(value);
+    return value >= 0x1p64 ? UINT64_MAX : (uint64_t)value;
+}
+
+static inline float to_float32(double value) {
+    return (float)value;
+}
+
+static inline double seen_float32(double value) {
+    return (double)(float)value;
+}
+
+static inline double to_float64(double value) {
+    return value;
+}
+
+static inline double seen_float64(double value) {
+    return value;
+}
+
+#define CONVERT(type)                                                                                                  \
+    case NUMBER_##type: {                                                                                              \
+        type##_t *own = points;                                                                                        \
+        for (int64_t j = 0; j < count; j++)                                                                            \
+            own[j] = to_##type(values[j]);                                                                             \
+        break;                                                                                                         \
+    }
+
+#define SQUARE(type)                                                                                                   \
+    case NUMBER_##type: {                                                                                              \
+        const type##_t *own = points;                                                                                  \
+        for (int64_t j = 0; j < count; j++) {                                                                          \
+            double delta = (double)own[j] - seen_##type(values[j]);                                                    \
+            squares[j] = delta * delta;                                                                                \
+        }                                                                                                              \
+        break;                                                                                                         \
+    }
+
+/* Values into points that lie side by side. */
+static void convert(const double *restrict values, int64_t count, int64_t type, void *restrict points) {
+    switch (type) {
+        CONVERT(int8)
+        CONVERT(int16)
+        CONVERT(int32)
+        CONVERT(int64)
+        CONVERT(uint8)
+        CONVERT(uint16)
+        CONVERT(uint32)
+        CONVERT(uint64)
+        CONVERT(float32)
+    }
+}
+
+/* Squares of how far points that lie side by side are from values. */
+static void square(const double *restrict values, int64_t count, int64_t type, const void *restrict points,
+                   double *restrict squares) {
+    switch (type) {
+        SQUARE(int8)
+        SQUARE(int16)
+        SQUARE(int32)
+        SQUARE(uint8)
+        SQUARE(uint16)
+        SQUARE(uint32)
+        SQUARE(float32)
+        SQUARE(float64)
+    }
+}
+
+#define COPY(bits)                                                                                                     \
+    case (bits) / 8:                                                                                                   \
+        for (int64_t j = 0; j < count; j++)                                                                            \
+            ((uint##bits##_t *)to)[j * to_stride] = ((const uint##bits##_t *)from)[j * from_stride];                   \
+        break;
+
+/* Copy elements of some bytes that stand some elements apart. */
+static void copy(int64_t size, const void *from, int64_t from_stride, void *to, int64_t to_stride, int64_t count) {
+    switch (size) {
+        COPY(8)
+        COPY(16)
+        COPY(32)
+        COPY(64)
+    }
+}
+
+static bool is_finite(double number) {
+    return number >= -DBL_MAX && number <= DBL_MAX;
+}
+
+/* Whether values rise with their coordinates, and are numbers. */
+static bool is_rule(double origin, double step, double scale) {
+    return is_finite(origin) && is_finite(step) && is_finite(scale) && step > 0 && scale > 0;
+}
+
+/* Whether there are `count` elements in rows x columns x channels. */
+static bool is_shape(int64_t count, int64_t rows, int64_t columns, int64_t channels) {
+    return rows >= 1 && columns >= 1 && rows <= INT32_MAX && columns <= INT32_MAX && channels >= 1 &&
+           count % channels == 0 && count / channels == rows * columns;
+}
+
+int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int64_t columns, int64_t pitch, void *points,
+                          int64_t points_count, int64_t points_type, int64_t channels, int64_t channel, int64_t first,
+                          int64_t last, int64_t decimal, double origin, double step, double scale) {
+    if (!is_shape(points_count, rows, columns, channels) || (rows > 1 && pitch < 0) || points_type < 0 ||
+        points_type >= TYPES || channel < 0 || channel >= channels || first < 0 || last < first ||
+        last > rows * columns || !is_rule(origin, step, scale))
+        return LODE_REFUSED;
+    struct rule rule = {decimal != 0, origin, step, scale, TYPE[points_type].low, TYPE[points_type].high};
+    int64_t size = TYPE[points_type].size;
+    bool as_it_is = points_type == NUMBER_float64, beside = channels == 1;
+    double values[TOGETHER], own[TOGETHER];
+    for (int64_t at = first; at < last;) {
+        int64_t row = at / columns, column = at % columns;
+        int64_t count = least(least(columns - column, last - at), TOGETHER);
+        void *place = (char *)points + (at * channels + channel) * size;
+        double *evaluated = as_it_is && beside ? place : values;
+        void *made = as_it_is ? evaluated : beside ? place : own;
+        evaluate(coordinates + row * pitch + column, count, &rule, evaluated);
+        if (!as_it_is)
+            convert(evaluated, count, points_type, made);
+        if (!beside)
+            copy(size, made, 1, place, channels, count);
+        at += count;
+    }
+    return 0;
+}
+
+struct comparison {
+    const void *points;
+    const int32_t *coordinates;
+    const double *rules;
+    const uint8_t *counted; /* or null: all are */
+    int64_t type, columns, channels, geometric, height, pitch;
+};
+
+/* Squared distances of at most TOGETHER points of a row in one channel. */
+static void channel_distances(const struct comparison *c, int64_t channel, int64_t row, int64_t left, int64_t count,
+                              double *squares) {
+    const double *numbers = c->rules + RULE_NUMBERS * channel;
+    struct rule rule = {numbers[0] != 0, numbers[1], numbers[2], numbers[3], TYPE[c->type].low, TYPE[c->type].high};
+    double values[TOGETHER], own[TOGETHER];
+    evaluate(c->coordinates + (channel * c->height + row) * c->pitch + left, count, &rule, values);
+    int64_t size = TYPE[c->type].size;
+    const void *points = (const char *)c->points + ((row * c->columns + left) * c->channels + channel) * size;
+    if (c->channels > 1) {
+        copy(size, points, c->channels, own, 1, count);
+        points = own;
+    }
+    square(values, count, c->type, points, squares);
+}
+
+/* The same in all channels. */
+static void row_distances(const struct comparison *c, int64_t row, int64_t left, int64_t count, double *squares) {
+    double more[TOGETHER];
+    channel_distances(c, 0, row, left, count, squares);
+    for (int64_t channel = 1; channel < c->geometric; channel++) {
+        channel_distances(c, channel, row, left, count, more);
+        for (int64_t j = 0; j < count; j++)
+            squares[j] += more[j];
+    }
+    if (c->counted) {
+        const uint8_t *counted = c->counted + row * c->columns + left;
+        for (int64_t j = 0; j < count; j++)
+            squares[j] = counted[j] ? squares[j] : 0.0;
+    }
+}
+
+/* Figures of parts side by side, together `count` points wide: those of columns, then of those. */
+static void part_figures(const struct comparison *c, int64_t top, int64_t bottom, int64_t left, int64_t count,
+                         double *figures) {
+    double squares[TOGETHER], sums[WIDEST], worst[WIDEST];
+    for (int64_t j = 0; j < count; j++)
+        sums[j] = worst[j] = 0.0;
+    for (int64_t row = top; row < bottom; row++)
+        for (int64_t start = 0; start < count; start += TOGETHER) {
+            int64_t some = least(count - start, TOGETHER);
+            row_distances(c, row, left + start, some, squares);
+            for (int64_t j = 0; j < some; j++) {
+                sums[start + j] += squares[j];
+                worst[start + j] = squares[j] > worst[start + j] ? squares[j] : worst[start + j];
+            }
+        }
+    for (int64_t j = 0; j < count; j++) {
+        double *own = figures + 2 * (j / LODE_PART_COLUMNS);
+        if (j % LODE_PART_COLUMNS == 0)
+            own[0] = own[1] = 0.0;
+        own[0] += sums[j];
+        own[1] = worst[j] > own[1] ? worst[j] : own[1];
+    }
+}
+
+int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, const int32_t *coordinates,
+                              int64_t coordinates_count, const double *rules, int64_t rules_count,
+                              const uint8_t *counted, int64_t counted_count, double *figures, int64_t figures_count,
+                              int64_t rows, int64_t columns, int64_t channels, int64_t height, int64_t pitch,
+                              int64_t first, int64_t last) {
+    int64_t geometric = rules_count / RULE_NUMBERS;
+    if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || geometric < 1 ||
+        geometric > channels || !is_shape(coordinates_count, height, pitch, geometric) || height < rows ||
+        pitch < columns || (counted_count && counted_count != rows * columns) || points_type < 0 ||
+        points_type >= TYPES || points_type == NUMBER_int64 || points_type == NUMBER_uint64)
+        return LODE_REFUSED;
+    int64_t across = (columns + LODE_PART_COLUMNS - 1) / LODE_PART_COLUMNS;
+    int64_t down = (rows + LODE_PART_ROWS - 1) / LODE_PART_ROWS;
+    if (first < 0 || last < first || last > down * across || figures_count != 2 * down * across)
+        return LODE_REFUSED;
+    for (int64_t at = 0; at < rules_count; at += RULE_NUMBERS)
+        if (!is_rule(rules[at + 1], rules[at + 2], rules[at + 3]))
+            return LODE_REFUSED;
+    struct comparison comparison = {points,      coordinates, rules,    counted_count ? counted : 0,
+                                    points_type, columns,     channels, geometric,
+                                    height,      pitch};
+    for (int64_t part = first; part < last;) {
+        int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
+        int64_t parts = least(least(across - part % across, last - part), SIDE_BY_SIDE);
+        part_figures(&comparison, top, least(top + LODE_PART_ROWS, rows), left,
+                     least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * part);
+        part += parts;
+    }
+    return 0;
+}

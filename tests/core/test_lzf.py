@@ -1,0 +1,97 @@
+"""LZF against a decoder in plain Python, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lodestream import kernels
+from lodestream.errors import FormatError
+from lodestream.formats import lzf
+from lodestream.formats.lzf import decompress
+
+
+@pytest.mark.parametrize(
+    ("content", "made"),
+    [
+        (b"\x02abc", b"abc"),
+        (b"\x00a\x20\x00", b"aaaa"),
+        (b"\x01ab\xe0\x05\x01", b"ab" * 8),
+        (b"\x02abc\x40\x02\x00x", b"abcabcax"),
+    ],
+)
+def test_lzf(content: bytes, made: bytes) -> None:
+    assert decompress(content, len(made)).tobytes() == made
+    for size in (len(made) - 1, len(made) + 1):
+        with pytest.raises(FormatError, match="LZF data that make"):
+            decompress(content, size)
+    for cut in range(1, len(content)):
+        with pytest.raises(FormatError, match="LZF data that make"):
+            decompress(content[:cut], len(made))
+
+
+def plain_lzf(content: bytes) -> bytes | None:
+    """What LZF data make, byte by byte; None where they are damaged."""
+    made, place = bytearray(), 0
+    try:
+        while place < len(content):
+            control, place = content[place], place + 1
+            if control < 32:
+                if place + control + 1 > len(content):
+                    return None
+                made += content[place : place + control + 1]
+                place += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length, place = length + content[place], place + 1
+            start, place = len(made) - 256 * (control & 31) - content[place] - 1, place + 1
+            if start < 0:
+                return None
+            for _ in range(length + 2):
+                made.append(made[start])
+                start += 1
+    except IndexError:
+        return None
+    return bytes(made)
+
+
+LITERALS = st.binary(min_size=1, max_size=32).map(lambda run: bytes([len(run) - 1]) + run)
+REFERENCES = st.builds(
+    lambda length, more, distance: (
+        bytes([length << 5 | distance >> 8]) + (bytes([more]) if length == 7 else b"") + bytes([distance & 255])
+    ),
+    st.integers(1, 7),
+    st.integers(0, 255),
+    st.one_of(st.integers(0, 40), st.integers(0, 8191)),
+)
+
+
+@given(
+    data=st.one_of(st.lists(st.one_of(LITERALS, REFERENCES), max_size=40).map(b"".join), st.binary(max_size=200)),
+    cut=st.integers(0, 3),
+    at_once=st.integers(0, 300),
+    more=st.integers(-1, 1),
+)
+def test_lzf_makes_what_a_plain_loop_makes_in_any_runs(data: bytes, cut: int, at_once: int, more: int) -> None:
+    content = b"\x1f" + bytes(range(32)) + data[: len(data) - cut]
+    expected = plain_lzf(content)
+    size = max(0, (100 if expected is None else len(expected)) + more)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lzf, "_AT_ONCE", max(at_once, 1))
+        if expected is not None and len(expected) == size:
+            assert decompress(content, size).tobytes() == expected
+        else:
+            with pytest.raises(FormatError, match="LZF data that make"):
+                decompress(content, size)
+
+
+@pytest.mark.parametrize("state", [[-1, 0], [0, -1], [6, 0], [0, 5], [2**62, 2**62], [0], [0, 0, 0]])
+def test_an_lzf_state_that_does_not_fit_is_refused(state: list[int]) -> None:
+    source, target = np.zeros(5, np.uint8), np.zeros(4, np.uint8)
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.lzf(source, target, 1, np.array(state, np.int64))
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.lzf(source, target, -1, np.zeros(2, np.int64))
