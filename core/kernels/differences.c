@@ -5,9 +5,9 @@
  * down from the most that the exponent of the restored value allows, in contexts; the bits themselves and the sign are
  * stored as they are. If the place on the line has occurred before, its last difference predicts this one.
  */
-#include <string.h>
 
 #include "binary_coder.h"
+#include "copying.h"
 
 enum {
     DEEPEST = 15, /* of a count of bits, and of the count so far, that have contexts of their own */

@@ -5,7 +5,8 @@
 #define LODE_EIGHT_H
 
 #include <stdint.h>
-#include <string.h>
+
+#include "copying.h"
 
 typedef uint64_t eight_t;
 

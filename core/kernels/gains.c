@@ -1,9 +1,9 @@
 /* What the passes of the embedded coder gain: the error of a tile when so many of its passes remain (docs/format.md,
  * "From coefficients to points", says what a receiver takes for bits that it does not know).
  */
-#include <string.h>
 
 #include "band_fields.h"
+#include "copying.h"
 #include "lodestream.h"
 
 enum { PLANES = 32 };

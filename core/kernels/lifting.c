@@ -14,8 +14,8 @@
  * otherwise. Both are exact for samples within +-2^27 and coefficients below 2^29; beyond, all is modulo 2^32.
  */
 #include <stdbool.h>
-#include <string.h>
 
+#include "copying.h"
 #include "lodestream.h"
 
 #define LODE_INLINE static inline __attribute__((always_inline))

@@ -3,8 +3,8 @@
 #define LODE_LOGARITHM_H
 
 #include <stdint.h>
-#include <string.h>
 
+#include "copying.h"
 #include "tables.h"
 
 /* log2 of a normal number greater than 0, good to 1e-8: between the entries of a table in a parabola. */

@@ -5,9 +5,9 @@
  * not of the last one. What is known of an offset is an interval, and every value that has it narrows it. A list holds
  * the offsets met last, the latest first.
  */
-#include <string.h>
 
 #include "binary_coder.h"
+#include "copying.h"
 
 enum {
     LISTED = 64,
