@@ -69,23 +69,40 @@ REFERENCES = st.builds(
 )
 
 
-@given(
-    data=st.one_of(st.lists(st.one_of(LITERALS, REFERENCES), max_size=40).map(b"".join), st.binary(max_size=200)),
-    cut=st.integers(0, 3),
-    at_once=st.integers(0, 300),
-    more=st.integers(-1, 1),
-)
+CONTENTS = st.one_of(st.lists(st.one_of(LITERALS, REFERENCES), max_size=40).map(b"".join), st.binary(max_size=200))
+
+
+@given(data=CONTENTS, cut=st.integers(0, 3), at_once=st.integers(1, 300), more=st.integers(-1, 1))
 def test_lzf_makes_what_a_plain_loop_makes_in_any_runs(data: bytes, cut: int, at_once: int, more: int) -> None:
     content = b"\x1f" + bytes(range(32)) + data[: len(data) - cut]
     expected = plain_lzf(content)
-    size = max(0, (100 if expected is None else len(expected)) + more)
+    size = (100 if expected is None else len(expected)) + more
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lzf, "_AT_ONCE", max(at_once, 1))
+        patch.setattr(lzf, "_AT_ONCE", at_once)
         if expected is not None and len(expected) == size:
             assert decompress(content, size).tobytes() == expected
         else:
             with pytest.raises(FormatError, match="LZF data that make"):
                 decompress(content, size)
+
+
+@given(data=CONTENTS, room=st.one_of(st.integers(0, 400), st.just(60_000)))
+def test_lzf_writes_nowhere_else_and_knows_what_is_damaged(data: bytes, room: int) -> None:
+    whole, state = np.full(room + 600, 77, np.uint8), np.zeros(2, np.int64)
+    target, expected = whole[300 : 300 + room], plain_lzf(data)
+    right = kernels.lzf(np.frombuffer(data, np.uint8), target, 1 << 20, state)
+    assert right == (expected is not None and len(expected) <= room)
+    if expected is not None and right:
+        assert state.tolist() == [len(data), len(expected)]
+        assert target[: len(expected)].tobytes() == expected
+    assert (whole[:300] == 77).all()
+    assert (whole[300 + room :] == 77).all()
+
+
+@pytest.mark.parametrize("content", [b"\x20\x00", b"\x00a\x20\x01", b"\x02abc\x21\x00", b"\x02abc\xe0\x00\x03"])
+def test_a_reference_to_before_the_first_byte_is_damage(content: bytes) -> None:
+    target, state = np.zeros(900, np.uint8), np.zeros(2, np.int64)
+    assert kernels.lzf(np.frombuffer(content, np.uint8), target, 1 << 20, state) == 0
 
 
 @pytest.mark.parametrize("state", [[-1, 0], [0, -1], [6, 0], [0, 5], [2**62, 2**62], [0], [0, 0, 0]])
