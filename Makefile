@@ -11,7 +11,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels test test-lowest torture lint format bench bench-peers bench-server bench-stream wheel clean
+.PHONY: help demo kernels test test-lowest torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -57,11 +57,12 @@ bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS
 bench-stream: kernels ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
 	@$(BIN)/python -m benchmarks.stream
 
-wheel: $(STAMP) ## build dist/*.whl
-	@$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
+wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
+	@$(BIN)/python -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
+	@$(BIN)/python .ci/wheels.py dist
 
 clean: ## remove the environment and everything else that can be made again
-	rm -rf $(VENV) $(PEERS) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is written last, so an installation that was interrupted is taken up again by the next make.

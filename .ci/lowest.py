@@ -6,7 +6,6 @@ itself (not of its tests) stands at exactly its lower bound, and runs pytest the
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -44,10 +43,8 @@ def main(folder: Path, arguments: list[str]) -> int:
     subprocess.run([*pip, "--upgrade", "pip>=25.1"], check=True)
     group = ["--group", f"{ROOT}/pyproject.toml:test"]
     subprocess.run([*pip, "--constraint", str(listed), "--editable", f"{ROOT}[all]", *group], check=True)
-    variables = {**os.environ, "NUMBA_CACHE_DIR": str((folder / "kernels").resolve())}
-    subprocess.run([python, "-m", "tests.warming"], cwd=ROOT, env=variables, check=True)
     command = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", *arguments]
-    return subprocess.run(command, cwd=ROOT, env=variables, check=False).returncode
+    return subprocess.run(command, cwd=ROOT, check=False).returncode
 
 
 if __name__ == "__main__":

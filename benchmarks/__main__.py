@@ -9,10 +9,10 @@ import platform
 import sys
 from importlib.metadata import version
 
-SECTIONS = ("transform", "solver", "rate", "coder", "memory", "meshes", "blocks", "formats")
+SECTIONS = ("start", "transform", "solver", "rate", "coder", "memory", "meshes", "blocks", "formats")
 
-# Before numpy and numba are loaded: every figure is of one core.
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+# Before numpy is loaded: every figure is of one core.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
 import lodestream  # noqa: E402 - see above
@@ -35,7 +35,7 @@ def main() -> int:
     unknown = sorted(set(chosen) - set(SECTIONS))
     if unknown:
         parser.error(f"expected sections of {', '.join(SECTIONS)}, got {', '.join(unknown)}")
-    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "scipy", "pywavelets"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "pywavelets"))
     print(f"Lodestream {lodestream.__version__}, Python {platform.python_version()}, {packages}")
     print(f"one core of {processor()}", flush=True)
     for section in SECTIONS:

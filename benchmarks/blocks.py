@@ -60,10 +60,11 @@ def _blocks() -> None:
     head = ["terrain, RMS / height range", "one block", "bits/point", "16 blocks", "ratio", "aim"]
     table("Terrain in 16 blocks", head, rows)
     note(
-        f"x, y, z over a bent grid, real heights and fractals of {SHAPE[0]} x {SHAPE[1]}, in 4 x 4 blocks that share "
-        f"their sides, coded to {TARGETS[-1]:.0e} of the range. Bytes are interpolated between layers in log-log. Aim: "
-        f"at most {AIM - 1:.0%} more on rough terrain at 1e-3 and below. Sides between blocks cost some kilobytes "
-        "whatever lies inside: on smooth terrain, of which a tenth of a bit a point is enough, that is a larger part."
+        f"x, y, z over a curvilinear grid, real heights and fractals of {SHAPE[0]} x {SHAPE[1]}, in 4 x 4 blocks that "
+        f"share their sides, coded to {TARGETS[-1]:.0e} of the range. Bytes are interpolated between layers on "
+        f"logarithmic axes. Aim: at most {AIM - 1:.0%} more on rough terrain at 1e-3 and below. The sides between "
+        "blocks cost some kilobytes in any case; on smooth terrain, which needs a tenth of a bit a point, that is a "
+        "larger share."
     )
 
 
@@ -118,14 +119,14 @@ def _holes() -> None:
         "mask, bytes",
         *(f"RMS {target:.0e}" for target in HOLES_TARGETS),
         "exact",
-        "exact, beside filled",
+        "exact / filled",
     ]
     table("Bytes of a surface with holes", head, rows)
     note(
-        f"The rough fractal as {SHAPE[0]} x {SHAPE[1]} heights, whole numbers of 16 bits; the mask counts. Bytes a "
-        "valid point, over bytes a point of the full surface; RMS is over valid points, relative to the range. Beside "
-        f"filled: over the bytes of the surface that was filled by hand (linear interpolation, rounded) and has no "
-        f"holes. Aim there: at most {HOLES_AIM - 1:.0%} more."
+        f"The rough fractal as {SHAPE[0]} x {SHAPE[1]} heights, 16-bit integers. Ratios of bytes for each valid point, "
+        "mask included, to bytes for each point of the surface without holes. RMS is over valid points, relative to "
+        "the range. `exact / filled`: ratio to the bytes of the surface whose holes are filled by linear interpolation "
+        f"and rounding. Aim there: at most {HOLES_AIM - 1:.0%} more."
     )
 
 

@@ -52,23 +52,12 @@ class Channel:
     def code(self, decoding: bool) -> tuple[Tiles, int]:
         """Code all planes of all tiles; returns what is known after that, and the bytes written."""
         tiles, count = Tiles(self.table), 0
+        bands = self.table.first
         for number, (top, data) in enumerate(zip(self.planes, self.room, strict=True)):
-            count += bitplanes.code_passes(
-                decoding,
-                self.table.of_tile(number),
-                bitplanes.pass_count(top) - 1,
-                0,
-                tiles.known,
-                tiles.sign,
-                tiles.flags,
-                tiles.early,
-                self.coefficients,
-                bitplanes.new_model(),
-                data,
-                NO_COSTS,
-                False,
-                np.empty(bitplanes.SUMS, np.uint32),
-            )
+            first, own = bitplanes.pass_count(top) - 1, bands[number + 1] - bands[number]
+            run = np.array([[bands[number], own, number, first, 0, 0, data.size]], np.int64)
+            tiles.code(decoding, run, self.coefficients, data, NO_COSTS)
+            count += int(run[0, -1])
         return tiles, count
 
 
@@ -106,8 +95,8 @@ def main() -> None:
         head = ["array", "bits/sample", "coder, writing", "coder, reading", "encode", "decode"]
         table("Million samples a second on one core", head, rows)
         note(
-            "The coder alone turns coefficients into bytes and back, all planes of all tiles; `encode` also finds the "
-            "lattice, transforms, allots bits to layers, and measures the errors of every layer and level."
+            "The coder alone: coefficients to bytes and back, all bit-planes of all tiles. `encode` also finds the "
+            "lattice, transforms, assigns coding passes to layers, and measures the error of every layer and level."
         )
     _prefixes()
 
@@ -132,9 +121,9 @@ def _prefixes() -> None:
         rows.append([array.name, *cells, f"{spent / least:.2f}"])
     table("Decoding a prefix", ["array", "bytes", "RMS / extent", "decode, ms", "inverse, ms", "times"], rows)
     note(
-        f"The first layer of the exact stream with an RMS error of at most {PREFIX:.0e} of the extent: from bytes to "
-        "points, beside the inverse of the integer transform alone (all levels, all channels, coefficients copied to "
-        "where they are undone in place). Aim: at most twice."
+        f"Time to decode the exact stream up to the first layer with an RMS error of at most {PREFIX:.0e} of the "
+        "extent, from bytes to points, and time of the inverse integer transform alone (all levels and channels, with "
+        "copying the coefficients). Aim: at most twice."
     )
 
 

@@ -154,7 +154,7 @@ def _read(folder: Path) -> None:
         rows.append([case.file, case.library, f"{vertices:,}", str(surface.dtype), *rates, ratio])
     head = ["file", "library", "vertices", "type", "MB/s", "MB/s of the library alone", "times its time"]
     table("Reading files of a million vertices", head, rows)
-    note("MB are of the arrays in memory: an .asc is float64 for us and float32 or int32 for GDAL by itself.")
+    note("MB are those of the arrays in memory. Lodestream reads an .asc as float64, GDAL alone as float32 or int32.")
 
 
 def _write() -> None:

@@ -37,14 +37,17 @@ def main() -> None:
             paths[name].write_bytes(lodestream.encode(points))
         if STATUS.exists():
             rows = [_decoder_row(name, sizes[name], path) for name, path in paths.items()]
-            head = ["surface", "as float32", "container", "fed, no picture", "with the last picture", "x float32"]
+            head = ["surface", "as float32", "container", "after all input", "with the last surface", "x float32"]
             table("Memory of a Decoder", head, rows)
-            note("Peak above what the process held before, in a process of its own, fed 64 KiB at a time.")
+            note("Peak memory above that of the process before, in a separate process, fed with 64 KiB at a time.")
         else:
             print("\nskipped: memory of a Decoder (this system does not tell a process its peak)")
         rows = list(_server_rows(Path(folder), fractal(2049)))
-    table("Memory of a server", ["streams opened, then not read", "resident", "more than idle", "a stream"], rows)
-    note("The server's own process, after each client took one layer of a 2049 x 2049 surface and then read no more.")
+    table("Memory of a server", ["streams opened, then not read", "resident", "above idle", "for each stream"], rows)
+    note(
+        "Memory of the server process after each client received one layer of a 2049 x 2049 surface and then stopped "
+        "reading."
+    )
 
 
 def _sphere(side: int) -> NDArray[np.float32]:

@@ -36,10 +36,10 @@ def main() -> None:
     head = ["mesh", "recognised", "seconds", "peak", "seconds from OBJ", "peak from OBJ"]
     table("Recognition of meshes", head, rows)
     note(
-        "A million quads or their halves in a random order, over vertices in a random order, half of the faces wound "
-        "the other way. Each in a process of its own, with compiled kernels; the peak is what the whole process holds, "
-        "the libraries and the mesh itself included. From OBJ: reading the file, recognition and making the surface. "
-        "Seconds are the processor's."
+        "A million quads, or the triangles they are split into, in random order, over vertices in random order; half "
+        "of the faces have the opposite winding. Each mesh in a separate process with compiled kernels. The peak is "
+        "that of the whole process, with the libraries and the mesh. From OBJ: reading the file, recognition, and "
+        "making the surface. Processor times."
     )
 
 

@@ -48,10 +48,11 @@ def main() -> None:
     head = ["array, RMS / extent", "prototype", "quantised alike", "ratio", "aim", "exact stream", "ratio", "aim"]
     table("Bytes to an RMS error", [*head, "of float32"], rows)
     note(
-        "Everything is counted, and bytes are interpolated between layers in log-log; where no lossy layer is as good, "
-        "the exact stream counts whole. `quantised alike`: to 16 bits of the range (18 of the longest side for xyz), "
-        "as the prototype did. `exact stream`: coded without a precision, on the values' own lattice where they have "
-        "one. Aim: the prototype's figure, which counts neither header nor tiles, plus 5 % plus 1 KiB."
+        "All bytes of the container count. Bytes are interpolated between layers on logarithmic axes; where no lossy "
+        "layer reaches the error, the whole exact stream counts. `quantised alike`: with the prototype's quantisation, "
+        "16 bits of the range (18 of the longest side for xyz). `exact stream`: encoded without a precision, on the "
+        "lattice of the values if they have one. Aim: the bytes of the prototype, which has neither headers nor tiles, "
+        "plus 5 % plus 1 KiB."
     )
     head = ["array", "raw bytes", "bytes", "bits/sample", "times smaller"]
     table("Bytes of the whole stream, every value exact", head, lossless)

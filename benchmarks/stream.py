@@ -94,7 +94,7 @@ def stop_table(served: Served) -> None:
             )
     head = ["link", "window", "bytes before", "credit at the stop", "bytes after", "seconds until the end"]
     table("After a stop, 100 ms round trip", head, rows)
-    note("Aim: at most the credit that was outstanding; at 256 kbit/s no more than 32,768 bytes.")
+    note("Aim for the bytes after the stop: at most the outstanding credit; at 256 kbit/s at most 32,768 bytes.")
 
 
 async def stopped(served: Served, rate: float | None, window: int | None) -> tuple[int, int, float, int]:
@@ -121,9 +121,9 @@ def first_table(surfaces: dict[str, Served]) -> None:
             found = sorted(asyncio.run(first(url, transport)) for _ in range(REPEATS))
             seconds, size = found[len(found) // 2]
             rows.append([name, road, f"{seconds * 1000:.0f}", f"{seconds / ROUND_TRIP:.2f}", f"{size:,}"])
-    head = ["surface", "road", "ms", "round trips", "bytes received"]
+    head = ["surface", "transport", "ms", "round trips", "bytes received"]
     table("First drawable surface, 100 ms round trip, rate unlimited, median of three", head, rows)
-    note("Aim by WebSocket: at most 2.5 round trips after the TCP connection, and 2,048 bytes.")
+    note("Aim for WebSocket: at most 2.5 round trips after the TCP connection, and 2,048 bytes.")
 
 
 async def first(url: str, transport: Any) -> tuple[float, int]:
@@ -137,8 +137,8 @@ async def first(url: str, transport: Any) -> tuple[float, int]:
 def roads(served: Served) -> list[tuple[str, str, str]]:
     return [
         ("WebSocket", served.url, "ws"),
-        ("Range, of a server", served.url, "http"),
-        ("Range, of a plain file", served.file, "http"),
+        ("Range, URL of surface", served.url, "http"),
+        ("Range, URL of file", served.file, "http"),
     ]
 
 
@@ -155,7 +155,7 @@ def error_table(array: Array, served: Served) -> None:
             for road, url, transport in roads(served):
                 seconds = timed(partial(pull, target=target, rms=share * array.extent, transport=transport), url, delay)
                 rows.append(["", "", road, "", f"{seconds:.3f}", f"{seconds / plain:.2f}"])
-    head = ["round trip", "RMS / extent", "road", "bytes", "seconds", "ratio"]
+    head = ["round trip", "RMS / extent", "transport", "bytes", "seconds", "ratio"]
     table(f"{array.name} to an RMS error at 1 Mbit/s, median of three", head, rows)
     note("Aim: at most 1.15 times the plain download of the same prefix with httpx.")
 
@@ -196,7 +196,10 @@ def window_table() -> None:
         rows.append([f"{side} x {side}", f"{len(container):,}", *found, f"{aim:.0%}"])
     head = ["integers", "bytes", "median", "least", "most", "aim"]
     table(f"Share of the container for a window of {WINDOW:.0%} of the area, of {PLACES} places", head, rows)
-    note("Everything is counted: header, index, segments, metadata. The points are those of cutting the whole.")
+    note(
+        "All bytes count: header, index, segments, metadata. The points of the window equal those of the complete "
+        "surface."
+    )
 
 
 def window_share(points: Any, container: bytes, corner: tuple[int, int]) -> float:

@@ -53,5 +53,5 @@ def main() -> None:
     ]
     head = ["4097 x 4097", "ms", "million samples/s", "times np.copyto", "times as fast as wavedec2"]
     table("The transform", head, rows)
-    note("Integers are int32 and transformed in place; their times include copying the input there.")
+    note("Integers are int32 and are transformed in place. Their times include copying the input to that place.")
     assert np.array_equal(work, lattice), "the last inverse did not restore the surface"

@@ -63,10 +63,10 @@ def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="session")
 def one_fork_server() -> Iterator[None]:
-    """Servers that are objects here share what has loaded the kernels: each call has a process of its own anyway.
+    """Servers that are objects here share what calls are forked from: each call has its own process anyway.
 
     Those that are programs of their own do as they always do. For the whole session, since tests of several folders
-    take turns in a process of pytest-xdist, and loading takes seconds.
+    take turns in a process of pytest-xdist.
     """
     from lodestream_server import jobs
     from lodestream_server.processes import ForkServer
@@ -76,7 +76,7 @@ def one_fork_server() -> Iterator[None]:
         def close(self) -> None:
             """Leave it to the next server."""
 
-    shared = Shared(slow.warm)
+    shared = Shared(slow.preload)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jobs, "ForkServer", lambda _: shared)
         yield

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 # Before numpy is loaded: every figure is of one core.
-_THREADS = ("OMP", "OPENBLAS", "MKL", "NUMBA", "OPJ")
+_THREADS = ("OMP", "OPENBLAS", "MKL", "OPJ")
 for _name in _THREADS:
     os.environ[f"{_name}_NUM_THREADS"] = "1"
 

@@ -1,4 +1,4 @@
-"""Addresses of servers, surfaces and container files, and what is asked at them."""
+"""URLs of servers, surfaces and container files."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ _ADDRESS = re.compile("https?://[!-~]+", re.IGNORECASE)
 
 
 def is_url(text: str) -> bool:
-    """Whether this is the address of something on a server, not a file's name."""
+    """Whether this is a URL and not the name of a file."""
     return text.lower().startswith(("http://", "https://"))
 
 
 def surfaces_url(url: str) -> str:
-    """The collection of surfaces of a server, from the server's address or from the collection's.
+    """The URL of a server's collection of surfaces, from the server's URL or from the collection's.
 
     Raises
     ------
     OptionError
-        When this is not an ``http`` or ``https`` address.
+        If this is not an ``http`` or ``https`` URL.
     """
     base = _clean(url)
     return base if base.endswith(_SURFACES) else base + _SURFACES
 
 
 def surface_url(url: str) -> str:
-    """The address of one surface, without a slash at its end.
+    """The URL of one surface, without a slash at its end.
 
     Raises
     ------
     OptionError
-        When this is not ``http(s)://HOST/v1/surfaces/ID``.
+        If this is not ``http(s)://HOST/v1/surfaces/ID``.
     """
     base = _clean(url)
     collection, _, name = base.rpartition("/")
@@ -64,12 +64,12 @@ def surface_url(url: str) -> str:
 
 
 def source_url(url: str) -> str:
-    """The address of what can be pulled: a surface on a server, or a container file that any web server holds.
+    """The URL of something that can be pulled: a surface on a server, or a container file on any web server.
 
     Raises
     ------
     OptionError
-        When this is neither.
+        If this is neither.
     """
     base = _clean(url)
     path = urlsplit(base).path
@@ -83,25 +83,25 @@ def source_url(url: str) -> str:
 
 
 def is_surface(url: str) -> bool:
-    """Whether this is a surface's address, not that of a file."""
+    """Whether this is the URL of a surface, not of a file."""
     return _clean(url).rpartition("/")[0].endswith(_SURFACES)
 
 
 def stream_url(url: str, query: str | None = None) -> str:
-    """Where the stream of the surface at this address is."""
+    """The WebSocket URL of a surface's stream."""
     address = "ws" + surface_url(url).removeprefix("http") + "/stream"
     return address if query is None else f"{address}?{query}"
 
 
 def container_url(url: str) -> str:
-    """Where the container of a surface, or at a file's own address, can be fetched."""
+    """The URL from which a container can be fetched, given the URL of its surface or of its file."""
     return f"{surface_url(url)}/container" if is_surface(url) else url
 
 
 def origin(url: str) -> str:
-    """Scheme, host and port of an address: what a token given for it may be sent to, and nothing else.
+    """Scheme, host and port of a URL. A token is only ever sent to the origin that it was given for.
 
-    A WebSocket counts as the HTTP that it begins as. What is no such address has no origin: an empty text.
+    A WebSocket URL counts as the HTTP URL of the same server. Any other text has the empty origin.
     """
     try:
         parts = urlsplit(url)
@@ -117,21 +117,21 @@ def origin(url: str) -> str:
 
 
 def same_origin(one: str, other: str) -> bool:
-    """Whether two addresses are of one server: the same scheme, host and port."""
+    """Whether two URLs have the same scheme, host and port."""
     return origin(one) == origin(other) != ""
 
 
 def counterpart(given: str, asked: str, landed: str) -> str:
-    """What to give instead of one address, where what was asked below it has led elsewhere.
+    """The URL to use instead of `given`, if a request for `asked` was redirected to `landed`.
 
     Parameters
     ----------
     given : str
-        The address of a server, a surface or a file.
+        The URL that the user gave: of a server, a surface or a file.
     asked : str
-        What was asked for it: that address itself, or one that begins with it.
+        The URL of the request: `given`, or one that begins with it.
     landed : str
-        Where a redirect led.
+        Where the redirect led.
     """
     base, path, end = urlsplit(given).path.rstrip("/"), urlsplit(asked).path, urlsplit(landed).path
     below = path.removeprefix(base)
@@ -139,12 +139,12 @@ def counterpart(given: str, asked: str, landed: str) -> str:
 
 
 def resolved(base: str, address: str) -> str:
-    """An address that a server has told, seen from `base`.
+    """A URL from a server's answer, made absolute with `base`.
 
     Raises
     ------
     RemoteProtocolError
-        When it is no ``http`` or ``https`` address, written in characters that an address has.
+        If it is not an ``http`` or ``https`` URL in plain ASCII.
     """
     try:
         found = urljoin(base, address)
@@ -156,7 +156,7 @@ def resolved(base: str, address: str) -> str:
 
 
 def is_loopback(url: str) -> bool:
-    """Whether the address is on this machine, where no proxy of the environment may come between."""
+    """Whether the URL is on this machine; proxies from the environment are then not used."""
     host = urlsplit(url).hostname or ""
     if host == "localhost":
         return True

@@ -1,7 +1,7 @@
 """Streams and surfaces of a server, for asyncio.
 
-`lodestream_client` exports these names; `lodestream_client.sync` has the same without an event loop. Bytes are decoded
-in the event loop, at most 64 KiB at a time.
+`lodestream_client` exports these names; `lodestream_client.sync` has the same for programs without an event loop. Data
+are decoded in the event loop, at most 64 KiB at a time.
 
 Examples
 --------
@@ -57,7 +57,7 @@ async def upload(
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
-    A surface in memory is encoded in a thread, and files are read in threads; progress is told from there.
+    A surface in memory is encoded in a thread, and files are read in threads; `progress` is called from there.
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {})
     parcel = await _prepared(sources, asked, progress)
@@ -69,42 +69,42 @@ async def upload(
 async def retry(
     url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None
 ) -> Description:
-    """Have a surface built again that waits, failed or is missing; as `lodestream_client.sync.retry`."""
+    """Ask the server to build a surface again that waits, failed or is missing; see `lodestream_client.sync.retry`."""
     return await _run(requests.retry(url, wait, progress), url, token)
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; exported as ``list`` too."""
+    """All surfaces of a server; also exported as ``list``."""
     return await _run(requests.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
-    """State and figures of one surface."""
+    """State and description of one surface."""
     return await _run(requests.describe(url), url, token)
 
 
 async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
-    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints.
+    """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
-    What a surface of `max_vertices` takes is what the container's tables may, see `connect`.
+    `max_vertices` limits the memory of the container's tables, see `connect`.
     """
     return await _run(requests.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
-    """What a surface's container, or a container's file, is known by."""
+    """What identifies a surface's container, or a container file."""
     return await _run(requests.identify(url), url, token)
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
-    """Remove a surface from its server."""
+    """Delete a surface from its server."""
     await _run(requests.delete(url), url, token)
 
 
 async def fetch_range(
     url: str, offset: int, length: int, *, token: str | None = None, timeout: float = requests.TIMEOUT
 ) -> bytes:
-    """Bytes of a surface's container, over HTTP; `timeout` is in seconds, for connecting and for each wait after it."""
+    """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
     return await _run(requests.fetch_range(url, offset, length), url, token, timeout)
 
 

@@ -26,14 +26,14 @@ __all__ = ["Stream", "connect"]
 
 
 class Stream(BaseStream):
-    """One surface being received; iterate over it for a `View` per layer.
+    """A surface being received; iterate over it for a `View` of each layer.
 
-    It is an asynchronous context manager: entering it opens the connection, leaving it tells the server that no more is
-    wanted. `connect` makes it.
+    It is an asynchronous context manager, made by `connect`. Entering it opens the connection; leaving it stops the
+    stream.
 
-    An error that the iteration raises, such as that of a server that is gone, ends the stream and takes nothing away:
-    views until then can be used as before, `decoder` has all that came (``decoder.view()`` is the last whole layer),
-    and `ended` is truncated.
+    If the iteration raises an error, for example because the server is gone, the stream ends but keeps what it has:
+    earlier views stay usable, `decoder` has all received data (``decoder.view()`` is the last complete layer), and
+    `ended` is truncated.
     """
 
     _socket: ClientConnection | None = None
@@ -73,7 +73,7 @@ class Stream(BaseStream):
             await self._abandon()
 
     async def stop(self) -> None:
-        """Ask for no more, at once: no further view is yielded.
+        """Stop the stream at once: no further view is yielded.
 
         May be called from another task than the one that iterates.
         """
@@ -82,10 +82,11 @@ class Stream(BaseStream):
         await self._flush()
 
     async def focus(self, region: Region | None) -> None:
-        """Let what a region needs come before the rest; at any time, and as often as one looks elsewhere.
+        """Receive the data of a region before the rest. Allowed at any time, any number of times.
 
-        Nothing is sent twice for it, and the end is the same. Views then come whenever a layer is whole in the region,
-        or everywhere; their errors are not known (NaN) where they hold more than belongs to that layer.
+        Nothing is sent twice, and the stream ends as it would have. Views then come when a layer is complete in the
+        region, and when it is complete everywhere. Their errors are NaN if more data have arrived than belong to the
+        layer.
 
         Parameters
         ----------
@@ -95,13 +96,14 @@ class Stream(BaseStream):
         Raises
         ------
         OptionError
-            When the surface has no such region, or several blocks; before it is known, the iteration raises it.
+            If the surface has no such region, or several blocks. While the surface is not known yet, the iteration
+            raises it.
         """
         self._turn(region)
         await self._flush()
 
     async def close(self) -> None:
-        """Stop, take leave and close the connection, within the time allowed for it."""
+        """Stop and close the connection, within `close_timeout`."""
         try:
             if self.ended is None:
                 await self.stop()
@@ -249,9 +251,9 @@ def connect(
     sink: Sink | None = None,
     max_vertices: int | None = None,
 ) -> Stream:
-    """The stream of a surface, to be entered with ``async with``.
+    """Receive a surface; to be entered with ``async with``.
 
-    Parameters and errors are those of `lodestream_client.sync.connect`; the connection is opened, and its errors are
+    Parameters and errors are those of `lodestream_client.sync.connect`. The connection is opened, and errors are
     raised, on entering.
     """
     return Stream(

@@ -1,6 +1,6 @@
-"""What a server answers over HTTP, before anything in it is believed: read within bounds, and its JSON checked.
+"""Answers of a server over HTTP: read within bounds, and their JSON checked before use.
 
-No answer is decompressed: none was asked for compressed, and a few bytes of it could become any number.
+Encoded answers are refused: none was requested, and a few compressed bytes can expand to any number.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _LARGEST_NUMBER = 2**63
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer, read as far as it is wanted.
+    """An answer that has been read as far as needed.
 
     Attributes
     ----------
     status, reason : int, str
-        Its first line.
+        The status line.
     headers : mapping
         By names in lower case.
     content : bytes
         The body, as it was sent.
     withheld : str
-        What to say where the token was not sent along a redirect; empty otherwise.
+        Explanation if the token was not sent along a redirect; otherwise empty.
     """
 
     status: int
@@ -54,23 +54,23 @@ class Answer:
 
 
 class Incoming:
-    """An answer whose body is still to be read.
+    """An answer whose body has not been read yet.
 
     Parameters
     ----------
     response : httpx.Response
-        As far as its headers.
+        Read as far as its headers.
     most : int
-        Bytes that are read of a body that is none of a problem.
+        Most bytes of a body, unless it is a problem document.
     asked, given : str
-        The address asked, and the one that the user gave.
+        The URL of the request, and the one that the user gave.
     token : str or None
-        What was sent to the server at `given`.
+        Token that was sent to the server at `given`.
 
     Raises
     ------
     RemoteProtocolError
-        When it is encoded, which was not asked for, or longer than `most`.
+        If the body is encoded, or longer than `most`.
     """
 
     def __init__(self, response: httpx.Response, most: int, asked: str, given: str, token: str | None) -> None:
@@ -83,12 +83,10 @@ class Incoming:
         coding = str(response.headers.get("content-encoding", "identity"))
         self._read = coding == "identity"
         if self._fine and not self._read:
-            raise RemoteProtocolError(
-                f"expected an answer of {asked} as it is, got it encoded with {coding}, which was not asked for"
-            )
+            raise RemoteProtocolError(f"expected an unencoded answer of {asked}, got one encoded with {coding}")
 
     def take(self, piece: bytes) -> bool:
-        """Take a piece of the body; whether more is wanted."""
+        """Take a piece of the body; returns whether more is needed."""
         if self._read:
             self._body += piece
         if len(self._body) <= self._most:
@@ -99,21 +97,21 @@ class Incoming:
         return False
 
     def answer(self) -> Answer:
-        """All of it."""
+        """The complete answer."""
         response = self._response
         headers = dict(response.headers)
         return Answer(response.status_code, response.reason_phrase, headers, bytes(self._body), self._withheld)
 
 
 def withheld(token: str | None, given: str, asked: str, landed: str) -> str:
-    """What to say of a token that was not sent where a redirect led; empty where it was.
+    """Explanation for the user if a token was not sent along a redirect; empty if it was.
 
     Parameters
     ----------
     token : str or None
-        What the server at `given` is shown.
+        Token for the server at `given`.
     given, asked, landed : str
-        The address that the user gave, the one asked, and the one that answered.
+        The URL that the user gave, the one of the request, and the one that answered.
     """
     if token is None or addresses.same_origin(given, landed):
         return ""
@@ -124,19 +122,19 @@ def withheld(token: str | None, given: str, asked: str, landed: str) -> str:
 
 
 def parse(data: bytes) -> Mapping[str, Any]:
-    """The JSON object that is all of these bytes.
+    """Parse bytes that must be one JSON object.
 
     Raises
     ------
     ValueError
-        When it is none, has numbers that are not finite, or lists and objects in each other beyond all use.
+        If they are not, or contain numbers that are not finite, or are nested too deeply.
     """
     try:
         found = json.loads(data, parse_float=_finite, parse_constant=_finite)
     except RecursionError:
-        raise ValueError("lists and objects in each other") from None
+        raise ValueError("lists and objects nested too deeply") from None
     if not isinstance(found, dict):
-        raise ValueError("no object")
+        raise ValueError("not an object")
     within: list[Any] = [found]
     for _ in range(_DEEPEST):
         within = [
@@ -147,7 +145,7 @@ def parse(data: bytes) -> Mapping[str, Any]:
         ]
         if not within:
             return found
-    raise ValueError("lists and objects in each other")
+    raise ValueError("lists and objects nested too deeply")
 
 
 def _finite(text: str) -> float:
@@ -158,7 +156,7 @@ def _finite(text: str) -> float:
 
 
 def check_figures(document: Mapping[str, Any], url: str) -> None:
-    """Refuse a surface's description whose figures are of another kind than they should; any of them may be missing.
+    """Refuse a description of a surface whose figures have wrong types; any of them may be missing.
 
     Raises
     ------
@@ -167,7 +165,7 @@ def check_figures(document: Mapping[str, Any], url: str) -> None:
     for name, fits in _FIGURES.items():
         value = document.get(name)
         if value is not None and not fits(value):
-            raise RemoteProtocolError(f"expected the figures of a surface from {url}, got {name} {value!a:.80}")
+            raise RemoteProtocolError(f"expected the description of a surface from {url}, got {name} {value!a:.80}")
 
 
 def _is_count(value: Any) -> bool:

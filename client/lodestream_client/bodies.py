@@ -1,4 +1,4 @@
-"""What is uploaded: files opened for sending, counted while they are read; what is in memory as a container."""
+"""The bodies of uploads: files opened for sending, and surfaces in memory encoded as containers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CHUNK = 64 * 1024
 
 @dataclass(frozen=True)
 class Parcel:
-    """What is sent: files, each with the name that it has unless its own is known, and the query of the upload."""
+    """An upload: files with their names (empty: the file's own name), and the query of the request."""
 
     files: tuple[tuple[str, File], ...]
     parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class Body:
     ----------
     files : sequence of (name, file)
     sent : callable or None
-        Called as ``sent(fraction)`` while they are read.
+        Called as ``sent(fraction)`` while the files are read.
     """
 
     def __init__(self, files: Sequence[tuple[str, BinaryIO]], sent: Callable[[float], None] | None = None) -> None:
@@ -61,14 +61,14 @@ class Body:
             self._sent(min(self._done / max(self.size, 1), 1.0))
 
     def parts(self) -> list[tuple[str, tuple[str, BinaryIO, str]]]:
-        """Several files as the parts of a form, in httpx's shape."""
+        """Several files as the parts of a form, as httpx expects them."""
         return [
             ("file", (name, cast("BinaryIO", _Counted(file, self)), "application/octet-stream"))
             for name, file in self.files
         ]
 
     def chunks(self) -> Iterator[bytes]:
-        """The one file, piece by piece."""
+        """The contents of the one file, piece by piece."""
         file = _Counted(self.files[0][1], self)
         while chunk := file.read(_CHUNK):
             yield chunk
@@ -95,36 +95,36 @@ def _length(file: BinaryIO) -> int:
 
 
 def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, float], None] | None) -> Parcel:
-    """Get ready what is to be uploaded; a surface in memory is encoded, which takes its time.
+    """Prepare an upload; a surface in memory is encoded, which takes time.
 
     Raises
     ------
     OptionError
-        When there is nothing to send, an option has a value that it does not take, both a precision and an RMS error
-        are given, or there are options of a format for what is in memory.
+        If there is nothing to upload, an option has an invalid value, both a precision and an RMS error are given, or
+        there are format options for a surface in memory.
     InputError
-        When a source is of another kind, a surface in memory is not alone, or it cannot be encoded.
+        If a source has another type, a surface in memory is not the only source, or it cannot be encoded.
     """
     if not sources:
         raise OptionError("expected at least one file to upload, got none")
     kinds = [in_memory(source) for source in sources]
     if any(kinds):
         if len(sources) > 1:
-            raise InputError(f"expected one surface in memory by itself, got it among {len(sources)} sources")
+            raise InputError(f"expected a surface in memory as the only source, got {len(sources)} sources")
         return Parcel((("surface.lode", encoded(sources[0], asked, progress)),))
     return Parcel(tuple(("", cast("File", source)) for source in sources), _parameters(asked))
 
 
 @contextmanager
 def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Iterator[Body]:
-    """Open what is to be uploaded.
+    """Open the files of an upload.
 
     Raises
     ------
     OptionError
-        When there are options for a container, which says all that they could say itself.
+        If there are options for a container, which takes none but a name.
     OSError
-        When a file cannot be opened.
+        If a file cannot be opened.
     """
     with ExitStack() as stack:
         files: list[tuple[str, BinaryIO]] = []
@@ -138,7 +138,7 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
                 files.append((name, source))
         options = [option for option in parcel.parameters if option != "name"]
         if options and any(_is_container(file) for _, file in files):
-            raise OptionError(f"expected no {options[0]} for a container (.lode), which says it already")
+            raise OptionError(f"expected no {options[0]} for a container (.lode), which is encoded already")
         yield Body(files, sent)
 
 

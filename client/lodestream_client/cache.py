@@ -1,11 +1,11 @@
-"""What came of surfaces that are not complete yet, on disk, so that a later program goes on from there.
+"""Received data of incomplete surfaces, on disk, so that a later program can continue from there.
 
-One file for each container, a log: a head, then a record for each piece of the container that came, with its place, its
-length and a checksum over all three. A piece is written at once and nothing that stands is ever changed, so a program
-that is killed loses nothing, and a machine that loses power loses at most what does not match its checksum.
+There is one log file for each container: a head, then a record for each received piece, with its offset, its length and
+a checksum over all three. Records are appended at once and never changed. So a program that is killed loses nothing,
+and a machine that loses power loses at most records whose checksum does not match.
 
-What a container is called comes from a server. So a name is 64 hexadecimal digits or refused, no symbolic link is
-followed, and no file is written or removed that does not begin as ours do.
+The name of a file comes from a server. So only names of 64 hexadecimal digits are accepted, symbolic links are not
+followed, and no file is written or removed that does not begin like a file of this module.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ import time
 import zlib
 from bisect import bisect_right, insort
 from pathlib import Path
-
-from platformdirs import user_cache_path
 
 from lodestream.errors import InputError, LodestreamError
 from lodestream.ranges import RangeSet
@@ -45,25 +43,26 @@ class _TakenError(Exception):
 
 
 def cache_folder() -> Path:
-    """The folder of ``LODESTREAM_CACHE``, or the user's own for such things."""
+    """The folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
     chosen = os.environ.get("LODESTREAM_CACHE")
-    return Path(chosen) if chosen else user_cache_path("lodestream", appauthor=False)
+    base = os.environ.get("XDG_CACHE_HOME", "").strip() or os.path.expanduser("~/.cache")
+    return Path(chosen) if chosen else Path(base, "lodestream")
 
 
 def is_name(name: object) -> bool:
-    """Whether a container can be called so: 64 hexadecimal digits, as a SHA-256 is written."""
+    """Whether a text is a valid name: 64 hexadecimal digits."""
     return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
 class Part:
-    """What is kept of one container; nobody else writes it as long as it is open.
+    """The stored data of one container; locked against other programs while it is open.
 
     Parameters
     ----------
     folder : Path
-        Made, for the user alone, when it is not there.
+        Created with access for the user only, if it does not exist.
     name : str
-        What the container is known by: 64 hexadecimal digits.
+        Name of the container, 64 hexadecimal digits.
     size : int
         Bytes of the container.
 
@@ -71,19 +70,19 @@ class Part:
     ----------
     folder : Path
     ranges : RangeSet
-        What is kept.
+        The bytes that are stored.
     discarded : bool
-        Whether closing removes it. What holds nothing is removed in any case.
+        Whether closing removes the file. A file without data is removed in any case.
 
     Raises
     ------
     InputError
-        When the name is another.
+        If the name is not valid.
     LodestreamError
-        When another program has it open.
+        If another program has the file open.
     OSError
-        When the folder cannot be written, or what stands there under this name is none of these files: a symbolic
-        link, a file of another user or with other content. It is left as it is.
+        If the folder cannot be written, or something else has this name: a symbolic link, a file of another user or
+        with other contents. It is not touched.
     """
 
     def __init__(self, folder: Path, name: str, size: int) -> None:
@@ -106,7 +105,7 @@ class Part:
             raise
 
     def read(self, offset: int, length: int) -> bytes:
-        """Bytes that are kept."""
+        """Read stored bytes."""
         data = bytearray()
         number = bisect_right(self._pieces, (offset, 1 << 63, 0)) - 1
         while len(data) < length:
@@ -117,7 +116,7 @@ class Part:
         return bytes(data)
 
     def write(self, offset: int, data: bytes) -> None:
-        """Keep bytes that are not kept yet."""
+        """Store bytes that are not stored yet."""
         record = _RECORD.pack(offset, len(data), _checksum(offset, data)) + data
         written = os.pwrite(self._handle, record, self._end)
         if written != len(record):
@@ -126,10 +125,10 @@ class Part:
         self._end += len(record)
 
     def used(self, offset: int, length: int) -> None:
-        """Whatever has been used is kept nevertheless."""
+        """Do nothing: used bytes stay stored."""
 
     def close(self) -> None:
-        """Let others have it, or remove it."""
+        """Release the file, or remove it."""
         if self.discarded or not self.ranges.total:
             # Whoever opens it just now finds that it has no name any more, and makes another.
             self._path.unlink(missing_ok=True)
@@ -167,7 +166,7 @@ class Part:
 
 
 def forget_old(folder: Path) -> None:
-    """Remove what nobody has come back to for a month; other files in the folder are left alone."""
+    """Remove files that were not used for a month; files of other programs in the folder are not touched."""
     if not folder.is_dir():
         return
     before = time.time() - _DAYS_KEPT * 24 * 3600
@@ -215,7 +214,7 @@ def _check_ours(handle: int, path: Path) -> None:
     own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
     # A program that was killed may have left less than a head.
     if not own or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
-        raise FileExistsError(errno.EEXIST, "not a file that an earlier pull left; it is left alone", str(path))
+        raise FileExistsError(errno.EEXIST, "not a file of an earlier pull; it is not changed", str(path))
 
 
 def _is_at(handle: int, path: Path) -> bool:

@@ -1,10 +1,10 @@
-"""What can go wrong on the way to a server, beside the errors of `lodestream.errors`.
+"""Errors of the connection to a server, in addition to those of `lodestream.errors`.
 
 ::
 
     LodestreamError
     ├── UnreachableError (ConnectionError)    no connection, or it broke before the end
-    └── SilenceError (TimeoutError)           nothing came for longer than allowed
+    └── SilenceError (TimeoutError)           the server sent nothing for too long
 """
 
 from __future__ import annotations

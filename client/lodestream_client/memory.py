@@ -1,4 +1,4 @@
-"""Surfaces in memory: what can be encoded before it is sent, and the container that is sent."""
+"""Surfaces in memory: recognising them, and encoding them before they are sent."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ARRAYS = ("__array__", "__array_interface__", "__array_struct__")
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of an upload, see `lodestream_client.sync.upload`."""
+    """The options of an upload, see `lodestream_client.sync.upload`."""
 
     precision: Tolerance | float | str | None = None
     rms: Tolerance | float | str | None = None
@@ -43,12 +43,12 @@ class Asked:
 
 
 def in_memory(source: object) -> bool:
-    """Whether this is a surface or an array, not a file; told without importing what they are made of.
+    """Whether a source is a surface or an array, not a file; decided without importing their libraries.
 
     Raises
     ------
     InputError
-        When it is neither.
+        If it is neither.
     """
     if isinstance(source, str | os.PathLike | bytes | bytearray) or _is_bytes(source):
         return False
@@ -61,7 +61,7 @@ def in_memory(source: object) -> bool:
         return True
     found = "a file open for text" if isinstance(source, io.TextIOBase) else type(source).__name__
     raise InputError(
-        f"expected a file's name, an open binary file, the bytes of one, a Surface or an array of points, got {found}"
+        f"expected the name of a file, an open binary file, its bytes, a Surface or an array of points, got {found}"
     )
 
 
@@ -70,22 +70,25 @@ def _is_bytes(source: object) -> bool:
 
 
 def encoded(source: object, asked: Asked, progress: Callable[[str, float], None] | None) -> bytes:
-    """The container of a surface or an array; what it does not keep is a `FormatWarning`, and one of its ``notes``.
+    """The container of a surface or an array. What a container does not keep is a `FormatWarning`, and one of its
+    ``notes``.
 
     Parameters
     ----------
     source : Surface or array
     asked : Asked
-        The name becomes the surface's own. No options of formats: there is no file.
+        The name becomes the surface's own. Format options are refused, because there is no file.
     progress : callable or None
         Called as ``progress("encoding", fraction)``.
 
     Raises
     ------
     OptionError
-        When there are options of formats, or an option has a value that it does not take.
+        If there are format options, or an option has an invalid value.
     InputError
-        When it cannot be encoded.
+        If the surface cannot be encoded.
+    UnavailableError
+        If the compiled kernels are missing.
     """
     for option in asked.options:
         raise OptionError(f"expected no options of a file's format for a surface in memory, got {option}")

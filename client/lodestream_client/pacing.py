@@ -1,4 +1,4 @@
-"""Reading at a limited rate: how long each message would have taken on a link of that speed."""
+"""Receiving at a limited rate: the time that each message would take on a link of that rate."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _WINDOW_MOST = 256 * 1024
 
 
 class Link:
-    """A link of limited rate on this side of the real one: a token bucket without burst, clock passed in.
+    """A simulated link of limited rate behind the real one: a token bucket without burst; the caller passes the time.
 
-    Credit is granted only for bytes that have come through, so the server follows.
+    Credit is granted only for data that have passed it, so the server adapts its rate.
 
     Parameters
     ----------
@@ -29,11 +29,11 @@ class Link:
         self._free_at = float("-inf")
 
     def delay(self, size: int, now: float) -> float:
-        """Seconds from `now` until `size` more bytes have come through."""
+        """Seconds from `now` until `size` more bytes have passed."""
         self._free_at = max(self._free_at, now) + size / self.rate
         return self._free_at - now
 
 
 def window_for(rate: float) -> int:
-    """Bytes of credit that keep a link of `rate` bytes per second busy and no more."""
+    """The credit, in bytes, that keeps a link of `rate` bytes per second busy and no more."""
     return round(min(max(rate * _WINDOW_SECONDS, _WINDOW_LEAST), _WINDOW_MOST))

@@ -1,4 +1,4 @@
-"""From what a server or a socket reports to the errors of Lodestream."""
+"""Conversion of server answers and socket errors to the exceptions of Lodestream."""
 
 from __future__ import annotations
 
@@ -55,26 +55,26 @@ _NO_HANDSHAKE = {400, 404, 405, 426}
 
 
 class NoStreamError(RemoteProtocolError):
-    """What answers is a WebSocket that carries no streams."""
+    """A WebSocket was opened, but it does not speak the stream protocol."""
 
 
 def from_code(code: str, message: str) -> LodestreamError:
-    """The error that a code of the server stands for."""
+    """The exception for an error code of the server."""
     kind = _BY_CODE.get(code)
     return RemoteError(code, message) if kind is None else kind(message)
 
 
 def from_response(status: int, reason: str, body: bytes, url: str) -> LodestreamError:
-    """The error that an HTTP answer stands for.
+    """The exception for an HTTP answer.
 
     Parameters
     ----------
     status, reason : int, str
-        First line of the answer.
+        The status line.
     body : bytes
         A problem document (RFC 9457), whose ``detail`` becomes the message, or anything else.
     url : str
-        What was asked for; named where the answer does not explain itself.
+        The URL of the request; named if the answer does not explain itself.
     """
     document = _document(body)
     detail = document.get("detail") or document.get("title")
@@ -88,16 +88,16 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
 
 
 def passes(error: LodestreamError) -> bool:
-    """Whether the same attempt may go well a little later."""
+    """Whether the same request may succeed a little later."""
     if isinstance(error, RemoteError):
         return error.code in _PASSING
     return isinstance(error, UnreachableError | SilenceError | TruncatedStreamError) or _broke_off(error)
 
 
 def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
-    """Whether it is the WebSocket that something between does not let through, so that plain HTTP may do.
+    """Whether something on the way seems to block WebSockets only, so that plain HTTP may work.
 
-    A connection that broke in its handshake tells this only if there has been none (`met`) that did not.
+    A connection that broke during its handshake counts as a sign of this only if no handshake has succeeded (`met`).
     """
     from websockets import exceptions as ws
 
@@ -133,7 +133,7 @@ def _document(body: bytes) -> Mapping[str, Any]:
 
 
 def from_connection(error: Exception, url: str) -> LodestreamError:
-    """The error that a failed connection of websockets or httpx stands for; `url` is the surface's or server's."""
+    """The exception for a failed connection of websockets or httpx; `url` is that of the surface or server."""
     import httpx
     from websockets import exceptions as ws
 
@@ -144,7 +144,7 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
         return from_response(response.status_code, response.reason_phrase, bytes(response.body or b""), url)
     if isinstance(error, ws.InvalidURI):  # ours is one
         use = addresses.counterpart(url, addresses.stream_url(url), error.uri)
-        return RemoteProtocolError(f"{url} redirects its stream to what is no WebSocket's address; use {use}")
+        return RemoteProtocolError(f"{url} redirects its stream to an address that is not a WebSocket's; use {use}")
     if isinstance(error, (ws.InvalidHandshake, httpx.RemoteProtocolError, httpx.DecodingError)):
         return RemoteProtocolError(f"{url} does not answer like a Lodestream server: {error}")
     if isinstance(error, (ssl.SSLError, ssl.CertificateError)):

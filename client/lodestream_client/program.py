@@ -1,4 +1,4 @@
-"""The command ``lodestream``: its parser, and what becomes of errors."""
+"""The command ``lodestream``: its parser, and how errors are reported."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING
 
 import lodestream
 from lodestream.errors import LodestreamError
@@ -17,23 +17,35 @@ from .commands.interrupts import exit_code, unwrapping
 from .commands.output import Parser, clean_warnings, note
 from .starting import EndingAtOnce
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
 __all__ = ["build_parser", "main"]
 
 _MODULES = (demo, encode, decode, info, push, retry, pull, surfaces, formats)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The whole command line, with the sub-commands that other packages add through ``lodestream.commands``."""
+def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The command line, with the sub-commands that other packages add through ``lodestream.commands``.
+
+    Those are looked for only where ``argv``, what is to be parsed, does not begin with one of the client's own: looking
+    takes a third of the time of a short command.
+    """
     parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
-        description="Stream structured surfaces progressively: coarse first, then finer, the error known at each step.",
-        epilog="A path - is standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
+        description="Stream structured surfaces progressively: coarse data first, then finer data, with a known error "
+        "at each step.",
+        epilog="The path - means standard input or output. Exit code: 0 success, 1 failure, 2 wrong command line.",
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for module in _MODULES:
         module.register(subparsers)
+    if argv and argv[0] in subparsers.choices:
+        return parser
+    from importlib.metadata import entry_points
+
     # By name: a second, stale installation on the path may announce the same.
     found = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
     for name in sorted(found):
@@ -70,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         with EndingAtOnce():
-            args = build_parser().parse_args(argv)
+            arguments = sys.argv[1:] if argv is None else argv
+            args = build_parser(arguments).parse_args(arguments)
         with clean_warnings(), unwrapping():
             code: int = args.run(args)
         sys.stdout.flush()

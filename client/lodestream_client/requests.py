@@ -1,7 +1,7 @@
-"""What is asked of a server over HTTP, without I/O.
+"""HTTP requests to a server, without I/O.
 
-Each function here is a generator: it yields a `Call` and is sent the answer, or yields a `Pause` and is resumed after
-it; what it returns is the result. `lodestream_client.sync` and `lodestream_client.aio` run the same generators.
+Each function here is a generator. It yields a `Call` and is sent the answer, or yields a `Pause` and is resumed after
+it; its return value is the result. `lodestream_client.sync` and `lodestream_client.aio` run the same generators.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ TIMEOUT = 30.0
 
 @dataclass(frozen=True)
 class Call:
-    """Ask this of a server; the answer, read whole, is sent back.
+    """A request to make; the complete answer is sent back.
 
-    With ``partial``, an answer that is the whole of a file is sent back without having been read. Of others at most
-    `most` bytes are.
+    With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
+    bytes are read.
     """
 
     method: str
@@ -93,7 +93,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Pause:
-    """Wait so many seconds."""
+    """A wait of so many seconds."""
 
     seconds: float
 
@@ -103,14 +103,14 @@ Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
 
 @dataclass(frozen=True)
 class Identity:
-    """What a container is known by, so that what is kept of it can be found again.
+    """What identifies a container, so that stored data of it can be found again.
 
     Attributes
     ----------
     name : str or None
-        Of its own, in hexadecimal digits; None where nothing tells this version of a file from another.
+        A name in hexadecimal digits; None if the server does not distinguish versions of the file.
     container : str or None
-        SHA-256 of the container, where the server tells it.
+        SHA-256 of the container, if the server gives it.
     size : int or None
         Bytes of the container.
     """
@@ -122,20 +122,20 @@ class Identity:
 
 @dataclass(frozen=True)
 class Description:
-    """What a server says of one surface.
+    """A server's description of one surface.
 
     Attributes
     ----------
     url : str
-        The surface's address: what `connect` and `delete` take.
+        The surface's URL, as `connect` and `delete` take it.
     id : str
-        Name of the surface on its server.
+        Id of the surface on its server.
     state : str
-        ``queued``, ``building``, ``ready``; ``failed``: it cannot be built; ``waiting``: its build could not be made,
-        for a reason of the server's own; or ``missing``: it is not on the server's disk now. Of the last three see
+        ``queued``, ``building``, ``ready``; ``failed``: the reader rejected the file; ``waiting``: it could not be
+        built for a reason on the server; ``missing``: it is not on the server's disk now. For the last three see
         `retry`.
     details : mapping
-        Everything that the server says, by its own keys: build progress, or what ``info --json`` tells.
+        The complete description, by the server's keys: build progress, or what ``info --json`` prints.
     """
 
     url: str
@@ -152,7 +152,7 @@ class Description:
 def client_options(
     url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False, home: Callable[[], str] | None = None
 ) -> dict[str, Any]:
-    """What an httpx client for the server at `url` is made with.
+    """Arguments for an httpx client of the server at `url`.
 
     Parameters
     ----------
@@ -160,9 +160,9 @@ def client_options(
     timeout : float
         Seconds for each step.
     asynchronous : bool
-        Whether it is one for asyncio.
+        Whether it is an asyncio client.
     home : callable, optional
-        Gives the address whose origin alone is shown a token, where that is not always `url`.
+        Returns the URL whose origin may receive the token, if that is not always `url`.
     """
 
     def guard(request: httpx.Request) -> None:
@@ -193,9 +193,9 @@ def _trusted() -> ssl.SSLContext:
 
 
 def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
-    """The arguments of an httpx client's ``request`` but the body of one file.
+    """Arguments for the ``request`` method of an httpx client, except the body of a single file.
 
-    The token is only for the server at `url`, wherever an answer may point.
+    The token is sent only to the server at `url`, wherever redirects lead.
     """
     headers = dict(call.headers)
     if token is not None and addresses.same_origin(call.url, url):
@@ -224,7 +224,7 @@ def upload(
 
 
 def retry(url: str, wait: bool, progress: Progress | None) -> Flow[Description]:
-    """Have a surface built again, and wait until it is ready."""
+    """Ask for another build of a surface, and wait until it is ready."""
     address = addresses.surface_url(url)
     answer = yield Call("POST", f"{address}/retry")
     surface = _described(_checked(answer, address), address)
@@ -255,7 +255,7 @@ def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str
 
 
 def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
-    """Everything that a server has, page by page."""
+    """All surfaces of a server, page by page."""
     page: str | None = addresses.surfaces_url(url)
     surfaces: list[Description] = []
     seen = set[str]()
@@ -277,14 +277,14 @@ def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
 
 
 def describe(url: str) -> Flow[Description]:
-    """One surface's state and figures."""
+    """State and description of one surface."""
     address = addresses.surface_url(url)
     answer = yield Call("GET", address)
     return _described(_checked(answer, address), address)
 
 
 def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str, Any]]:
-    """The figures of a container that some web server holds as a file."""
+    """Description of a container file on any web server."""
     from lodestream.container import describe
     from lodestream.range_download import RangeDownload
     from lodestream.reception import Reception
@@ -304,7 +304,7 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
 
 
 def identify(url: str) -> Flow[Identity]:
-    """What a surface's container, or a file, is known by."""
+    """What identifies a surface's container, or a file."""
     if addresses.is_surface(url):
         surface = yield from describe(url)
         container, size = surface.details.get("container"), surface.details.get("bytes")
@@ -312,7 +312,7 @@ def identify(url: str) -> Flow[Identity]:
             raise RemoteError("not-ready", f"expected {url} to be ready, got {surface.state}")
         if not _CONTAINER.fullmatch(container) or size is True or not 0 < size <= _LARGEST_FILE:
             raise RemoteProtocolError(
-                f"expected the SHA-256 and the bytes of a container from {url}, got {container!a:.80} and {size!r:.80}"
+                f"expected the SHA-256 and size of a container from {url}, got {container!a:.80} and {size!r:.80}"
             )
         return Identity(container, container, size)
     answer = _refuse((yield Call("HEAD", url, headers={"Accept-Encoding": "identity"})), url)
@@ -322,21 +322,21 @@ def identify(url: str) -> Flow[Identity]:
 
 
 def identity_of_file(url: str, version: str | None, size: int | None) -> Identity:
-    """What a container's file is known by; `version` is its entity tag or date."""
+    """What identifies a container file; `version` is its entity tag or date."""
     if version is None or size is None:
         return Identity(None, None, None)
     return Identity(hashlib.sha256(f"{url}\n{version}\n{size}".encode()).hexdigest(), None, size)
 
 
 def delete(url: str) -> Flow[None]:
-    """Remove one surface from its server."""
+    """Delete one surface from its server."""
     address = addresses.surface_url(url)
     answer = yield Call("DELETE", address)
     _refuse(answer, address)
 
 
 def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
-    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container's file."""
+    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file."""
     address = addresses.container_url(url)
     headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
     response = _refuse((yield Call("GET", address, headers=headers, partial=True, most=length)), address)
@@ -354,7 +354,9 @@ def _refuse(answer: Answer | None, url: str) -> Answer:
         raise AssertionError("a call was resumed without its answer")
     if answer.status in _MOVED and (location := answer.headers.get("location")):
         place = addresses.counterpart(url, url, addresses.resolved(url, location))
-        raise RemoteProtocolError(f"{url} redirects what would change something; use {place} if that is meant")
+        raise RemoteProtocolError(
+            f"{url} redirects a request that changes something, which is not followed; use {place}"
+        )
     if not 200 <= answer.status < 300:
         error = problems.from_response(answer.status, answer.reason, answer.content, url)
         error.args = (f"{error}{answer.withheld}", *error.args[1:])

@@ -1,7 +1,6 @@
-"""By which road a stream is asked for, and when again after it broke: the policy, without I/O.
+"""Which transport a stream uses, and when to try again after it broke: the policy, without I/O.
 
-The road is the WebSocket, or HTTP Range where something between does not let WebSockets through or the address is that
-of a plain file.
+The transport is a WebSocket, or HTTP Range if WebSockets do not get through or the URL is that of a plain file.
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ _FIRST_ATTEMPTS = 3
 
 
 class Roads:
-    """The roads to one address.
+    """The transports to one URL.
 
     Parameters
     ----------
     url : str
-        Of a surface, or of its container.
+        URL of a surface, or of its container.
     transport : "auto", "ws" or "http"
-        Which roads may be taken.
+        Transports that may be used.
     deadline : float
-        Seconds since a connection was lost in which no byte came, after which it is given up.
+        Seconds without data after a connection was lost, after which the client gives up.
 
     Attributes
     ----------
     url : str
     road : "ws" or "http"
-        What is tried next.
+        The transport of the next attempt.
     met : bool
-        The server has answered as it should. Before, it is tried three times and no more: what is wrong with an address
-        is better told than waited for.
+        Whether the server has answered as expected. Before that there are only three attempts, because a wrong URL
+        should be reported soon.
     """
 
     def __init__(self, url: str, transport: Transport, deadline: float) -> None:
@@ -62,23 +61,22 @@ class Roads:
         self.met = False
 
     def start(self, now: float) -> None:
-        """The first attempt begins."""
+        """Begin the first attempt."""
         self._attempts, self._since = 0, now
 
     def failed(self, error: LodestreamError, now: float, *, progressed: bool) -> float:
-        """An attempt ended with an error; the seconds to wait before the next one.
+        """Record that an attempt failed; returns the seconds to wait before the next one.
 
         Parameters
         ----------
-        error : LodestreamError
-        now : float
+        error : LodestreamError now : float
         progressed : bool
-            New bytes had come before.
+            Whether new data had arrived before.
 
         Raises
         ------
         LodestreamError
-            The error itself, when there is nothing left to try.
+            The error itself, if no further attempt is made.
         """
         if progressed:
             self.start(now)

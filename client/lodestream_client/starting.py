@@ -1,6 +1,6 @@
-"""Ctrl-C while a program starts, when there is nothing yet that would have to be ended in order.
+"""Ctrl-C while a program starts and has nothing to clean up yet.
 
-Imported before everything else, hence itself without an import that takes time: until then Ctrl-C prints a traceback.
+This module is imported before all others and imports nothing slow: until then Ctrl-C prints a traceback.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ INTERRUPTED = 130
 
 
 class EndingAtOnce:
-    """Let SIGINT end the process within a ``with`` block, without a word, unless it is ignored or somebody else has it.
+    """End the process silently on SIGINT within a ``with`` block, unless SIGINT is ignored or handled by other code.
 
-    An import that is interrupted by an exception may make another one of it, or print it.
+    An import that is interrupted by an exception may turn it into another one, or print it.
     """
 
     def __enter__(self) -> None:

@@ -1,8 +1,8 @@
-"""What the synchronous and the asynchronous stream share: everything but the waiting.
+"""The code that the synchronous and the asynchronous stream share: everything except waiting.
 
-The way of a stream is one generator. What it yields is what one of the stream's own primitives gives (`_dial`, `_hear`
-and so on); it is resumed with the result. For plain code a primitive has done its work by then; for asyncio it gives
-something to await first. Errors come back into the generator either way.
+A stream is one generator. It yields the results of the stream's primitives (`_dial`, `_hear` and so on). In the
+synchronous stream a primitive has done its work when it returns; in the asynchronous one it returns something to await.
+The generator is resumed with the result, or with the error.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ _OFFENCES = {1002, 1003, 1007, 1009}
 
 
 class BaseStream:
-    """One surface being received.
+    """A surface being received.
 
     Attributes
     ----------
     target : Target
-        Where it stops, and the order on the way there.
+        What to receive, where to stop, and in which order.
     """
 
     def __init__(
@@ -117,12 +117,12 @@ class BaseStream:
 
     @property
     def url(self) -> str:
-        """The address that it comes from."""
+        """The URL of the surface or file."""
         return self._roads.url
 
     @property
     def silence(self) -> float:
-        """Seconds without a word after which a connection is given up; may be set at any time."""
+        """Seconds without data after which a connection counts as lost; may be set at any time."""
         return self._silence
 
     @silence.setter
@@ -133,17 +133,17 @@ class BaseStream:
 
     @property
     def decoder(self) -> Decoder:
-        """What has come so far; after `stop` it may hold more than the last view."""
+        """Decodes what has arrived so far; after `stop` it may hold more than the last view."""
         return self._reception.decoder
 
     @property
     def header(self) -> Header | None:
-        """What the server said first over the WebSocket: the container's hash and size, and how much is planned."""
+        """The server's first message over the WebSocket: the container's SHA-256 and size, and how much is planned."""
         return self._download.header if self._download is not None else None
 
     @property
     def identity(self) -> Identity:
-        """What the container is known by, as far as the server has told."""
+        """What identifies the container, as far as the server has told it."""
         container, size = self._reception.container, self._reception.size
         if container is not None:
             return Identity(container, container, size)
@@ -152,7 +152,7 @@ class BaseStream:
 
     @property
     def planned(self) -> int | None:
-        """Bytes of the surface that the target needs; None until that is known."""
+        """Bytes of the surface that the target needs; None until they are known."""
         return self._reception.planned
 
     @property
@@ -172,12 +172,12 @@ class BaseStream:
 
     @property
     def transport(self) -> str:
-        """The road in use: ``ws`` or ``http``."""
+        """The transport in use: ``ws`` or ``http``."""
         return self._roads.road
 
     @property
     def connections(self) -> int:
-        """How many connections it took so far; over HTTP, how many requests."""
+        """Number of connections so far; over HTTP, number of requests."""
         return self._connections
 
     @property
@@ -187,7 +187,7 @@ class BaseStream:
 
     @property
     def ended(self) -> str | None:
-        """Why nothing more comes; None while more may come.
+        """Why the stream ended; None while it has not.
 
         complete, level, rms, max, bytes or seconds, as the target says; stopped by this side; truncated by an error.
         """
@@ -487,7 +487,7 @@ class BaseStream:
         """Raise what the end of a WebSocket stands for."""
         if error.rcvd is None and error.sent is not None and error.sent.code in _OFFENCES:
             raise RemoteProtocolError(
-                f"{self.url} sent what is no WebSocket message of the stream: {error.sent.reason or error.sent.code}"
+                f"{self.url} sent an invalid WebSocket message: {error.sent.reason or error.sent.code}"
             )
         if self._download is not None:
             try:

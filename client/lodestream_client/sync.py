@@ -1,6 +1,6 @@
 """Streams and surfaces of a server, for programs without an event loop.
 
-The names are those of `lodestream_client`; here they block.
+The names are those of `lodestream_client`; here the functions block.
 
 Examples
 --------
@@ -59,49 +59,47 @@ def upload(
     Parameters
     ----------
     url : str
-        The server's address.
+        URL of the server.
     *sources : str, path, binary file, bytes, Surface or array
-        One file, or several that make one surface; one that is open; the bytes of one. Or a surface in memory, whatever
-        `lodestream.encode` takes: it is encoded here, and the server keeps the container as it is. So it does with a
-        file that is a container, for which there is no option but a name.
+        One file, or several that make one surface: each as a name, an open file, or its bytes. Or a surface in memory,
+        anything that `lodestream.encode` takes: it is encoded here, and the server keeps the container unchanged. A
+        container file is kept unchanged too; no option but a name is allowed for it.
     precision : Tolerance, float, str or None
-        Greatest error of the complete surface; None for a lossless one.
+        Maximum error of the complete surface; None: lossless.
     rms : Tolerance, float, str or None
-        Make the shortest stream whose root mean square error is at most this, instead; excludes `precision`.
+        Encode for one root mean square error instead, see `lodestream.encode`; excludes `precision`.
     closed : "auto", "none", "rows", "cols" or "both"
-        Which axes of the grid wrap; auto leaves it to the file, or to the surface in memory.
+        Closed axes of the grid; auto: as the file or the surface in memory says.
     name : str or None
         Name of the surface.
     options : mapping of str to str
         Options of the file's format.
     wait : bool
-        Whether to wait until it is ready to be streamed.
+        Whether to wait until the surface is ready to be streamed.
     progress : callable or None
-        Called as ``progress(stage, fraction)``, with the stages ``encoding`` (of a surface in memory), ``sending`` and
+        Called as ``progress(stage, fraction)`` with the stages ``encoding`` (of a surface in memory), ``sending`` and
         ``building``.
     token : str or None
-        What the server asks for, if it does.
+        Token, if the server needs one.
     attribute_precision : mapping of str to Tolerance, float or str, or None
-        Greatest error of attributes, by their names; the others are lossless.
+        Maximum error of attributes, by name; the others are lossless.
 
     Returns
     -------
     Description
-        With the surface's address as ``url``.
+        With the surface's URL as ``url``.
 
     Raises
     ------
     OptionError
-        When an option has a value that it does not take, has no place beside such a source, or both `precision` and
-        `rms` are given.
+        If an option has an invalid value or is not allowed for such a source, or both `precision` and `rms` are given.
     InputError, TooLargeError
-        When a source is none of these or cannot be encoded, the server cannot use the file, or will not take one so
-        large.
+        If a source has another type or cannot be encoded, or the server cannot read the file or finds it too large.
     RemoteError
-        When the surface does not become ready, or the server refused. The code is ``failed`` where it cannot be built,
-        and ``waiting`` or ``missing`` where that is the server's trouble: what was uploaded is kept, see `retry`.
+        If the server refuses, or the surface does not become ready. The code is ``failed`` if the file cannot be built,
+        and ``waiting`` or ``missing`` if the reason is on the server: it keeps the upload, see `retry`.
     UnreachableError
-        When there is no connection.
+        If there is no connection.
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {})
     parcel = prepared(sources, asked, progress)
@@ -111,18 +109,18 @@ def upload(
 
 
 def retry(url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None) -> Description:
-    """Have a surface built again that waits, since its build could not be made, that failed or is missing.
+    """Ask the server to build a surface again that is waiting, failed or missing.
 
     Parameters
     ----------
     url : str
-        The surface's address.
+        URL of the surface.
     wait : bool
-        Whether to wait until it is ready to be streamed.
+        Whether to wait until the surface is ready to be streamed.
     progress : callable or None
         Called as ``progress("building", fraction)``.
     token : str or None
-        What the server asks for, if it does.
+        Token, if the server needs one.
 
     Returns
     -------
@@ -131,47 +129,47 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
     Raises
     ------
     NotFoundError
-        When there is no such surface.
+        If there is no such surface.
     RemoteError
-        When the server refuses, or the surface does not become ready: code ``failed``, ``waiting`` or ``missing``.
+        If the server refuses, or the surface does not become ready: code ``failed``, ``waiting`` or ``missing``.
     UnreachableError
-        When there is no connection.
+        If there is no connection.
     """
     return _run(requests.retry(url, wait, progress), url, token)
 
 
 def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; exported as ``list`` too."""
+    """All surfaces of a server; also exported as ``list``."""
     return _run(requests.list_surfaces(url), url, token)
 
 
 def describe(url: str, *, token: str | None = None) -> Description:
-    """State and figures of one surface."""
+    """State and description of one surface."""
     return _run(requests.describe(url), url, token)
 
 
 def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
-    """Figures of a container that some web server holds as a file: what ``lodestream info --json`` prints.
+    """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
-    What a surface of `max_vertices` takes is what the container's tables may, see `connect`.
+    `max_vertices` limits the memory of the container's tables, see `connect`.
     """
     return _run(requests.describe_file(url, max_vertices), url, token)
 
 
 def identify(url: str, *, token: str | None = None) -> Identity:
-    """What a surface's container, or a container's file, is known by."""
+    """What identifies a surface's container, or a container file."""
     return _run(requests.identify(url), url, token)
 
 
 def delete(url: str, *, token: str | None = None) -> None:
-    """Remove a surface from its server."""
+    """Delete a surface from its server."""
     _run(requests.delete(url), url, token)
 
 
 def fetch_range(
     url: str, offset: int, length: int, *, token: str | None = None, timeout: float = requests.TIMEOUT
 ) -> bytes:
-    """Bytes of a surface's container, over HTTP; `timeout` is in seconds, for connecting and for each wait after it."""
+    """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
     return _run(requests.fetch_range(url, offset, length), url, token, timeout)
 
 

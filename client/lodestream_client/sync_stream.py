@@ -28,13 +28,13 @@ __all__ = ["Stream", "connect"]
 
 
 class Stream(BaseStream):
-    """One surface being received; iterate over it for a `View` per layer.
+    """A surface being received; iterate over it for a `View` of each layer.
 
-    It is a context manager: leaving it tells the server that no more is wanted. `connect` makes it.
+    It is a context manager, made by `connect`. Leaving it stops the stream.
 
-    An error that the iteration raises, such as that of a server that is gone, ends the stream and takes nothing away:
-    views until then can be used as before, `decoder` has all that came (``decoder.view()`` is the last whole layer),
-    and `ended` is truncated.
+    If the iteration raises an error, for example because the server is gone, the stream ends but keeps what it has:
+    earlier views stay usable, `decoder` has all received data (``decoder.view()`` is the last complete layer), and
+    `ended` is truncated.
     """
 
     _socket: ClientConnection | None = None
@@ -76,7 +76,7 @@ class Stream(BaseStream):
         self._abandon()
 
     def stop(self) -> None:
-        """Ask for no more, at once: no further view is yielded.
+        """Stop the stream at once: no further view is yielded.
 
         May be called from another thread than the one that iterates.
         """
@@ -85,10 +85,11 @@ class Stream(BaseStream):
         self._flush()
 
     def focus(self, region: Region | None) -> None:
-        """Let what a region needs come before the rest; at any time, and as often as one looks elsewhere.
+        """Receive the data of a region before the rest. Allowed at any time, any number of times.
 
-        Nothing is sent twice for it, and the end is the same. Views then come whenever a layer is whole in the region,
-        or everywhere; their errors are not known (NaN) where they hold more than belongs to that layer.
+        Nothing is sent twice, and the stream ends as it would have. Views then come when a layer is complete in the
+        region, and when it is complete everywhere. Their errors are NaN if more data have arrived than belong to the
+        layer.
 
         Parameters
         ----------
@@ -98,13 +99,14 @@ class Stream(BaseStream):
         Raises
         ------
         OptionError
-            When the surface has no such region, or several blocks; before it is known, the iteration raises it.
+            If the surface has no such region, or several blocks. While the surface is not known yet, the iteration
+            raises it.
         """
         self._turn(region)
         self._flush()
 
     def close(self) -> None:
-        """Stop, take leave and close the connection, within the time allowed for it."""
+        """Stop and close the connection, within `close_timeout`."""
         try:
             if self.ended is None:
                 self.stop()
@@ -241,46 +243,44 @@ def connect(
     sink: Sink | None = None,
     max_vertices: int | None = None,
 ) -> Stream:
-    """Open the stream of a surface.
+    """Receive a surface.
 
-    A connection that breaks later is replaced by itself, and what has come is not sent again.
+    If the connection breaks, the stream reconnects by itself; data that have arrived are not sent again.
 
     Parameters
     ----------
     url : str
-        The surface's address, ``http(s)://HOST/v1/surfaces/ID``, or that of a container's file on any web server.
+        URL of the surface, ``http(s)://HOST/v1/surfaces/ID``, or of a container file on any web server.
     target : Target or None
-        Where to stop, and the order on the way there; None for the whole surface.
+        What to receive, where to stop, and in which order; None: the whole surface.
     token : str or None
-        What the server asks for, if it does.
+        Token, if the server needs one.
     transport : "auto", "ws" or "http"
-        Whether to use a WebSocket, or parts of the file by HTTP Range; ``auto`` takes the second where the first does
-        not come through.
+        WebSocket, or HTTP Range requests; ``auto``: WebSocket, or HTTP Range if WebSockets do not get through.
     silence : float
-        Seconds without a word after which a connection is given up, with `SilenceError` if it is not replaced.
+        Seconds without data after which a connection counts as lost. If it is not replaced, `SilenceError` is raised.
     deadline : float
-        Seconds for which a lost connection is tried to be replaced while no byte comes, before the error is raised; 0
-        for never replacing one.
+        Seconds without data for which the client tries to reconnect before it raises the error; 0: never reconnect.
     close_timeout : float
-        Seconds that taking leave may last.
+        Seconds that closing may take.
     limit_rate : float or None
         Receive at most so many bytes a second.
     window : int or None
-        Bytes that may be under way at once; None for what suits the rate allowed, or else for what is measured. It is
-        also what may still arrive after `Stream.stop`.
+        Bytes that may be in flight, and that may still arrive after `Stream.stop`. None: as `limit_rate` needs, or as
+        measured.
     store : Store or None
-        Where what comes is kept; what is there is not asked for again.
+        Storage for received data; data that it has are not requested.
     container, size : str or None, int or None
-        SHA-256 and bytes of the container that the store has bytes of.
+        SHA-256 and size of the container whose data the store has.
     progress : callable or None
-        Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is
-        None until it is known.
+        Called as ``progress(received, planned)`` with bytes of the surface, whenever data arrive; ``planned`` is None
+        until it is known.
     sink : callable or None
-        Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come, before they
-        are decoded; `Stream.identity` says of which container.
+        Called as ``sink(offset, data)`` with new bytes of the container as they arrive, before they are decoded;
+        `Stream.identity` identifies the container.
     max_vertices : int or None
-        What the surface may have at most, told from its header before memory is taken for it; 128 bytes are allowed for
-        each, whatever they are of. None for what suits the memory that this process can have.
+        Limit on the memory of the surface, checked with its header before memory is allocated: 128 bytes for each
+        vertex, plus 16 MiB. None: what fits the memory available to this process.
 
     Returns
     -------
@@ -289,11 +289,11 @@ def connect(
     Raises
     ------
     UnreachableError
-        When there is no connection.
+        If there is no connection.
     NotFoundError, RemoteError, RemoteProtocolError
-        When the server refuses, or is none.
+        If the server refuses, or is not a Lodestream server.
     TooLargeError
-        When the surface takes more memory than it may.
+        If the surface needs more memory than allowed.
     """
     stream = Stream(
         url,

@@ -21,6 +21,7 @@
 #include "tables.h"
 
 #define LODE_INLINE static inline __attribute__((always_inline))
+#define SELDOM(condition) __builtin_expect(condition, 0)
 
 enum {
     /* A context at the start: a probability of one half, and an adaptation count of 1. */
@@ -57,11 +58,21 @@ LODE_INLINE struct coder coder_start(bool reads, uint8_t *data, int64_t size) {
     return coder;
 }
 
-/* Add 1 to the number that ends before `place`. */
+/* Whether a coder and its weights that a caller has kept since the last call are such as a call leaves behind: from any
+ * others it might run forever, or back out of its bytes. Contexts may hold anything. */
+static inline bool coder_can_go_on(bool reads, const struct coder *coder, const int32_t *weights, int64_t count) {
+    for (int64_t i = 0; i < count; i++)
+        if (weights[i] < -HEAVIEST || weights[i] > HEAVIEST)
+            return false;
+    return coder->width >= NARROWEST && coder->low <= (reads ? coder->width - 1 : 2 * (uint64_t)WIDEST) &&
+           coder->place >= 0 && coder->place <= INT64_MAX / 2;
+}
+
+/* Add 1 to the number that ends before `place`; what is past `size` was not written. */
 static inline void coder_carry(struct coder *coder) {
-    for (int64_t back = coder->place - 1; back >= 0; back--)
-        if (back < coder->size && ++coder->data[back] != 0)
-            break;
+    int64_t back = coder->place < coder->size ? coder->place : coder->size;
+    while (back > 0 && ++coder->data[back - 1] == 0)
+        back--;
 }
 
 /* Move bytes until the interval is wide enough again. */
@@ -83,17 +94,14 @@ LODE_INLINE void coder_shift(bool reads, struct coder *coder) {
     } while (coder->width < NARROWEST);
 }
 
-/* The part of the interval for a bit, which is read where reading; a 1 has the lower part: `chance` over 2^16. */
-LODE_INLINE int coder_narrow(bool reads, struct coder *coder, int bit, uint32_t chance) {
-    uint32_t bound = (coder->width >> 16) * chance;
+/* The part of the interval for a bit, which is read where reading; a 1 has the lower part, `bound`. Without a branch:
+ * of most bits nobody can guess what they are. */
+LODE_INLINE int coder_narrow(bool reads, struct coder *coder, int bit, uint32_t bound) {
     if (reads)
         bit = coder->low < bound;
-    if (bit) {
-        coder->width = bound;
-    } else {
-        coder->width -= bound;
-        coder->low = reads ? coder->low - bound : coder->low + bound;
-    }
+    uint32_t above = bound & ((uint32_t)bit - 1);
+    coder->low = reads ? coder->low - above : coder->low + above;
+    coder->width = bit ? bound : coder->width - bound;
     return bit;
 }
 
@@ -101,43 +109,93 @@ LODE_INLINE int32_t clamped(int32_t value, int32_t low, int32_t high) {
     return value < low ? low : value > high ? high : value;
 }
 
-/* A context after a bit. */
-LODE_INLINE int32_t context_after(int32_t context, int bit) {
-    int32_t chance = context >> 8, count = context & 255;
-    int64_t way = (int64_t)((bit ? (1 << 20) - 1 : 0) - chance) * RATES[count & MOST_ADAPTED];
-    chance += (int32_t)(way >> 16);
-    return (int32_t)((uint32_t)chance << 8) | (count < MOST_ADAPTED ? count + 1 : MOST_ADAPTED);
+/* The same of what is almost always within its limits: a branch that is guessed takes no time. */
+LODE_INLINE int32_t seldom_clamped(int32_t value, int32_t low, int32_t high) {
+    return SELDOM((uint32_t)value - (uint32_t)low > (uint32_t)high - (uint32_t)low) ? clamped(value, low, high) : value;
 }
 
-/* Code one bit in one context, which adapts. Coded with the highest 16 bits of the probability, within 32 ... 2^16
- * - 32. */
+/* A context after a bit. */
+LODE_INLINE int32_t context_after(int32_t context, int bit) {
+    uint32_t now = (uint32_t)context;
+    int64_t way = ((int64_t)((0 - (uint32_t)bit) & 0xFFFFF) - (int64_t)(now >> 8)) * RATES[now & MOST_ADAPTED];
+    return (int32_t)(now + ((uint32_t)(way >> 8) & ~UINT32_C(255)) + ((now & 255) < MOST_ADAPTED));
+}
+
+/* The part of the interval that a 1 has in a context: the highest 16 bits of the probability, within 32 ... 2^16 - 32.
+ */
+LODE_INLINE uint32_t bound_of(const struct coder *coder, int32_t context) {
+    return (coder->width >> 16) * (uint32_t)seldom_clamped((int32_t)((uint32_t)context >> 12 & 0xFFFF), 32, 65504);
+}
+
+/* Code one bit in one context, which adapts. */
 LODE_INLINE int code_bit(bool reads, struct coder *coder, int bit, int32_t *context) {
-    bit = coder_narrow(reads, coder, bit, (uint32_t)clamped(*context >> 12, 32, 65504));
-    *context = context_after(*context, bit);
+    int32_t before = *context;
+    bit = coder_narrow(reads, coder, bit, bound_of(coder, before));
+    *context = context_after(before, bit);
     if (coder->width < NARROWEST)
         coder_shift(reads, coder);
     return bit;
 }
 
 LODE_INLINE int32_t weight_after(int32_t weight, int32_t stretch, int32_t error) {
-    return clamped(weight + ((stretch * error + 16384) >> 15), -HEAVIEST, HEAVIEST);
+    return seldom_clamped(weight + ((stretch * error + 16384) >> 15), -HEAVIEST, HEAVIEST);
+}
+
+/* Two contexts and their weights. */
+struct mixture {
+    int32_t *first, *second, *weights;
+};
+
+/* What a mixture says: the inputs of both contexts, and the probability of a 1 over 2^16. */
+struct opinion {
+    int32_t x, y, chance;
+};
+
+LODE_INLINE struct opinion opinion_of(const struct mixture *mixture) {
+    int32_t x = STRETCH[(*mixture->first >> 16) & 4095], y = STRETCH[(*mixture->second >> 16) & 4095];
+    /* Weights of at most 2^18, inputs of less than 2^11. */
+    int32_t sum = (mixture->weights[0] * x + mixture->weights[1] * y) >> 16;
+    return (struct opinion){x, y, SQUASH[(seldom_clamped(sum, -2047, 2047) + 2048) & 4095]};
+}
+
+/* Adapt all of a mixture to a bit, and move on. */
+LODE_INLINE void mixture_learns(bool reads, struct coder *coder, const struct mixture *mixture,
+                                const struct opinion *opinion, int bit) {
+    int32_t error = bit * 65536 - opinion->chance;
+    mixture->weights[0] = weight_after(mixture->weights[0], opinion->x, error);
+    mixture->weights[1] = weight_after(mixture->weights[1], opinion->y, error);
+    *mixture->first = context_after(*mixture->first, bit);
+    *mixture->second = context_after(*mixture->second, bit);
+    if (coder->width < NARROWEST)
+        coder_shift(reads, coder);
 }
 
 /* Code one bit in two contexts, mixed with two weights; all four adapt. */
 LODE_INLINE int code_mixed_bit(bool reads, struct coder *coder, int bit, int32_t *first, int32_t *second,
                                int32_t *weights) {
-    int32_t x = STRETCH[(*first >> 16) & 4095], y = STRETCH[(*second >> 16) & 4095];
-    int32_t sum = (weights[0] * x + weights[1] * y) >> 16; /* weights of at most 2^18, inputs of less than 2^11 */
-    int32_t chance = SQUASH[(clamped(sum, -2047, 2047) + 2048) & 4095];
-    bit = coder_narrow(reads, coder, bit, (uint32_t)chance);
-    int32_t error = (bit ? 65536 : 0) - chance;
-    weights[0] = weight_after(weights[0], x, error);
-    weights[1] = weight_after(weights[1], y, error);
-    *first = context_after(*first, bit);
-    *second = context_after(*second, bit);
-    if (coder->width < NARROWEST)
-        coder_shift(reads, coder);
+    struct mixture mixture = {first, second, weights};
+    struct opinion opinion = opinion_of(&mixture);
+    bit = coder_narrow(reads, coder, bit, (coder->width >> 16) * (uint32_t)opinion.chance);
+    mixture_learns(reads, coder, &mixture, &opinion, bit);
     return bit;
+}
+
+/* The same of a bit that can be guessed, or that decides anyway which way is taken: what follows need not wait for it.
+ */
+LODE_INLINE int code_guessed_bit(bool reads, struct coder *coder, int bit, int32_t *first, int32_t *second,
+                                 int32_t *weights) {
+    struct mixture mixture = {first, second, weights};
+    struct opinion opinion = opinion_of(&mixture);
+    uint32_t bound = (coder->width >> 16) * (uint32_t)opinion.chance;
+    if (reads ? coder->low < bound : bit) {
+        coder->width = bound;
+        mixture_learns(reads, coder, &mixture, &opinion, 1);
+        return 1;
+    }
+    coder->width -= bound;
+    coder->low = reads ? coder->low - bound : coder->low + bound;
+    mixture_learns(reads, coder, &mixture, &opinion, 0);
+    return 0;
 }
 
 /* Write the fewest bytes that name a number in the interval, without zeros at the end; the length, at least 1, or

@@ -147,7 +147,7 @@ def compile_library(target: Path, command: list[str] | None = None, flags: list[
     target.parent.mkdir(parents=True, exist_ok=True)
     wrong = _run(command, machine_flags(command) if flags is None else flags, sources(), target)
     if wrong:
-        raise RuntimeError(wrong)
+        raise RuntimeError(f"the kernels of Lodestream could not be compiled: {wrong}")
 
 
 def is_current(target: Path) -> bool:

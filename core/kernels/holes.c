@@ -4,8 +4,8 @@
  * grid has there, in a straight line between its points, and some sweeps bring it to where a plate would lie.
  */
 #include <stdbool.h>
-#include <string.h>
 
+#include "copying.h"
 #include "lodestream.h"
 
 enum { GROUP = 8 }; /* points that are left out together where none is a hole */

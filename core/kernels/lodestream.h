@@ -28,6 +28,30 @@
 /* The hash of the sources that the library was compiled from, 16 hexadecimal digits and a zero. */
 LODE_API const char *lode_sources(void);
 
+/* lifting.c ------------------------------------------------------------------------------------------------------ */
+
+#define LODE_LIFT_STRIP 64
+
+/* One step of the lifting along an axis of a plane, or its inverse, in place: samples on one side, on the other nodes
+ * of the coarser level and behind them the details. Exact for samples within +-2^27 and for coefficients below 2^29;
+ * what is larger gives numbers without a meaning. The inverse leaves samples within +-2^27.
+ *
+ * axis:      0 along columns, 1 along rows.
+ * midpoints: details, at least 1; `run`: nodes that alternate with them, `midpoints` where the axis wraps, else one
+ *            more. A sample that the axis has beyond these is a node by itself.
+ * table:     20 rows of two: for the ten places before the details and the ten after them, the detail that stands there
+ *            and the sign, -1, 0 or 1, that it takes.
+ * a, b:      of the third step, within +-127; both 0: none.
+ * from:      0, or what the call before for this plane has returned.
+ * work:      kept from call to call: at least 16 + (midpoints + run + 25) lines, where `lines` is LODE_LIFT_STRIP along
+ *            LODE_LIFT_STRIP / 4 or more columns, otherwise 1.
+ * Returns how many nodes are done: `run`, except on very long axes where the plane is one row, one column, or at most
+ * LODE_LIFT_STRIP columns and at least a quarter of them.
+ */
+LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64_t columns, int64_t pitch,
+                           int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a,
+                           int64_t b, int64_t from, int32_t *work, int64_t work_count);
+
 /* mask.c --------------------------------------------------------------------------------------------------------- */
 
 /* Code rows `first` to `last` - 1 of a mask of `rows` x `columns` points.
@@ -35,7 +59,7 @@ LODE_API const char *lode_sources(void);
  * field:  flat, (rows + 2) x (columns + 6): two rows before and three columns at either side are zeros; 1 is valid.
  * model:  LODE_MASK_MODEL contexts and weights; begun where `first` is 0.
  * data:   writing, at least 64 + 2 rows columns bytes; reading, all there are, those missing count as zeros.
- * state:  four numbers that are handed on from call to call.
+ * state:  four numbers that are handed on from call to call, as the model is; others are refused.
  * Returns the bytes written or looked at so far, all of them once `last` is `rows`.
  */
 LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
@@ -163,5 +187,156 @@ LODE_API int64_t lode_choose(const int64_t *bands, int64_t bands_count, const do
  */
 LODE_API int64_t lode_lzf(const uint8_t *source, int64_t source_count, uint8_t *target, int64_t target_count,
                           int64_t budget, int64_t *state, int64_t state_count);
+
+/* differences.c -------------------------------------------------------------------------------------------------- */
+
+/* Code how far values are from the places on the line that a lattice restores, with specials that are on no line.
+ *
+ * line, exponents: of the restored values.
+ * differences:     writing, all above -2^63; reading, filled.
+ * marks:           for specials their number in a list of `specials`, from 1, else 0; writing, at most `specials`.
+ * most:            what lode_most_bits says, at most 4095.
+ * model, memory:   room to work in, LODE_DIFFERENCES_MODEL and 3 LODE_DIFFERENCES_MEMORY long.
+ * data:            decisions in contexts; writing, at least 128 bytes a value and 64; reading, those missing are zeros.
+ * stored:          lower bits; writing, at least 8 bytes a value and 16; reading, those missing are zeros.
+ * used:            bytes of `data` and of `stored`, written or looked at.
+ * A call takes about 50 ns a value. Returns 0.
+ */
+LODE_API int64_t lode_differences(int64_t reads, const int64_t *line, int64_t line_count, int64_t *differences,
+                                  int64_t differences_count, const int32_t *exponents, int64_t exponents_count,
+                                  uint8_t *marks, int64_t marks_count, int64_t most, int64_t specials, int32_t *model,
+                                  int64_t model_count, int64_t *memory, int64_t memory_count, uint8_t *data,
+                                  int64_t data_count, uint8_t *stored, int64_t stored_count, int64_t *used,
+                                  int64_t used_count);
+
+#define LODE_MOST_SPECIALS 15
+#define LODE_DIFFERENCES_MODEL (256 + 4 + 16 + 1 + 1 + 16)
+#define LODE_DIFFERENCES_MEMORY (1 << 14)
+
+/* The largest sum of a difference's bits and its exponent, of those that have no mark; at least 0. */
+LODE_API int64_t lode_most_bits(const int64_t *differences, int64_t differences_count, const int32_t *exponents,
+                                int64_t exponents_count, const uint8_t *marks, int64_t marks_count);
+
+/* offsets.c ------------------------------------------------------------------------------------------------------ */
+
+/* Code the places of float32 values, given those that a lattice restores.
+ *
+ * bases:    the restored values, rounded to the lattice.
+ * restored: their places.
+ * bits:     of the differences of `places` from `restored`, with their signs: 0 to 34.
+ * places:   writing, so close to `restored`; reading, filled.
+ * model:    room to work in, LODE_OFFSETS_MODEL long.
+ * data:     writing, at least 64 bytes a value and 64; reading, those missing are zeros.
+ * A call takes about 100 ns a value, writing up to 1 us. Returns the bytes written or looked at.
+ */
+LODE_API int64_t lode_offsets(int64_t reads, const double *bases, int64_t bases_count, const int64_t *restored,
+                              int64_t restored_count, int64_t bits, int64_t *places, int64_t places_count,
+                              int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count);
+
+#define LODE_OFFSETS_MODEL (16 + 1 + 64 + 2 * 8 + 16 + 34)
+
+/* predictor_fit.c ------------------------------------------------------------------------------------------------ */
+
+/* The factors u and w of a and b in what the third step predicts, flat, for as many rows of midpoints as `details` has;
+ * `nodes` has five rows more, the first of them two before that of the first midpoint. `kept` takes the details.
+ *
+ * Returns a number that no magnitude of u and w exceeds, at most 2^31.
+ */
+LODE_API int64_t lode_predictor_factors(const int32_t *nodes, int64_t rows, int64_t columns, int64_t pitch,
+                                        const int32_t *details, int64_t details_rows, int64_t details_columns,
+                                        int64_t details_pitch, int32_t *first, int64_t first_count, int32_t *second,
+                                        int64_t second_count, int32_t *kept, int64_t kept_count);
+
+/* Add to five moments: the sums of u u, u w, w w, u d and w d, each value weighted with 1 / (1 + |d - (a u + b w) /
+ * 256|), or not at all. Good to 1e-12.
+ */
+LODE_API int64_t lode_predictor_moments(const int32_t *first, int64_t first_count, const int32_t *second,
+                                        int64_t second_count, const int32_t *details, int64_t details_count, double a,
+                                        double b, int64_t weighted, double *moments, int64_t moments_count);
+
+/* Add to `bits`, one number, about the bits that the details take with (a, b), each within +-127: the sum of log2(1 +
+ * |e|), good to 3e-6 for each sixteen values. No magnitude of u and w exceeds `largest`, nor 2^28.
+ */
+LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, const int32_t *second,
+                                     int64_t second_count, const int32_t *details, int64_t details_count,
+                                     int64_t largest, int64_t a, int64_t b, double *bits, int64_t bits_count);
+
+/* spreading.c ---------------------------------------------------------------------------------------------------- */
+
+/* Passes that remain of a tile that was not announced: more than any tile has. */
+#define LODE_UNANNOUNCED 57
+
+/* Put what is known of the bands `numbers` into a plane of coefficients, each within +-2^28.
+ *
+ * known, sign, early: of the coefficients of all bands, flat, see the section above.
+ * bands:   rows of BAND_FIELDS columns (band_fields.h).
+ * windows: of each band its tile, and its first row and column among all coefficients.
+ * steps:   of each band its quantiser's step, below 2^26; 0 where there is none, and `known` are no indices.
+ * state:   passes that remain of each tile, or LODE_UNANNOUNCED, which gives zeros.
+ * finer:   coefficients of the tiles from this one on are multiplied by 8.
+ * out:     begins at `first_row` and `first_column` of all coefficients; the bands lie inside.
+ */
+LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
+                             const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
+                             const int64_t *windows, int64_t windows_count, const int64_t *steps, int64_t steps_count,
+                             const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
+                             int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch,
+                             int64_t first_row, int64_t first_column);
+
+/* bitplanes.c ---------------------------------------------------------------------------------------------------- */
+
+/* `bands` are rows of the table of bands (band_fields.h), which says where the coefficients of each tile's bands stand
+ * in flat arrays of one length, and their blocks in an array of flags. The places of a band hold its parents too.
+ */
+
+/* Code runs of passes, one after another: of plane p of a tile the passes 2 p + 1 and 2 p.
+ *
+ * trellis:  1 where coefficients are indices of a trellis.
+ * runs:     LODE_RUN_FIELDS numbers each: the tile's first band, its bands, its model's number, the first pass and the
+ *           last one (from the highest down, at most 55), where its bytes start in `data`, and how many they are.
+ * Writing, there must be room for 11 bits of each decision; how many were written takes the place of the last number.
+ * known:    magnitudes as far as they are known, zeros around each band.
+ * sign:     -1, 1, or 0 where no bit is known.
+ * flags:    of blocks, 0 as long as no coefficient is known to be significant.
+ * early:    1 + the plane in whose first pass a coefficient was coded last, or 0.
+ * truth:    writing, the coefficients with their signs; reading, empty.
+ * models:   LODE_MODEL or, of a trellis, LODE_TRELLIS_MODEL contexts and weights each, see `lode_new_models`.
+ * costs:    empty; or the bits that were written when each pass had ended, by its number.
+ * state:    LODE_PASSES_STATE numbers, zeros at first, handed on from call to call.
+ * budget:   about so many coefficients are looked at in a call, at least one block.
+ *
+ * Returns how many runs are done.
+ */
+LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
+                             int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
+                             uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count,
+                             const int32_t *truth, int64_t truth_count, int32_t *models, int64_t models_count,
+                             uint8_t *data, int64_t data_count, double *costs, int64_t costs_count, int64_t *state,
+                             int64_t state_count, int64_t budget);
+
+#define LODE_RUN_FIELDS 7
+#define LODE_RUN_START 5
+#define LODE_RUN_LENGTH 6
+#define LODE_PASSES_STATE 8
+#define LODE_MODEL 551
+#define LODE_TRELLIS_MODEL 1127
+
+/* Models before their tiles' first passes. Returns 0. */
+LODE_API int64_t lode_new_models(int64_t trellis, int32_t *models, int64_t models_count);
+
+/* gains.c -------------------------------------------------------------------------------------------------------- */
+
+/* Squared error of a tile, by how many of its passes remain.
+ *
+ * bands, early: of the tile, as above; all of it was coded.
+ * weights:      of each band, what a squared error of 1 counts.
+ * truth:        the coefficients.
+ * errors:       for 0, 1, ... passes that remain, up to all of them.
+ *
+ * Returns 0.
+ */
+LODE_API int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, const double *weights,
+                                 int64_t weights_count, const int32_t *truth, int64_t truth_count, const uint8_t *early,
+                                 int64_t early_count, double *errors, int64_t errors_count);
 
 #endif

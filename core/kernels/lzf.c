@@ -3,8 +3,8 @@
  *
  * Source: M. Lehmann, LibLZF 3.6, the format as lzf_d.c reads it.
  */
-#include <string.h>
 
+#include "copying.h"
 #include "lodestream.h"
 
 enum { LITERALS = 32, LONG = 7 };

@@ -79,6 +79,8 @@ int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, i
         return LODE_REFUSED;
     struct coder coder = {(uint64_t)state[0], (uint32_t)state[1], state[2], data, data_count};
     int answer = state[3] & 1;
+    if (first > 0 && ((uint64_t)state[1] > WIDEST || !coder_can_go_on(reads, &coder, model + WEIGHTS, 2)))
+        return LODE_REFUSED;
     if (first == 0) {
         coder = coder_start(reads, data, data_count);
         answer = 0;

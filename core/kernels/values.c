@@ -10,8 +10,8 @@
  */
 #include <float.h>
 #include <stdbool.h>
-#include <string.h>
 
+#include "copying.h"
 #include "lodestream.h"
 
 enum {

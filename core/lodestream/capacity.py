@@ -1,15 +1,15 @@
-"""How much memory a container may have its reader take, told from its header before any is taken.
+"""Limits on the memory that decoding a container may take, computed from its header before memory is allocated.
 
-A header of a few hundred bytes can promise a surface of billions of points, so what it promises is counted first:
+A header of a few hundred bytes can announce a surface of billions of points. So the memory that it implies is added up
+first:
 
-- of each block, point by point: what the coder keeps of a coefficient (7 bytes, and more in blocks of few rows or
-  columns, whose bands have edges), two integers of a picture and its successor (16 bytes), and the value twice, for
-  every channel, attributes included; 4 bytes where there are masks;
+- for each point of each block and for every channel, attributes included: what the coder keeps of a coefficient (7
+  bytes; more in blocks of few rows or columns, because of the edges of their bands), an integer each in a
+  reconstruction and in the next one (16 bytes), and the value twice; with masks 4 bytes more;
 - for each tile of each channel, and for each block: 2 KiB.
 
-What is read is counted as it comes: every byte, and what stands in tables as many times as it grows when it is read.
-Of either there may be as much as the capacity. Surfaces and views that the caller keeps are not counted, nor is what a
-format needs to write them.
+A second budget of the same size counts what is read: every byte, and tables with the size they have after parsing.
+Surfaces and views that the caller keeps are not counted, nor is memory for writing a file.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from .errors import TooLargeError
+from .library import why_missing
 
 __all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
 
@@ -29,7 +30,9 @@ BYTES_PER_VERTEX = 128
 _LEAST = 16 * 1024 * 1024
 
 # Of the memory that this process can have: the surface takes as much, and what is read of its container as well.
+# Plain Python takes up to five times as much for a surface as the compiled kernels, for which this counts.
 _SHARE = 0.4
+_PLAIN_SHARE = 0.08
 
 _COEFFICIENT, _PICTURE, _MASKS, _TABLE = 7, 16, 4, 2048
 _EDGE = 12  # rows or columns
@@ -39,41 +42,42 @@ Extent = tuple[tuple[int, int], Iterable[int]]
 
 
 class Capacity:
-    """What a container may take; it counts what has been read.
+    """A memory limit for one container; it counts what has been read.
 
     Parameters
     ----------
     max_vertices : int or None
-        At most this many vertices, and `BYTES_PER_VERTEX` for each, whatever they are of, with 16 MiB in any case.
-        None: as many as take two fifths of the memory that this process can have, see `memory_limit`.
+        Allows this many vertices and `BYTES_PER_VERTEX` bytes for each, plus 16 MiB. None: two fifths of the memory
+        available to this process, see `memory_limit`.
 
     Attributes
     ----------
     bytes : int
-        For the surface, and again for what is read.
+        Bytes allowed for the surface, and again for what is read.
     """
 
     def __init__(self, max_vertices: int | None = None) -> None:
         self.max_vertices = max_vertices
         if max_vertices is None:
-            self.bytes = max(int(memory_limit() * _SHARE), _LEAST)
+            self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
+            self.bytes = max(int(memory_limit() * self._share), _LEAST)
         else:
             self.bytes = _LEAST + max_vertices * BYTES_PER_VERTEX
         self._read = 0
 
     def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
-        """Refuse a surface that takes more than this.
+        """Refuse a surface that needs more memory than this.
 
         Parameters
         ----------
         vertices : int
-            Of what is decoded.
+            Vertices to be decoded.
         grids : iterable of ((rows, columns), bytes of a number in each channel)
-            What is decoded.
+            Grids to be decoded.
         masked : int
-            Points of which masks are kept.
+            Points for which masks are kept.
         tables : int
-            Tiles of all channels, and blocks.
+            Tiles of all channels, plus blocks.
 
         Raises
         ------
@@ -95,28 +99,28 @@ class Capacity:
             )
 
     def take(self, count: int) -> None:
-        """Count bytes that are read and kept, or what they become.
+        """Count bytes that are read and kept, or that tables take after parsing.
 
         Raises
         ------
         TooLargeError
-            When there are more than a surface of this size has.
+            If there are more than a surface of this size can have.
         """
         self._read += count
         if self._read > self.bytes:
             raise TooLargeError(
-                f"expected a container of which at most {_size(self.bytes)} are kept ({self._words}), got more"
+                f"expected a container whose data take at most {_size(self.bytes)} ({self._words}), got more"
             )
 
     @property
     def _words(self) -> str:
         if self.max_vertices is not None:
             return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
-        return f"{_SHARE:.0%} of the memory there is"
+        return f"{self._share:.0%} of the available memory"
 
 
 def memory_limit() -> int:
-    """Bytes of memory that this process can have: the machine's, its control group's or its own limit."""
+    """Memory available to this process, in bytes: the least of the limits of machine, control group and process."""
     return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
 
 

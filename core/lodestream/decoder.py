@@ -1,4 +1,4 @@
-"""A surface out of the bytes of a container as they arrive."""
+"""Decoding a container while its bytes arrive."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from .container.reader import INDEX_GROWTH, index_from, read_metadata, with_leve
 from .container.slices import Slices, State
 from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
+from .library import why_missing
 from .reconstruction import Coded, Progress, Reconstruction
 from .selection import Wish, select
 from .spreading import UNANNOUNCED
@@ -34,28 +35,27 @@ Bytes = bytes  # the name within classes that have a property of this name
 
 
 class Decoder:
-    """Takes the bytes of a container in any chunks, gives a `View` for each state with known errors.
+    """Decodes a container piece by piece, and gives a `View` for each state whose errors are known.
 
-    `feed` takes them in file order, `feed_at` takes the slices that `plan` names. Damage raises `CorruptStreamError`
-    with its offset, and what came before stays usable.
+    `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
+    `CorruptStreamError` with its offset; everything before it stays usable.
 
     Parameters
     ----------
     wish : Wish, optional
-        A window of the surface, or some of its attributes, which alone the views then show. Errors of a window are not
-        known (NaN) before it is complete.
+        A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
+        not known (NaN) before it is complete.
     max_vertices : int or None
-        What a surface may have, before which nothing of it is decoded, see `capacity.Capacity`; None for what suits
-        the memory that this process can have.
+        Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
+        as fits this process's memory.
     level : int or None
-        The finest level that the caller looks at, when it is not the surface itself: only what this one takes has to
-        be allowed.
+        The finest level that the caller will use; None: the whole surface. Only memory for this level is then counted.
 
     Raises
     ------
     TooLargeError
-        From what takes bytes of the container: when the header promises a surface that takes more, or more than such
-        a surface has comes.
+        From methods that take bytes: if the header announces a surface that needs more memory than allowed, or if there
+        are more bytes than such a surface can have.
     """
 
     def __init__(self, wish: Wish | None = None, *, max_vertices: int | None = None, level: int | None = None) -> None:
@@ -78,12 +78,12 @@ class Decoder:
         self._footer = bytearray()
 
     def feed(self, chunk: bytes | bytearray | memoryview) -> list[View]:
-        """Take the next bytes of the file; returns the views that they complete.
+        """Decode the next bytes of the file; returns the views that they complete.
 
         Raises
         ------
         CorruptStreamError, UnsupportedVersionError
-            The layers before the damage stay decodable.
+            The layers before the damage stay usable.
         """
         self.capacity.take(len(chunk))
         if self._frames.ended:
@@ -97,9 +97,9 @@ class Decoder:
         return self.layers[before:]
 
     def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
-        """Take a slice of the container that starts at ``offset``; returns the views that it completes.
+        """Decode a slice of the container that starts at ``offset``; returns the views that it completes.
 
-        Slices come in the order of a `plan`, cut into any pieces.
+        Slices must come in the order of a `plan`. They may be cut into pieces of any size.
         """
         before = len(self.layers)
         if self._slices is not None:
@@ -120,15 +120,16 @@ class Decoder:
         return self.layers[before:]
 
     def focus(self, region: Region | None) -> None:
-        """Say that from now on bytes come in another order: what a region needs first, or the plan's own order again.
+        """Announce another order of the bytes: first what a region needs; with None, the plan's own order.
 
-        The index has to be among them, unless it came before. A view is given whenever a layer or level has become
-        whole in the region, or everywhere. Its errors are not known (NaN) where it has more than belongs to that layer.
+        The index must have come before, or be among these bytes. A view is given whenever a layer or level is complete
+        in the region, and when it is complete everywhere. Its errors are NaN if more data have arrived than belong to
+        the layer.
 
         Raises
         ------
         OptionError
-            When the header has come, and there is no such region in the surface.
+            If the header is known and the surface has no such region.
         """
         self._focus, self._turned = region, True
         if self.header is not None:
@@ -136,12 +137,12 @@ class Decoder:
         self._follow_focus()
 
     def finish(self) -> None:
-        """Say that no more bytes come.
+        """Declare that no more bytes will come.
 
         Raises
         ------
         TruncatedStreamError
-            When the surface did not come whole; what came stays decodable.
+            If the surface is not complete. What has come stays usable.
         """
         if not self.complete:
             got, wanted = len(self.layers), self.header.layer_count if self.header else None
@@ -153,7 +154,7 @@ class Decoder:
 
     @property
     def complete(self) -> bool:
-        """Whether the whole surface has come; metadata and index may still be missing."""
+        """Whether the whole surface has arrived; metadata and index may still be missing."""
         return bool(self.layers) and self.layers[-1].complete
 
     def view(self) -> View:
@@ -162,7 +163,7 @@ class Decoder:
         Raises
         ------
         TruncatedStreamError
-            Before the first layer.
+            If the first layer is not complete.
         """
         if not self.layers:
             raise TruncatedStreamError("expected at least one whole layer, got less")
@@ -178,12 +179,12 @@ class Decoder:
 
     @property
     def level(self) -> int:
-        """Finest level with a decoded segment, see `view`."""
+        """Finest level of which there are decoded data, see `view`."""
         return self.view().level
 
     @property
     def bytes(self) -> int:
-        """Bytes held of header, layers and exactness; 0 before the first layer."""
+        """Bytes received of header, layers and exactness; 0 before the first layer is complete."""
         return self.layers[-1].bytes if self.layers else 0
 
     @property
@@ -240,7 +241,7 @@ class Decoder:
     def _begin(self, header: Header) -> None:
         self._wanted = self._wish.tiles(header)
         self._progress = Progress(header)
-        self._reconstruction = Reconstruction(header)
+        self._reconstruction = _reconstruction(header)
         self._level = 0
 
     def _take_masks(self, frame: Frame, header: Header) -> None:
@@ -381,27 +382,36 @@ class Decoder:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
 
 
+def _reconstruction(header: Header) -> Reconstruction:
+    if why_missing() is None:
+        return Reconstruction(header)
+    from .fallback import PlainReconstruction
+
+    return PlainReconstruction(header)
+
+
 def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | None = None) -> Surface:
-    """The surface of a complete container.
+    """Decode a complete container.
 
     Parameters
     ----------
     container : bytes
     max_vertices : int or None
-        What it may have at most, see `Decoder`.
+        Limit on the memory of the surface, see `Decoder`.
 
     Returns
     -------
     Surface
-        With the dtype, axes and values of the original, bit for bit unless a precision or an error was asked for.
+        With the dtype and axes of the original. The values are bit for bit the same, unless a precision or an error was
+        chosen in `encode`.
 
     Raises
     ------
     CorruptStreamError, UnsupportedVersionError
     TruncatedStreamError
-        When the container is cut; use `Decoder` for a prefix.
+        If the container is cut short; use `Decoder` for a prefix.
     TooLargeError
-        When it takes more memory than it may.
+        If it needs more memory than allowed.
     """
     decoder = Decoder(max_vertices=max_vertices)
     decoder.feed(container)

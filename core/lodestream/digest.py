@@ -1,4 +1,4 @@
-"""The fingerprint of a surface's values, by which a receiver knows that it has just these."""
+"""The SHA-256 of a surface's values, with which a receiver checks that it has decoded them all correctly."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ DIGEST = "values_sha256"
 
 
 def values_digest(blocks: Iterable[Block]) -> str:
-    """SHA-256, in hexadecimal digits, of all values.
+    """SHA-256 of all values, in hexadecimal digits.
 
-    They are taken in C order and little-endian, in their own types: block by block the points, then each attribute.
-    Holes have the values that `Block`s out of a container have there.
+    Values are hashed in C order, little-endian, in their own types: block by block the points, then each attribute.
+    Holes count with the values that they have in decoded `Block` objects.
     """
     digest = hashlib.sha256()
     for block in blocks:

@@ -1,4 +1,4 @@
-"""The client's end of a stream without I/O: messages in; views, grants and the last word out."""
+"""The client's end of a stream, without I/O: messages in; views, credit and the last message out."""
 
 from __future__ import annotations
 
@@ -21,33 +21,34 @@ __all__ = ["Download", "Ended"]
 class Download:
     """One connection over which a surface is received.
 
-    Whoever integrates it moves messages: each that comes goes into `receive`, and whatever `data_to_send` gives goes
-    out, at the start and after every call. When `receive` gives an `Ended`, what `data_to_send` gives then is the last,
-    and the server closes the connection. When the connection breaks before, another `Download` of the same `reception`
-    goes on where this one was.
+    The caller moves messages: it passes each received message to `receive`, and sends whatever `data_to_send` returns,
+    at the start and after every call. When `receive` returns an `Ended`, what `data_to_send` then returns is the last
+    message, and the server closes the connection. If the connection breaks earlier, another `Download` with the same
+    `reception` continues.
 
     Parameters
     ----------
     target : Target
-        Where to stop, and the order on the way there.
+        What to receive, where to stop, and in which order.
     window : int or None
-        Bytes that may be under way at once, 1 to `MAX_CREDIT`. A full window is what still arrives after `stop`; less
-        than what the link holds in one round trip leaves it idle. None lets a `Window` measure, which takes times.
+        Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it
+        is less than what the link carries in one round trip, the link is idle at times. None: a `Window` measures the
+        link; this needs times.
     reception : Reception or None
-        What has come over other connections; its target counts then.
+        What has arrived over other connections; its target is used then.
 
     Attributes
     ----------
     reception : Reception
-        What has come so far.
+        What has arrived so far.
     header : Header or None
-        What the server said first.
+        The server's first message.
     layer : Layer or None
-        The figures that the server told last.
+        The server's last `layer` message.
     window : Window
-        How much may be under way.
+        The number of bytes that may be in flight.
     opening : bytes
-        The first message, for whoever puts it into the handshake's address; see `opened`.
+        The first message, for use in the address of the handshake; see `opened`.
     """
 
     def __init__(
@@ -68,50 +69,50 @@ class Download:
 
     @property
     def target(self) -> Target:
-        """Where to stop, and the order on the way there."""
+        """What to receive, where to stop, and in which order."""
         return self.reception.target
 
     @property
     def decoder(self) -> Decoder:
-        """What has come so far, decoded."""
+        """Decodes what has arrived so far."""
         return self.reception.decoder
 
     @property
     def wire_bytes(self) -> int:
-        """Bytes of all messages received, over other connections too."""
+        """Bytes of all received messages, including those of earlier connections."""
         return self.reception.wire_bytes
 
     @property
     def ended(self) -> str | None:
-        """Why nothing more will come, as in `Ended`."""
+        """Why the stream ended, as in `Ended`."""
         return self.reception.ended
 
     @property
     def credit(self) -> int:
-        """Bytes of the container that may still arrive unless more are granted."""
+        """Bytes of the container that may still arrive without further credit."""
         return self._connection.credit
 
     def receive(self, message: bytes, now: float | None = None) -> list[DownloadEvent]:
-        """Take one message; the views that it completes and, last, an `Ended` if it is the last.
+        """Take one message; returns the views that it completes, and an `Ended` if it is the last.
 
-        What still arrives after `stop` is kept in the decoder and gives no views.
+        Data that still arrive after `stop` are decoded but give no views.
 
         Parameters
         ----------
         message : bytes
         now : float or None
-            Seconds of the clock that `tick` is told; without it a window that is measured stays as it is.
+            Time in seconds, by the clock used for `tick`; without it a measured window does not change.
 
         Raises
         ------
         RemoteError
-            When the server refuses, with its code and reason.
+            If the server refuses, with its code and reason.
         RemoteProtocolError, UnsupportedVersionError
-            When it is no message, or not one that is allowed now.
+            If it is not a message, or not one that is allowed now.
         CorruptStreamError
-            When the bytes of the container are damaged.
+            If the bytes of the container are damaged.
         TruncatedStreamError
-            When the server ends before it has sent what it promised.
+            If the server ends before it has sent what it announced.
         """
         self.reception.wire_bytes += len(message)
         event = self._connection.receive(message)
@@ -135,25 +136,25 @@ class Download:
         return []
 
     def data_to_send(self) -> list[bytes]:
-        """The messages to send now, in order; each is given once."""
+        """The messages to send now, in order; each is returned once."""
         messages, self._outbox = self._outbox, []
         return messages
 
     def opened(self, now: float) -> None:
-        """Tell that `opening` stood in the address of the handshake: it is not to be sent again.
+        """Declare that `opening` was part of the handshake's address, so that it is not sent again.
 
         Parameters
         ----------
         now : float
-            When the handshake began, by the clock that `tick` is told.
+            Time at which the handshake began, by the clock used for `tick`.
         """
         self._outbox.remove(self.opening)
         self._opened = now
 
     def focus(self, region: Region | None) -> None:
-        """Ask for what a region needs before the rest, or for the target's own order again; at any time.
+        """Request the data of a region before the rest; None returns to the target's own order. Allowed at any time.
 
-        The server is told to stop and, once it has, opened again: what is under way comes first.
+        The server is asked to stop, and the stream is opened again once it has. Data in flight still arrive first.
 
         Parameters
         ----------
@@ -163,25 +164,25 @@ class Download:
         Raises
         ------
         OptionError
-            When it is known already that the surface has no such region; the server refuses it otherwise.
+            If the surface is known and has no such region; otherwise the server refuses it.
         """
         if region != self.reception.target.first:
             self.reception.focus(region)
             self.turn()
 
     def turn(self) -> None:
-        """End this connection's order and open again with that of the reception, which has changed."""
+        """End the current order, and open again with the changed target of the reception."""
         if self._connection.state in (State.OPENED, State.STREAMING):
             self._turning = True
             self._outbox.append(self._connection.send(Stop()))
 
     def stop(self, why: str = "stopped") -> None:
-        """Ask for no more; at once, whatever is under way. Again, or after the end, it does nothing.
+        """Ask the server to stop sending, at once. A second call, or one after the end, does nothing.
 
         Parameters
         ----------
         why : "stopped" or "seconds"
-            What `Ended` is to say when the server has obeyed.
+            Reason given by `Ended` when the server has stopped.
         """
         if self._turning or self._connection.state in (State.OPENED, State.STREAMING):
             self.reception.stopped_for = why
@@ -190,14 +191,14 @@ class Download:
         self._turning = False
 
     def tick(self, now: float) -> float | None:
-        """Tell the time, in seconds of any clock that does not go back; `stop` when the target's seconds are over.
+        """Set the time, in seconds of any clock that does not go back; stops when the target's time limit is over.
 
         The first call starts the clock.
 
         Returns
         -------
         float or None
-            Seconds until the stop; None when no time is set, or it is over.
+            Seconds until the stop; None if there is no time limit or it is over.
         """
         if self._opened is None:
             self._opened = now
@@ -210,21 +211,21 @@ class Download:
         return left
 
     def connection_lost(self, code: int | None = None, reason: str = "") -> None:
-        """Tell that the connection is closed; nothing happens if the stream has ended.
+        """Declare that the connection is closed; does nothing if the stream has ended.
 
         Parameters
         ----------
         code : int or None
             Close code of the WebSocket, if there was one.
         reason : str
-            Reason that came with it.
+            Reason in the close frame.
 
         Raises
         ------
         RemoteError
-            When the close code says what is wrong.
+            If the close code stands for an error of the server.
         TruncatedStreamError
-            When the connection broke in the middle.
+            If the connection broke before the end.
         """
         if self.ended is not None:
             return

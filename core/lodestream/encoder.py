@@ -1,4 +1,4 @@
-"""A surface into a container: which kind of stream is shortest for what is asked."""
+"""Encoding a surface into a container: chooses the kind of stream that is shortest for what the caller asks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from . import metadata
 from .encoding import Encoding, UnreachableError
 from .errors import FormatWarning, OptionError
+from .library import require
 from .losses import at_holes
 from .preparation import Preparation
 from .surface import Surface
@@ -36,31 +37,34 @@ def encode(
     surface : Surface or array
         An array is taken as ``Surface(array)``.
     precision : float, str, Tolerance or None
-        Largest distance allowed between a point and what comes back, in the surface's unit or, as ``"1e-4d"``, times
-        the range of the heights or the diagonal of the box. None: every value comes back bit for bit. Attributes come
-        back bit for bit in any case, but for those with a precision of their own.
+        Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
+        the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
+        unless `attribute_precision` names them.
     rms : float, str, Tolerance or None
-        Make the shortest stream whose root mean square error is at most this, in place of one that ends exactly or
-        within a precision: steps of quantisation are chosen for this error alone, and layers before the last are few.
+        Encode for one root mean square error instead: a container as short as possible whose complete surface has at
+        most this error. Quantisation steps are chosen for this error alone, and there are few layers before the last.
     attribute_precision : mapping of str to float, str or Tolerance, optional
-        Largest distance allowed between the values of an attribute, by its name.
+        Maximum error of attributes, by name.
     progress : callable, optional
-        Called now and then with the fraction done, 0 to 1.
+        Called from time to time with the fraction done, 0 to 1.
 
     Returns
     -------
     bytes
-        A container, see ``docs/format.md``. It has no values of attributes at holes of the points; where there are
-        some, a `FormatWarning` says so.
+        A container, see ``docs/format.md``. Values of attributes at holes of the points are not kept; if there are any,
+        a `FormatWarning` says so.
 
     Raises
     ------
     InputError
-        When the surface cannot be encoded, or not with this precision; or its metadata are larger than
+        If the surface cannot be encoded, or not with this precision, or if its metadata are larger than
         `lodestream.metadata.MAX_BYTES`.
     OptionError
-        When there is no such attribute, or both a precision and an error are given.
+        If there is no attribute of a given name, or both a precision and an error are given.
+    UnavailableError
+        If the compiled kernels are missing; it says how to get them.
     """
+    require("encoding")
     if not isinstance(surface, Surface):
         surface = Surface(surface)
     metadata.check(surface.metadata)

@@ -215,13 +215,11 @@ class Encoding:
                     costs = np.zeros(passes, np.float64)
                     coder.code(tile, number, passes, passes, costs)
                     bits = np.diff(costs[::-1], prepend=0.0)[::-1]
-                    errors = np.zeros(passes + 1, np.float64)
                     table = self._table(number)
                     first, last = table.first[tile], table.first[tile + 1]
                     early, weights = coder.tiles[number].early, channel.weights[first:last]
                     rows = table.of_tile(tile)
-                    pass_gains(rows, weights, passes, channel.true, early, errors)
-                    gains = np.diff(errors)
+                    gains = np.diff(pass_gains(rows, weights, passes, channel.true, early))
                     rounding = _ROUNDING if self.quantiser is None else 0.0
                     gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
                     curves.append(TileCurve(tile, number, bits, gains))

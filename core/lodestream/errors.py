@@ -1,27 +1,28 @@
-"""Everything that Lodestream raises on purpose.
+"""The exceptions and warnings of Lodestream.
 
 ::
 
     LodestreamError
-    ├── InputError (ValueError)          what you gave cannot be used
-    │   ├── FormatError                  a file is not what it says, is cut short, or holds no structured surface
-    │   │   └── SwitchedOffError         its format may not be read here
+    ├── InputError (ValueError)          the caller's input cannot be used
+    │   ├── FormatError                  a file is invalid, cut short, or not a structured surface
+    │   │   └── SwitchedOffError         a file's format is switched off
     │   ├── TooLargeError                more bytes or vertices than allowed
-    │   └── OptionError                  an option, level or format that does not exist; names those that do
-    ├── UnavailableError                 what is needed is not here now: a library, a process that was ended
+    │   └── OptionError                  an option, level or format that does not exist; the message names valid ones
+    ├── UnavailableError                 a library is not installed, or a helper process was killed
     ├── NotFoundError (LookupError)      no such surface
     ├── StreamError                      the bytes of a container cannot be used
     │   ├── CorruptStreamError           damaged, with the offset
-    │   ├── TruncatedStreamError         ends before what was asked for
-    │   └── UnsupportedVersionError      of another version than this program reads, naming both
-    ├── ProtocolError                    a message out of turn or out of shape
-    │   ├── LocalProtocolError           by this side
-    │   └── RemoteProtocolError          by the other side
-    └── RemoteError                      the other side refused, with its code and reason
+    │   ├── TruncatedStreamError         ends too early
+    │   └── UnsupportedVersionError      another format version; the message names both
+    ├── ProtocolError                    a message that the protocol does not allow
+    │   ├── LocalProtocolError           sent by this side
+    │   └── RemoteProtocolError          sent by the other side
+    └── RemoteError                      the other side refused a request, with its code and reason
 
-    FormatWarning (UserWarning)          a file cannot say all of a surface
+    FormatWarning (UserWarning)          a file or format does not hold everything
 
-One class for each reaction that a caller may have. Each message says what was expected, what came, and where.
+There is one class for each way in which a caller may want to react. Each message says what was expected, what was
+found, and where.
 """
 
 from __future__ import annotations
@@ -48,23 +49,23 @@ __all__ = [
 
 
 class LodestreamError(Exception):
-    """Base of everything that Lodestream raises on purpose."""
+    """Base class of all exceptions of Lodestream."""
 
 
 class InputError(LodestreamError, ValueError):
-    """What the caller gave cannot be used."""
+    """The caller's input cannot be used."""
 
 
 class FormatError(InputError):
-    """A file is not what it says, is cut short, or holds no structured surface."""
+    """A file is invalid, cut short, or not a structured surface."""
 
 
 class SwitchedOffError(FormatError):
-    """A file is of a format that may not be read here, whatever is in it."""
+    """A file has a format that is switched off here; its contents were not looked at."""
 
 
 class FormatWarning(UserWarning):
-    """A file cannot say all of a surface, or does not say all that was needed; what was left out or assumed."""
+    """Something was left out of a file or of a surface, or had to be assumed; the message says what."""
 
 
 class TooLargeError(InputError):
@@ -76,7 +77,7 @@ class OptionError(InputError):
 
 
 class UnavailableError(LodestreamError):
-    """What is needed is not here now, whatever was given: a library that is not installed, a process that was ended."""
+    """Something that is needed is missing, whatever the input: a library is not installed, or a process was killed."""
 
 
 class NotFoundError(LodestreamError, LookupError):
@@ -93,7 +94,7 @@ class CorruptStreamError(StreamError):
     Attributes
     ----------
     offset : int
-        Place in the container, in bytes from its start, of the part that failed its check.
+        Offset in the container, in bytes, of the part that failed its check.
     """
 
     def __init__(self, message: str, offset: int) -> None:
@@ -102,32 +103,32 @@ class CorruptStreamError(StreamError):
 
 
 class TruncatedStreamError(StreamError):
-    """A container ends before what was asked for."""
+    """A container ends too early."""
 
 
 class UnsupportedVersionError(StreamError):
-    """A container or peer of another version than this program's."""
+    """A container or a peer has a version that this program does not support."""
 
 
 class ProtocolError(LodestreamError):
-    """A message out of turn or out of shape."""
+    """A message that the protocol does not allow."""
 
 
 class LocalProtocolError(ProtocolError):
-    """This side tried to send what the protocol does not allow now."""
+    """This side tried to send a message that the protocol does not allow now."""
 
 
 class RemoteProtocolError(ProtocolError):
-    """The other side sent what the protocol does not allow now."""
+    """The other side sent a message that the protocol does not allow now."""
 
 
 class RemoteError(LodestreamError):
-    """The other side refused.
+    """The other side refused the request.
 
     Attributes
     ----------
     code : str
-        Word from the table of error codes in ``docs/protocol.md``.
+        Code from the table of error codes in ``docs/protocol.md``.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -1,4 +1,4 @@
-"""A container of which nothing is believed: every section, the index, every value, and the errors that it tells."""
+"""Checking a container from an untrusted source: every section, the index, every value, and the recorded errors."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from .container.pieces import windows
 from .decoder import Decoder
 from .errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
 from .heights import to_xyz
+from .library import require
 from .measure import extent_of
 from .picture import coordinate_distances, originals_of
 from .reconstruction import Reconstruction, initial_state
@@ -44,14 +45,14 @@ _UNUSABLE = (InputError, TypeError, ValueError, LookupError, AttributeError, Ari
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found of a container that is sound.
+    """The result of checking a container that is sound.
 
     Attributes
     ----------
     index : Index
     errors_checked : bool
-        The errors that it records are those of its layers and levels. Only the values that were encoded can tell, and
-        only an exact container has them; of others the errors are what its maker says.
+        Whether the recorded errors were measured again. This needs the original values, which only an exact container
+        has; otherwise the errors are what the container's maker claims.
     """
 
     index: Index
@@ -74,10 +75,11 @@ class _Found:
 def inspect(
     file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None] = lambda fraction: None
 ) -> Inspection:
-    """Look a whole container through, and decode it once.
+    """Check a whole container, and decode it once.
 
-    Nothing is decoded before the header has said how many vertices there are. Of an exact container each layer and
-    level is drawn and compared with the complete surface, about as much work as its encoder had with them.
+    Nothing is decoded before the header has announced the number of vertices. For an exact container each layer and
+    level is decoded and compared with the complete surface, which takes about as long as measuring them did in the
+    encoder.
 
     Parameters
     ----------
@@ -86,19 +88,22 @@ def inspect(
     max_vertices : int
         Larger surfaces are refused.
     progress : callable
-        Called now and then with the fraction done, 0 to 1.
+        Called from time to time with the fraction done, 0 to 1.
 
     Raises
     ------
     CorruptStreamError
-        When it is damaged, does not say the same of itself everywhere, or more follows after its end; with the offset.
+        If it is damaged, contradicts itself, or is followed by more bytes; with the offset.
     TruncatedStreamError
-        When it is cut short; the message names the offset.
+        If it is cut short; the message names the offset.
     UnsupportedVersionError
-        When it has a version that this program does not read.
+        If this program does not read its version.
     TooLargeError
-        When it has more vertices than allowed.
+        If it has more vertices than allowed.
+    UnavailableError
+        If the compiled kernels are missing.
     """
+    require("looking a container through")
     size = file.seek(0, os.SEEK_END)
     # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.
     decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
@@ -230,9 +235,7 @@ def _compare(index: Index, found: _Found) -> None:
         wrong = [k for k, (a, b) in enumerate(zip(told, real, strict=False)) if a != b]
         if wrong or len(told) != len(real):
             number = wrong[0] if wrong else min(len(told), len(real))
-            raise CorruptStreamError(
-                f"expected an index of what stands in the file, got another {word} {number}", offset
-            )
+            raise CorruptStreamError(f"expected an index that matches the file, got another {word} {number}", offset)
     last = found.figures or (found.layers[-1].rms, found.layers[-1].max_error)
     if (index.levels[-1].rms, index.levels[-1].max_error) != last:
         raise CorruptStreamError(f"expected errors {last} of the complete surface in the index, got others", offset)
@@ -275,7 +278,7 @@ def _check_metadata(decoder: Decoder, index: Index, complete: Surface) -> None:
         except _UNUSABLE as error:
             problem = f"{type(error).__name__}: {error}"
             raise CorruptStreamError(
-                f"expected metadata that say how level {level} is restored, got others ({problem:.200})",
+                f"expected metadata with which level {level} can be restored, got others ({problem:.200})",
                 index.metadata.offset,
             ) from None
 

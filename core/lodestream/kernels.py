@@ -19,21 +19,34 @@ from .library import library
 
 __all__ = [
     "CLASSES",
+    "DIFFERENCES_MEMORY",
+    "DIFFERENCES_MODEL",
     "INDICES",
+    "LIFT_STRIP",
     "MASK_MODEL",
+    "OFFSETS_MODEL",
     "PART_COLUMNS",
     "PART_ROWS",
     "VALUE_TYPES",
     "choose",
     "classify",
+    "differences",
+    "lift",
     "lzf",
     "mask",
+    "most_bits",
+    "offsets",
+    "predictor_bits",
+    "predictor_factors",
+    "predictor_moments",
     "pull",
     "push",
     "relax",
+    "spread",
     "square_distances",
     "store_values",
 ]
+__all__ = ["MASK_MODEL", "MODEL", "PASSES_STATE", "TRELLIS_MODEL", "mask", "new_models", "pass_gains", "passes"]
 
 _REFUSED = -(2**63)
 
@@ -233,6 +246,10 @@ def _described(values: tuple[Any, ...]) -> str:
 
 _BOOL, _I8, _U8, _I32, _I64, _F64 = np.bool_, np.int8, np.uint8, np.int32, np.int64, np.float64
 
+# lifting.c
+LIFT_STRIP = 64
+lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
+
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
@@ -261,3 +278,39 @@ choose = Kernel(
 
 # lzf.c
 lzf = Kernel("lzf", reads(_U8), writes(_U8), INTEGER, writes(_I64))
+
+# differences.c
+DIFFERENCES_MODEL = 256 + 4 + 16 + 1 + 1 + 16
+DIFFERENCES_MEMORY = 1 << 14
+_of_values = reads(_I64), writes(_I64), reads(_I32), writes(_U8)
+_room = writes(_I32), writes(_I64)
+_coded = writes(_U8), writes(_U8), writes(_I64)
+differences = Kernel("differences", INTEGER, *_of_values, INTEGER, INTEGER, *_room, *_coded)
+most_bits = Kernel("most_bits", reads(_I64), reads(_I32), reads(_U8))
+
+# offsets.c
+OFFSETS_MODEL = 16 + 1 + 64 + 2 * 8 + 16 + 34
+offsets = Kernel("offsets", INTEGER, reads(_F64), reads(_I64), INTEGER, writes(_I64), writes(_I32), writes(_U8))
+
+# predictor_fit.c
+predictor_factors = Kernel("predictor_factors", *[reads_plane(_I32)] * 2, *[writes(_I32)] * 3)
+predictor_moments = Kernel("predictor_moments", *[reads(_I32)] * 3, REAL, REAL, INTEGER, writes(_F64))
+predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, writes(_F64))
+
+# spreading.c
+_KNOWN: tuple[_Argument, ...] = (reads(_I32), reads(_I8), reads(_U8))
+spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writes_plane(_I32), INTEGER, INTEGER)
+
+# bitplanes.c
+PASSES_STATE = 8
+MODEL, TRELLIS_MODEL = 551, 1127
+passes = Kernel(
+    "passes",
+    *[INTEGER] * 2,
+    *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
+    *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
+)
+new_models = Kernel("new_models", INTEGER, writes(_I32))
+
+# gains.c
+pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))

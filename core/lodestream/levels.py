@@ -1,7 +1,7 @@
-"""The hierarchy in floating point: every coarser level the least-squares best grid of its size.
+"""The hierarchy in floating point: every coarser level is the least-squares optimum for the next finer one.
 
-The same filter as `lifting`, without rounding and with all of its taps that matter, as whole-array operations; it
-agrees with the dense optimum to 1e-12 of the scale. The paper's own solver is in `paper`.
+It is the filter of `lifting` without rounding and with all significant taps, as operations on whole arrays. It agrees
+with a dense least-squares solution to 1e-12 of the scale. The paper's own solver is in `paper`.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ _REACH = 1 + sum(_SPANS)
 
 
 def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.float64]:
-    """One least-squares level: the grid whose bilinear refinement is nearest to the points in mean square.
+    """The next coarser level: the grid whose bilinear refinement is closest to the points in mean square.
 
     Parameters
     ----------
     points : array, shape (row, column) or (row, column, channel)
-        Any real numbers; not changed.
+        Real numbers; not changed.
     closed : (bool, bool)
-        Whether the rows and the columns wrap.
+        Whether rows (axis 0) and columns (axis 1) are closed.
 
     Returns
     -------
     float64 array
-        Of an open axis of N >= 3 samples (N + 1) // 2 remain where N is odd, N // 2 + 1 where it is even; of a closed
-        one of N >= 5, (N + 1) // 2; shorter axes stay as they are (always a new array).
+        A new array. An open axis of N >= 3 samples keeps (N + 1) // 2 if N is odd, N // 2 + 1 if N is even. A closed
+        axis of N >= 5 keeps (N + 1) // 2. Shorter axes keep their length.
 
     Raises
     ------
     InputError
-        When the array is not of such a shape, or holds NaN or infinities.
+        If the array has another shape, or contains NaN or infinities.
 
     Notes
     -----
@@ -60,7 +60,7 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArray[np.float64]]:
-    """Every level of a surface, coarsest first, the input (as float64) last; see `coarsen`."""
+    """All levels of a surface, from the coarsest to the input itself (as float64); see `coarsen`."""
     levels = [_as_floats(points)]
     while (coarser := _coarsen(levels[-1], closed)).shape != levels[-1].shape:
         levels.append(coarser)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from .errors import UnavailableError
 
-__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "why_missing"]
+__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "require", "why_missing"]
 
 #: Where the library stands, and where its sources stand in a working tree.
 NATIVE = Path(__file__).with_name("native")
@@ -63,6 +63,18 @@ def why_missing() -> str | None:
     """Why the compiled kernels cannot be used here, in a line; None where they can."""
     loaded = _load()
     return loaded if isinstance(loaded, str) else None
+
+
+def require(what: str) -> None:
+    """Refuse, before any of it is done, what cannot be done without the kernels: ``"encoding"``.
+
+    Raises
+    ------
+    UnavailableError
+        Where they are missing.
+    """
+    if (why := why_missing()) is not None:
+        raise UnavailableError(f"{what} is not possible here: {why}")
 
 
 def library() -> ctypes.CDLL:

@@ -17,9 +17,9 @@ _MORE_CHANNELS = "channels beyond the third"
 
 
 def at_holes(surface: Surface) -> str | None:
-    """Say in a line of which attributes there are values at holes of the points, which no container keeps.
+    """Describe in one line which attributes have values at holes of the points; no container keeps these.
 
-    NaN, 0 and the metadata's ``nodata`` are no values there. None: nothing is lost.
+    NaN, 0 and the metadata's ``nodata`` do not count as values. Returns None if nothing is lost.
     """
     nodata = surface.metadata.get("nodata")
     lost: dict[str, int] = {}

@@ -1,7 +1,7 @@
-"""The messages of a stream, one frozen dataclass each, and the codes of its errors.
+"""The messages of a stream, one frozen dataclass each, and the error codes.
 
-What one side sends as an event, the other receives as the same event. `wire` has their bytes, `protocol` their order,
-`docs/protocol.md` is the manual.
+An event that one side sends is received as the same event by the other side. `wire` has the bytes of messages,
+`protocol` their order; `docs/protocol.md` is the specification.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ MAX_HELD = 4096
 
 @dataclass(frozen=True)
 class Code:
-    """What an error code means: its title, and the close code of the WebSocket after it."""
+    """An error code: its title, and the close code of the WebSocket after it."""
 
     close: int
     title: str
@@ -71,35 +71,35 @@ class Code:
 #: says the same.
 CODES: Mapping[str, Code] = {
     "bad-message": Code(4400, "Not a message of this protocol"),
-    "out-of-turn": Code(4400, "A message that is not allowed now"),
+    "out-of-turn": Code(4400, "The message is not allowed now"),
     "no-token": Code(4401, "A token is needed"),
-    "bad-token": Code(4403, "A token that is not known, or no longer, or that does not allow it"),
+    "bad-token": Code(4403, "The token is unknown, expired or revoked, or its scope does not allow this"),
     "not-found": Code(4404, "No such surface"),
-    "idle": Code(4408, "Nothing was heard or taken for too long"),
+    "idle": Code(4408, "The client was silent, or did not read, for too long"),
     "not-ready": Code(4409, "The surface is still being built"),
     "other-container": Code(4412, "The surface has another container than the one held"),
-    "bad-held": Code(4416, "A list of what is held that cannot be"),
+    "bad-held": Code(4416, "The list of held slices is not valid"),
     "failed": Code(4424, "The surface could not be built"),
-    "waiting": Code(4424, "The surface could not be built yet; somebody has to ask for another attempt"),
-    "bad-target": Code(4422, "A target that the surface cannot meet"),
+    "waiting": Code(4424, "The surface could not be built yet; it waits for a retry"),
+    "bad-target": Code(4422, "The surface cannot meet the target"),
     "unsupported-version": Code(4426, "Another version of the protocol"),
-    "too-many": Code(4429, "More at the same time than one client may have"),
-    "message-too-large": Code(1009, "A message above the limit"),
+    "too-many": Code(4429, "The client has too much in progress"),
+    "message-too-large": Code(1009, "The message is too large"),
     "damaged": Code(4500, "The stored container is damaged"),
-    "busy": Code(4503, "As much to do as the server can; come back"),
+    "busy": Code(4503, "The server is busy; try again later"),
     "missing": Code(4503, "The surface is not on the server's disk now"),
     "internal": Code(1011, "The server failed"),
-    "restarting": Code(1012, "The server is restarting; come back"),
+    "restarting": Code(1012, "The server is restarting; try again"),
 }
 
 
 class MessageError(RemoteProtocolError):
-    """The other side sent what the protocol does not allow; `code` says which answer it gets.
+    """The other side sent something that the protocol does not allow; `code` is the answer to send.
 
     Attributes
     ----------
     code : str
-        Word from `CODES`.
+        Key of `CODES`.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -109,21 +109,21 @@ class MessageError(RemoteProtocolError):
 
 @dataclass(frozen=True)
 class Open:
-    """Client: what it wants, what it holds, and how much may be sent at once; at the start, and again after an `End`.
+    """From the client: what it wants, what it holds, and its first credit. Sent first, and again after an `End`.
 
     Attributes
     ----------
     target : Target
-        Where to stop and the order on the way there; ``seconds`` stays with the client and does not travel.
+        What to send, where to stop, and in which order; ``seconds`` is not sent to the server.
     credit : int
         First credit, in bytes of `Segments.data`.
     held : tuple of (offset, length)
-        Slices of the container that the client holds already, at most `MAX_HELD`. With neither them nor `container`,
-        after an `End`, those that were sent over this connection.
+        Slices of the container that the client holds, at most `MAX_HELD`. After an `End`, if neither they nor
+        `container` are given, the slices sent over this connection count as held.
     container : str or None
-        SHA-256 of the container that they are slices of.
+        SHA-256 of the container that these slices belong to.
     token : str or None
-        For a client that cannot send a header with the handshake, as in a browser; never in an address.
+        For a client that cannot send a header with the handshake, such as a browser; not allowed in an address.
     """
 
     type: ClassVar[str] = "open"
@@ -136,7 +136,7 @@ class Open:
 
 @dataclass(frozen=True)
 class Credit:
-    """Client: so many more bytes of `Segments.data` may be sent."""
+    """From the client: this many more bytes of `Segments.data` may be sent."""
 
     type: ClassVar[str] = "credit"
     bytes: int
@@ -144,21 +144,21 @@ class Credit:
 
 @dataclass(frozen=True)
 class Stop:
-    """Client: enough; nothing but `End` is to follow."""
+    """From the client: stop sending; only `End` may follow."""
 
     type: ClassVar[str] = "stop"
 
 
 @dataclass(frozen=True)
 class Bye:
-    """Client: the answer to `End`; the server closes."""
+    """From the client: the answer to `End`; the server then closes."""
 
     type: ClassVar[str] = "bye"
 
 
 @dataclass(frozen=True)
 class Header:
-    """Server: which container is being sent, and how much of it.
+    """From the server: which container is sent, and how much of it.
 
     Attributes
     ----------
@@ -167,15 +167,15 @@ class Header:
     size : int
         Bytes of the whole container.
     planned : int
-        Bytes of the surface (header, layers, exactness) that the target needs, held ones included; index and metadata
+        Bytes of the surface (header, layers, exactness) that the target needs, including held ones; index and metadata
         are not counted.
     extent : float
-        What a relative tolerance refers to: the range of the heights, or the diagonal of the box.
+        Unit of relative tolerances: the range of the heights, or the diagonal of the bounding box.
     index, metadata : (offset, length)
-        Where these two sections stand.
+        Places of these two sections.
     prefix : bool
-        What is sent, and what was held of it, is the file from its first byte on, then the metadata; otherwise the
-        index comes first and slices follow.
+        True if the file is sent from its first byte on (held parts left out), then the metadata. False if the index
+        comes first, then slices.
     """
 
     type: ClassVar[str] = "header"
@@ -190,7 +190,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Segments:
-    """Server: the slice of the container that starts at ``offset``."""
+    """From the server: a slice of the container that starts at ``offset``."""
 
     type: ClassVar[str] = "segments"
     offset: int
@@ -199,11 +199,12 @@ class Segments:
 
 @dataclass(frozen=True)
 class Layer:
-    """Server: with what has been sent so far, a layer (quality order) or a level (level order) is complete.
+    """From the server: a layer (quality order) or a level (level order) is complete with what was sent so far.
 
-    ``number`` counts layers or levels from 0; ``bytes``, ``rms`` and ``max`` are those of the container's own record.
-    Where a region comes first it is complete there first, then everywhere; while more is held than belongs to it,
-    ``rms`` and ``max`` are NaN, and ``bytes`` are what is held.
+    ``number`` counts layers or levels from 0. ``bytes``, ``rms`` and ``max`` are those recorded in the container. If a
+    region comes first, the message is sent when the layer is complete in the region, and again when it is complete
+    everywhere. While the client has been sent more than belongs to the layer, ``rms`` and ``max`` are NaN, and
+    ``bytes`` counts all that is held.
     """
 
     type: ClassVar[str] = "layer"
@@ -216,7 +217,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class End:
-    """Server: no more will be sent, and why: complete, level, rms, max, bytes or stopped."""
+    """From the server: nothing more will be sent, and why: complete, level, rms, max, bytes or stopped."""
 
     type: ClassVar[str] = "end"
     why: str
@@ -224,7 +225,7 @@ class End:
 
 @dataclass(frozen=True)
 class Error:
-    """Server: it refuses; the WebSocket is closed with the code's close code."""
+    """From the server: it refuses, and closes the WebSocket with the code's close code."""
 
     type: ClassVar[str] = "error"
     code: str

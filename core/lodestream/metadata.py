@@ -1,4 +1,4 @@
-"""How large the metadata of a surface may be, and what is dropped of those that are larger."""
+"""The size limit of a surface's metadata, and how larger metadata are cut down."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ _Path = tuple[str | int, ...]
 
 
 def packed(metadata: Mapping[str, Any]) -> bytes:
-    """Metadata as a container has them, a MessagePack map.
+    """Metadata as a MessagePack map, as they stand in a container.
 
     Raises
     ------
     InputError
-        When MessagePack cannot hold them.
+        If MessagePack cannot represent a value.
     """
     return _packed(dict(metadata))
 
 
 def check(metadata: Mapping[str, Any]) -> None:
-    """Refuse metadata that would be larger than `MAX_BYTES` in a container.
+    """Refuse metadata that would take more than `MAX_BYTES` in a container.
 
     Raises
     ------
     InputError
-        With their size and their largest entry; or when MessagePack cannot hold them.
+        With their size and largest entry; or if MessagePack cannot represent a value.
     """
     size = len(packed({**metadata, **_FINGERPRINT}))
     if size > MAX_BYTES:
@@ -59,16 +59,16 @@ def check(metadata: Mapping[str, Any]) -> None:
 
 
 def check_length(length: int, offset: int, *, section: bool = False) -> None:
-    """Refuse metadata of a container that are larger than `MAX_BYTES` by what is said of them, before they are read.
+    """Refuse a container's metadata by their announced length, before they are read, if it exceeds `MAX_BYTES`.
 
     Parameters
     ----------
     length : int
         Bytes of the map, or of the whole section.
     offset : int
-        Where that is said, or where the section stands.
+        Offset of the announcement or of the section, for the error.
     section : bool
-        Which of the two the length is.
+        Whether the length is that of the whole section.
 
     Raises
     ------
@@ -79,10 +79,10 @@ def check_length(length: int, offset: int, *, section: bool = False) -> None:
 
 
 def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str, int]]]:
-    """Drop the largest entries of metadata that are larger than a container may have them.
+    """Drop the largest entries of metadata that are too large for a container.
 
     Entries of ``tags``, ``bands``, ``scalars`` and ``faces`` are dropped one by one, other values as a whole. Some room
-    is left for what is added later, such as a server's notes.
+    is left for later additions, such as a server's notes.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
     Returns
     -------
     metadata : dict
-        Without the entries dropped; no value of the original is changed.
+        Without the dropped entries; no value of the original is changed.
     dropped : list of (str, int)
-        The names of these and how many bytes each took, the largest first.
+        Name and size in bytes of each dropped entry, the largest first.
 
     Raises
     ------
     InputError
-        When MessagePack cannot hold them.
+        If MessagePack cannot represent a value.
     """
     most = MAX_BYTES - _ROOM
     result, dropped = dict(metadata), []
@@ -121,7 +121,7 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
 
 
 def with_notes(metadata: Mapping[str, Any], notes: Sequence[str]) -> dict[str, Any]:
-    """Add ``notes`` to metadata: as many of them as there is room for, and how many more there were."""
+    """Add ``notes`` to metadata: as many as fit, and how many more there were."""
     room = MAX_BYTES - len(packed({**metadata, **_FINGERPRINT, "notes": [""] * 16}))
     kept: list[str] = []
     for number, text in enumerate(notes):

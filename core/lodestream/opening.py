@@ -1,6 +1,6 @@
-"""The client's first message in the address of the handshake: the server's first answer then comes a round trip sooner.
+"""The client's first message as part of the handshake's address, which saves one round trip.
 
-It is the very message, in the alphabet of addresses.
+The message is the same; it is written in base64url.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ MAX_OPENING = 2048
 
 
 def to_address(message: bytes) -> str | None:
-    """The query with this message; None where it is too long for an address and has to be sent as a message."""
+    """The query string with this message; None if it is too long for an address and must be sent as a message."""
     text = urlsafe_b64encode(message).rstrip(b"=").decode()
     return f"{PARAMETER}={text}" if len(text) <= MAX_OPENING else None
 
 
 def from_address(text: str) -> bytes:
-    """The message that the parameter's value stands for.
+    """The message in a value of the query parameter.
 
     Raises
     ------
     MessageError
-        When it is too long, or is no base64url.
+        If it is too long, or not base64url.
     """
     if len(text) > MAX_OPENING:
         raise MessageError(

@@ -1,7 +1,6 @@
-"""What to send of a container, in which order: one pure function for server and client.
+"""What to send of a container, and in which order: one pure function for server and client.
 
-What travels is always slices of the file, so that pushing over WebSocket, fetching by HTTP Range, resuming and caching
-share this piece of logic.
+Only slices of the file are ever sent. So WebSocket streams, HTTP Range, resuming and caching share this module.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ def plan(
     target: Target = Target(),  # noqa: B008 - an immutable value
     held: RangeSet | None = None,
 ) -> Plan:
-    """Decide what a receiver with this target, which holds these bytes of the container, gets.
+    """The slices that a receiver with this target gets, if it holds these bytes of the container.
 
     Raises
     ------
     OptionError
-        When there is no such level or region, or not even the first layer fits into the bytes allowed.
+        If there is no such level or region, or not even the first layer fits into the allowed bytes.
     """
     chosen = _whole(index, target)
     if target.first is not None:
@@ -76,7 +75,9 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
     for mark in marks:
         if target.max_bytes is not None and mark.bytes > target.max_bytes:
             if not kept:
-                raise OptionError(f"expected at least the {mark.bytes} bytes of the first step, got {target.max_bytes}")
+                raise OptionError(
+                    f"expected at least the {mark.bytes} bytes of the first layer or level, got {target.max_bytes}"
+                )
             return kept, "bytes"
         kept.append(mark)
         if mark is marks[-1]:

@@ -1,4 +1,4 @@
-"""What a plan is made of."""
+"""The parts of a plan."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ Ended = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped"
 
 @dataclass(frozen=True)
 class Mark:
-    """A state that the receiver reaches when it has ``sent`` bytes of the plan's ranges.
+    """A state that the receiver reaches when it has received ``sent`` bytes of the plan's ranges.
 
-    ``number`` is that of the layer (quality order) or level (level order); ``bytes`` what is held of the container.
+    ``number`` is that of the layer (quality order) or level (level order). ``bytes`` counts what is held of the
+    container.
     """
 
     sent: int
@@ -30,22 +31,22 @@ class Mark:
 
 @dataclass(frozen=True)
 class Plan:
-    """Slices of a container in sending order, less what is held.
+    """Slices of a container in sending order, without what is held.
 
     Attributes
     ----------
     before : tuple of ByteRange
-        Service slices that must come first: the index, where segments travel without the tables of their layers.
+        Service slices that must come first: the index, if segments are sent without the tables of their layers.
     ranges : tuple of ByteRange
-        The surface. Their sum and what is held of them make the state's ``bytes``.
+        Slices of the surface. Together with what is held of them they are the state's ``bytes``.
     after : tuple of ByteRange
         The metadata.
     marks : tuple of Mark
-        States on the way, the last one being the state at the end; those with a ``sent`` of 0 are held.
+        States on the way, the last one at the end; states with a ``sent`` of 0 are held already.
     ended : str
-        Why the plan ends where it does.
+        Why the plan ends.
     prefix : bool
-        The whole of ``ranges`` would be a prefix of the file, and needs no index.
+        Whether all ``ranges`` together are a prefix of the file, which needs no index.
     """
 
     before: tuple[ByteRange, ...]

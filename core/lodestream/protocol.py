@@ -1,21 +1,22 @@
-"""One end of a stream without I/O: whose turn it is, and how much may be in flight.
+"""One end of a stream, without I/O: the order of messages, and the credit.
 
-A `Connection` is fed with messages and says which events they are; it is told events and gives the messages to send. It
-knows turns, credit and ends; it knows neither sockets nor clocks nor what the bytes of a container mean.
+A `Connection` turns received messages into events and events into messages to send. It checks order, credit and ends.
+It knows nothing of sockets, clocks, or the contents of a container.
 
-The machine
------------
-The client opens, the server answers with a header, then sends slices and figures as far as credit goes, then ends; the
-client opens again, for something else of the same surface, or says bye; the server closes. Two things make it more than
-a list of steps:
+The state machine
+-----------------
+The client opens. The server answers with a header, then sends slices and layers as far as the credit goes, then ends.
+The client opens again, for something else of the same surface, or says bye; the server closes. Two things make this
+more than a list of steps:
 
-- *Messages cross.* A ``credit`` or ``stop`` may be under way while the server ends by itself, and slices are under way
-  when the client stops. So each side has its own table: after its own ``stop`` the client still takes what comes until
-  ``end``; after its own ``end`` the server still takes these two until ``open`` or ``bye``.
-- *Stop takes effect at once.* Once the server has heard ``stop``, its table allows ``end`` and nothing else. A client
-  that has stopped is in one of two states, since it may stop before the header has come, and must not take two.
+- *Messages cross.* A ``credit`` or ``stop`` may be in flight while the server ends by itself, and slices are in flight
+  when the client stops. So each side has its own table: after its own ``stop`` the client still accepts what comes
+  until ``end``; after its own ``end`` the server still accepts these two until ``open`` or ``bye``.
+- *Stop takes effect at once.* After ``stop`` the server may send ``end`` and nothing else. A client that has stopped is
+  in one of two states: it may stop before the header has come, and must not accept two headers.
 
-An ``error`` is the server's last word in any state; what the client still had under way is then taken and ignored.
+An ``error`` is the server's last message in any state; messages of the client that are still in flight are then
+accepted and ignored.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ __all__ = ["TRANSITIONS", "Connection", "Side", "State"]
 
 
 class Side(Enum):
-    """Which end of the stream."""
+    """The two ends of a stream."""
 
     CLIENT = "client"
     SERVER = "server"
 
 
 class State(Enum):
-    """Where a side is; `TRANSITIONS` says what leads where."""
+    """The states of a side; `TRANSITIONS` lists the transitions."""
 
     IDLE = "idle"
     OPENED = "opened"
@@ -143,10 +144,10 @@ class Connection:
     Attributes
     ----------
     state : State
-        Where this side is.
+        Current state of this side.
     credit : int
-        Bytes of `Segments.data` that the server may still send (server), or that may still arrive (client). Never
-        negative, never above `MAX_CREDIT`.
+        Bytes of `Segments.data` that the server may still send (on the server), or that may still arrive (on the
+        client). From 0 to `MAX_CREDIT`.
     """
 
     def __init__(self, side: Side) -> None:
@@ -160,7 +161,7 @@ class Connection:
         Raises
         ------
         LocalProtocolError
-            When it is not allowed now, or goes beyond the credit; nothing has changed then.
+            If the event is not allowed now, or exceeds the credit; nothing has changed then.
         """
         moves = TRANSITIONS[self.side][self.state][0]
         if type(event) not in moves:
@@ -176,15 +177,15 @@ class Connection:
         return serialize(event)
 
     def receive(self, message: bytes) -> Event:
-        """The event that a message from the other side stands for.
+        """The event of a message from the other side.
 
         Raises
         ------
         MessageError
-            When it is not a message, or not one that is allowed now. Nothing has changed then; a server may still send
-            an `Error`.
+            If it is not a message, or not one that is allowed now. Nothing has changed then; a server may still send an
+            `Error`.
         UnsupportedVersionError
-            When the other side speaks another version.
+            If the other side speaks another version.
         """
         event = parse(message)
         moves = TRANSITIONS[self.side][self.state][1]

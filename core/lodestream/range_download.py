@@ -1,8 +1,8 @@
-"""A surface received in parts of its container's file, as HTTP Range gives them, without I/O.
+"""Receiving a surface over HTTP Range, without I/O.
 
-The same plan that a server follows over WebSocket is made here: the first bytes tell what the file is and how long, the
-last ones hold its index, and what the target needs of the rest is asked for in few requests. Layers that come with the
-first bytes are shown before the plan is made, where it is certain to have them.
+The client makes the plan that a server would follow over WebSocket. The first bytes of the file tell what it is and how
+long, the last bytes contain its index. What the target needs of the rest is requested in few requests. Layers within
+the first bytes are shown before the plan exists, if it is certain to contain them.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _CONTAINER_TAG = re.compile(r'"([0-9a-f]{64})"')
 
 @dataclass(frozen=True)
 class RangeRequest:
-    """Ask for these bytes of the file.
+    """A request for a range of the file.
 
     Attributes
     ----------
     offset, length : int
-        Of the file; it may end before.
+        The range; the file may end before.
     headers : mapping
-        What the request says.
+        Headers of the request.
     """
 
     offset: int
@@ -61,23 +61,23 @@ class _MissingError(Exception):
 
 
 class RangeDownload:
-    """Requests out, parts of a file in.
+    """Receiving a surface over HTTP Range: requests out, parts of the file in.
 
-    Whoever integrates it asks for what `request` says, tells the first line and headers of the answer to `answer` and
-    its body, in any pieces, to `receive`, then calls `finish`; until `request` gives None. When a connection breaks it
-    goes on with the next `request`.
+    The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
+    body, in pieces of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
+    breaks, it continues with the next `request`.
 
     Parameters
     ----------
     reception : Reception
-        What has come, by this road or another.
+        What has arrived, over any transport.
     etag : str or None
-        Strong entity tag that the file has, where it is known.
+        Strong entity tag of the file, if it is known.
 
     Attributes
     ----------
     requests : int
-        How many were made.
+        Number of requests so far.
     """
 
     def __init__(self, reception: Reception, *, etag: str | None = None) -> None:
@@ -95,29 +95,29 @@ class RangeDownload:
 
     @property
     def ended(self) -> str | None:
-        """Why nothing more will come, as in `Ended`."""
+        """Why the stream ended, as in `Ended`."""
         return self.reception.ended
 
     @property
     def version(self) -> str | None:
-        """What tells this version of the file from another: its entity tag, or else its date; None without either."""
+        """Identifies this version of the file: its entity tag, or else its date; None if it has neither."""
         return self._validator
 
     def request(self, now: float | None = None) -> tuple[RangeRequest | None, list[DownloadEvent]]:
-        """What to ask for next, None when there is nothing; and what follows from what has come.
+        """The next request, or None if none is needed; and the views that follow from what has arrived.
 
         Parameters
         ----------
         now : float or None
-            Seconds of any clock that does not go back: what a round trip takes, and what comes in one, decides which
-            slices are asked for together.
+            Seconds of any clock that does not go back. The measured round-trip time and rate decide which slices are
+            requested together.
 
         Raises
         ------
         CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
-            When the file is no container that can be read.
+            If the file is not a container that can be read.
         OptionError
-            When the container has nothing that meets the target.
+            If the container cannot meet the target.
         """
         events: list[DownloadEvent] = []
         place = None
@@ -142,12 +142,12 @@ class RangeDownload:
         return self._asked, events
 
     def answer(self, status: int, headers: Mapping[str, str], now: float | None = None) -> None:
-        """Take the beginning of an answer.
+        """Take the status and headers of an answer.
 
         Parameters
         ----------
         status : int
-            200, 206 or 416; the others say nothing of the file.
+            200, 206 or 416; other answers say nothing about the file.
         headers : mapping
             By names in lower case.
         now : float or None
@@ -155,9 +155,9 @@ class RangeDownload:
         Raises
         ------
         RemoteProtocolError
-            When Range is not supported, or the answer is not what was asked for.
+            If the server does not support Range, or the answer does not match the request.
         RemoteError
-            With the code ``other-container``, when the file has changed.
+            With the code ``other-container`` if the file has changed.
         """
         asked = self._asked
         if asked is None:
@@ -187,14 +187,14 @@ class RangeDownload:
         self.reception.identify(tag[1] if tag else None, size)
 
     def receive(self, chunk: bytes) -> list[DownloadEvent]:
-        """Take a piece of an answer's body; the views that it completes.
+        """Take a piece of the body of an answer; returns the views that it completes.
 
         Raises
         ------
         CorruptStreamError
-            When the bytes of the container are damaged.
+            If the bytes of the container are damaged.
         RemoteProtocolError
-            When it is more than was asked for.
+            If there are more bytes than requested.
         """
         self.reception.wire_bytes += len(chunk)
         asked, start = self._asked, self._position
@@ -209,12 +209,12 @@ class RangeDownload:
         return events
 
     def finish(self, now: float | None = None) -> None:
-        """Tell that an answer's body has ended.
+        """Declare the end of an answer's body.
 
         Raises
         ------
         TruncatedStreamError
-            When that was before it was whole; the next `request` asks for the rest.
+            If the body was shorter than announced; the next `request` asks for the rest.
         """
         asked, self._asked = self._asked, None
         if asked is None:
@@ -227,20 +227,20 @@ class RangeDownload:
 
     @property
     def left(self) -> int:
-        """How many bytes of the present answer are still to come."""
+        """Bytes of the current answer that are still to come."""
         return self._asked.offset + self._asked.length - self._position if self._asked is not None else 0
 
     def leave(self) -> None:
-        """Tell that the present answer is not read to its end: something else is wanted first."""
+        """Declare that the rest of the current answer is not read, because something else is needed first."""
         self._asked = None
 
     def stop(self, why: str = "stopped") -> None:
-        """Want no more; whoever integrates this closes the connection.
+        """Stop; the caller closes the connection.
 
         Parameters
         ----------
         why : "stopped" or "seconds"
-            What `ended` is to say.
+            Reason given by `ended`.
         """
         if self.ended is None:
             self.reception.stopped_for = why

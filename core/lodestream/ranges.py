@@ -1,4 +1,4 @@
-"""Sets of bytes of a file, as ranges: what is held of a container, and what of a slice is missing."""
+"""Sets of byte ranges of a file: which bytes of a container are held, and which are missing."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ __all__ = ["RangeSet"]
 
 
 class RangeSet:
-    """Bytes of a file as sorted ranges that neither overlap nor touch; iterating gives (offset, length).
+    """A set of bytes as sorted ranges that neither overlap nor touch; iteration yields (offset, length).
 
     Parameters
     ----------
     ranges : iterable of (offset, length)
-        In any order; they may overlap. Empty ones are left out.
+        In any order; they may overlap. Empty ranges are ignored.
     """
 
     def __init__(self, ranges: Iterable[tuple[int, int]] = ()) -> None:
@@ -31,7 +31,7 @@ class RangeSet:
                 self._ends.append(offset + length)
 
     def add(self, offset: int, length: int) -> None:
-        """Add bytes; some of them, or all, may be there already."""
+        """Add bytes; some or all of them may be in the set already."""
         if length <= 0:
             return
         start, end = offset, offset + length
@@ -44,12 +44,12 @@ class RangeSet:
         self._ends[first:last] = [end]
 
     def run(self, offset: int) -> int:
-        """How many bytes from `offset` on are there without a gap."""
+        """Number of bytes from `offset` on that are in the set without a gap."""
         number = bisect_right(self._starts, offset) - 1
         return max(self._ends[number] - offset, 0) if number >= 0 else 0
 
     def missing(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """What of a range is not there, as (offset, length) in order."""
+        """The parts of a range that are not in the set, as (offset, length) in order."""
         position, end = offset, offset + length
         number = bisect_right(self._ends, position)
         while position < end:
@@ -62,7 +62,7 @@ class RangeSet:
             number += 1
 
     def overlap(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """What of a range is there, as (offset, length) in order."""
+        """The parts of a range that are in the set, as (offset, length) in order."""
         position = offset
         for start, size in self.missing(offset, length):
             if position < start:
@@ -72,21 +72,21 @@ class RangeSet:
             yield position, offset + length - position
 
     def covers(self, offset: int, length: int) -> bool:
-        """Whether all of a range is there."""
+        """Whether a whole range is in the set."""
         return self.run(offset) >= length
 
     @property
     def total(self) -> int:
-        """How many bytes there are."""
+        """Number of bytes in the set."""
         return sum(self._ends) - sum(self._starts)
 
     @property
     def end(self) -> int:
-        """The first byte after all of them; 0 where there are none."""
+        """The offset after the last byte; 0 for an empty set."""
         return self._ends[-1] if self._ends else 0
 
     def copy(self) -> RangeSet:
-        """A set of the same bytes that grows by itself."""
+        """A copy that can change independently."""
         made = RangeSet()
         made._starts, made._ends = self._starts[:], self._ends[:]
         return made

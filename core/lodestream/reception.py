@@ -1,7 +1,7 @@
-"""What has come of a surface, by whichever road and in however many connections.
+"""Reception of a surface over one or several connections.
 
-Bytes of the container go in; views come out. A `Download` or a `RangeDownload` is one connection and ends with it; the
-reception goes on: whoever starts the next one hands it over, and what is held is not asked for again.
+Bytes of the container go in, views come out. A `Download` or a `RangeDownload` is one connection and ends with it. The
+reception is handed to the next connection, so that bytes that have arrived are not requested again.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _HEAD = 4096
 
 @dataclass(frozen=True)
 class Ended:
-    """Nothing more will come.
+    """The end of a stream.
 
-    ``why`` is complete, level, rms, max or bytes when the target was met or lies out of reach; seconds or stopped when
-    this side stopped.
+    ``why`` is complete, level, rms, max or bytes if the target was met or cannot be reached; seconds or stopped if this
+    side stopped.
     """
 
     why: str
@@ -50,23 +50,23 @@ if TYPE_CHECKING:
 
 
 class Store(Protocol):
-    """Where bytes of one container are kept, in memory or on disk."""
+    """Storage for the bytes of one container, in memory or on disk."""
 
     @property
     def ranges(self) -> RangeSet:
-        """What is kept."""
+        """The bytes that are stored."""
         ...
 
     def read(self, offset: int, length: int) -> bytes:
-        """Bytes that are kept."""
+        """Read stored bytes."""
         ...
 
     def write(self, offset: int, data: bytes) -> None:
-        """Keep bytes that are not kept yet."""
+        """Store bytes that are not stored yet."""
         ...
 
     def used(self, offset: int, length: int) -> None:
-        """The decoder has been given these bytes: they are read no more."""
+        """Called when the decoder has been given these bytes; they are not read again."""
         ...
 
 
@@ -104,43 +104,43 @@ class Reception:
     Parameters
     ----------
     target : Target
-        Where to stop, and the order on the way there.
+        What to receive, where to stop, and in which order.
     store : Store or None
-        Where everything that comes is kept too, and what is there already is not asked for again. The decoder is then
-        given everything in the order of the target's plan, whenever it came.
+        All received bytes are stored here too, and bytes that it has are not requested. The decoder gets everything in
+        the order of the target's plan, whatever the order of arrival.
     container, size : str or None, int or None
-        SHA-256 and bytes of the container, where they are known.
+        SHA-256 and size of the container, if they are known.
     sink : callable or None
-        Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come. Which
-        container that is has been told by then.
+        Called as ``sink(offset, data)`` with new bytes of the container as they arrive. By then it is known which
+        container it is.
     max_vertices : int or None
-        What the surface may have at most, see `Decoder`.
+        Limit on the memory of the surface, see `Decoder`.
 
     Attributes
     ----------
     target : Target
     decoder : Decoder
-        What has come so far.
+        Decodes what has arrived so far.
     held : RangeSet
-        Bytes of the container that have come, or were in the store.
+        Bytes of the container that have arrived or were in the store.
     container : str or None
         SHA-256 of the container, once it is known.
     size : int or None
-        Its bytes, once they are known.
+        Its size in bytes, once it is known.
     planned : int or None
         Bytes of the surface that the target needs, once they are known.
     index : Index or None
-        The container's, if the road or the order needs it and once it has come.
+        The container's index, if the transport or the order needs it, once it has arrived.
     plan : Plan or None
-        What the target needs of the container, once the index is known.
+        The slices that the target needs, once the index is known.
     received : int
-        How many bytes of the surface are held.
+        Bytes of the surface that are held.
     data_bytes : int
-        Bytes of the container received, those that were held already among them.
+        Bytes of the container received, including bytes that were held already.
     wire_bytes : int
         Bytes of all messages and answers received.
     ended : str or None
-        Why nothing more will come, as in `Ended`.
+        Why the stream ended, as in `Ended`.
     """
 
     def __init__(
@@ -185,12 +185,12 @@ class Reception:
         self._kept = 0
 
     def identify(self, container: str | None, size: int) -> None:
-        """Tell which container is being received, before its bytes are.
+        """Declare which container is being received, before its bytes are.
 
         Raises
         ------
         RemoteError
-            With the code ``other-container``, when it is another one than before.
+            With the code ``other-container`` if it differs from the one before.
         """
         if (self.container or container) != (container or self.container) or self.size not in (None, size):
             raise RemoteError(
@@ -201,12 +201,12 @@ class Reception:
         self.container, self.size = container or self.container, size
 
     def expect(self, planned: int, index: tuple[int, int], metadata: tuple[int, int], prefix: bool) -> list[View]:
-        """Tell what the other side is about to send; the views that the store makes up for already.
+        """Declare what the other side is about to send; returns the views that stored bytes complete.
 
         Raises
         ------
         CorruptStreamError
-            When the metadata are longer than any container has them.
+            If the metadata are longer than allowed in a container.
         """
         check_length(metadata[1], metadata[0], section=True)
         self.planned, self._service = planned, (index, metadata)
@@ -215,12 +215,12 @@ class Reception:
         return self._advance()
 
     def follow(self, index: Index) -> list[View]:
-        """Tell the container's index; the views that the store makes up for already.
+        """Set the container's index; returns the views that stored bytes complete.
 
         Raises
         ------
         OptionError
-            When the container has nothing that meets the target.
+            If the container cannot meet the target.
         """
         self._plan(index)
         return self._advance()
@@ -236,12 +236,12 @@ class Reception:
         self._follow(*([(place.offset, place.length) for place in part] for part in parts))
 
     def focus(self, region: Region | None) -> None:
-        """Change what comes first: `Target.first`.
+        """Change which region comes first (`Target.first`).
 
         Raises
         ------
         OptionError
-            When the region has no point, or it is known already that the surface has no such region.
+            If the region contains no point, or the surface is known and has no such region.
         """
         target = replace(self.target, first=region)
         self.decoder.focus(region)
@@ -252,16 +252,16 @@ class Reception:
             self._learning = region is not None
 
     def take(self, offset: int, data: bytes) -> list[View]:
-        """Take bytes of the container; the views that they complete.
+        """Take bytes of the container; returns the views that they complete.
 
         Raises
         ------
         CorruptStreamError, UnsupportedVersionError
             From the decoder.
         RemoteProtocolError
-            When they lie outside the container.
+            If the bytes lie outside the container.
         TooLargeError
-            From the decoder, or when there are more than its capacity.
+            From the decoder, or if there are more bytes than its capacity.
         """
         if self.size is not None and offset + len(data) > self.size:
             raise RemoteProtocolError(f"expected bytes of {self.size}, got those to {offset + len(data)}")
@@ -285,32 +285,32 @@ class Reception:
         return views + self._advance()
 
     def missing(self) -> Iterator[tuple[int, int]]:
-        """What is still to come, as (offset, length) in order, once the index is known."""
+        """The bytes that are still to come, as (offset, length) in order; once the index is known."""
         for place in self._order or ():
             yield from self.held.missing(*place)
 
     def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """What of a range the target needs, held or not, as (offset, length); before that is known, all of it."""
+        """The parts of a range that the target needs, held or not; before that is known, the whole range."""
         return iter([(offset, length)]) if self._wanted is None else self._wanted.overlap(offset, length)
 
     def keep(self) -> Store:
-        """Keep from now on what comes before its turn, and in any case what tells where things stand."""
+        """Keep bytes that the decoder cannot use yet, and in any case those of header, index and metadata."""
         if self._store is None:
             self._store = self._aside
         return self._store
 
     @property
     def metadata_place(self) -> tuple[int, int] | None:
-        """Where the container's metadata stand, once that is known."""
+        """Offset and length of the container's metadata, once they are known."""
         return self._service[1] if self._service else None
 
     def tick(self, now: float) -> float | None:
-        """Tell the time, in seconds of any clock that does not go back; the first call starts the clock.
+        """Set the time, in seconds of any clock that does not go back; the first call starts the clock.
 
         Returns
         -------
         float or None
-            Seconds until the target's are over, 0 when they are; None when none are set.
+            Seconds left of the target's time limit, 0 if it is over; None if there is none.
         """
         if self.target.seconds is None:
             return None
@@ -319,12 +319,12 @@ class Reception:
         return max(self._deadline - now, 0.0)
 
     def end(self, why: str) -> Ended:
-        """Tell that the other side has sent what it had to.
+        """Declare that the other side has sent everything.
 
         Raises
         ------
         TruncatedStreamError
-            When that is less than was promised.
+            If that is less than it announced.
         """
         if why == "stopped":
             why = self.stopped_for or why

@@ -103,14 +103,20 @@ class Reconstruction:
             When ``corrected`` is asked for and a piece of the exactness section does not fit.
         """
         header = self.header
-        blocks = to_values(header, self.pictures(length, state, level, chosen), level)
+        blocks = self._whole(length, state, level, chosen)
         if corrected:
-            self._correct(blocks)
+            self._correct(blocks, chosen)
         masks = level_masks(header.parts, header.layout, level, header.masks)
         for block, mask, kept in zip(blocks, masks, header.kept_masks, strict=True):
             if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
                 block.clear(~(mask | kept) if corrected and kept is not None else ~mask, header.hole)
         return blocks
+
+    def _whole(
+        self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
+    ) -> list[Values]:
+        """The values of all blocks before exactness and holes."""
+        return to_values(self.header, self.pictures(length, state, level, chosen), level)
 
     def pictures(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
@@ -139,6 +145,18 @@ class Reconstruction:
         Takes memory for what the window is made of, not for the surface. See `blocks`.
         """
         header = self.header
+        values = self._part(length, state, region, chosen)
+        if corrected:
+            self._correct([values], chosen, region)
+        if (mask := header.masks[0]) is not None:
+            if corrected and (kept := header.kept_masks[0]) is not None:
+                mask = mask | kept
+            values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
+        return values
+
+    def _part(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
+        """The values of a window before exactness and holes."""
+        header = self.header
         with self._lock:
             self._decode(length)
             pictures = [
@@ -154,16 +172,9 @@ class Reconstruction:
                     store_values(header.lattices[channel], picture, array, component)
                 channel += 1
             arrays.append(array)
-        values = Values(arrays)
-        if corrected:
-            self._correct([values], region)
-        if (mask := header.masks[0]) is not None:
-            if corrected and (kept := header.kept_masks[0]) is not None:
-                mask = mask | kept
-            values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
-        return values
+        return Values(arrays)
 
-    def _correct(self, blocks: list[Values], region: Region | None = None) -> None:
+    def _correct(self, blocks: list[Values], chosen: NDArray[np.bool_] | None, region: Region | None = None) -> None:
         """Restore all windows of exactness that there are, or of a region of the only block those inside."""
         top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
         for number, window in enumerate(windows(self.header)):
@@ -171,14 +182,18 @@ class Reconstruction:
                 a <= start and stop <= b
                 for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
             )
-            if number in self._pieces and inside:
+            if number in self._pieces and inside and (chosen is None or chosen[window.channel]):
                 values = blocks[window.block].window(window, top, left)
                 masks = self.header.kept_masks if window.kept else self.header.masks
                 mask, (data, offset) = masks[window.block], self._pieces[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
-                chosen = slice(None) if valid is None else valid
-                known = values[chosen]
-                values[chosen] = exactness.decode_piece(known.ravel(), data, offset).reshape(known.shape)
+                places = slice(None) if valid is None else valid
+                known = values[places]
+                values[places] = self._restored(known.ravel(), data, offset).reshape(known.shape)
+
+    def _restored(self, known: NDArray[Any], piece: bytes, offset: int) -> NDArray[Any]:
+        """The values of a piece of the exactness section."""
+        return exactness.decode_piece(known, piece, offset)
 
     def _prepare(self) -> list[Tiles]:
         if not self._tiles:

@@ -1,4 +1,4 @@
-"""A plan in another order: what a region needs comes first, the rest after it."""
+"""Reordering a plan: what a region needs comes first, the rest after it."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ __all__ = ["region_first"]
 
 
 def region_first(index: Index, chosen: Plan, region: Region) -> Plan:
-    """The same slices, with the segments that a region needs before the others.
+    """Move the segments that a region needs to the front of a plan; the slices stay the same.
 
-    What the first state needs stays in front. Both parts keep the plan's order, so that no segment stands before one
-    that its contexts may see. The index comes before all: with it alone can slices be told apart.
+    What the first state needs stays in front. Both parts keep the plan's order, so that every segment comes after those
+    that its contexts depend on. The index comes before everything, because only with it can the slices be told apart.
 
     Parameters
     ----------
     index : Index
     chosen : Plan
-        As `plan` makes it where nothing is held.
+        A plan of `plan` for a client that holds nothing.
     region : ((int, int), (int, int))
         Rows and columns, half-open, in full-resolution indices.
 
     Returns
     -------
     Plan
-        A mark stands where its state is whole in the region, and again where it is everywhere. Its errors are NaN where
-        more has been sent by then than belongs to the state.
+        A mark stands where its state is complete in the region, and again where it is complete everywhere. Its errors
+        are NaN if more than the state's data have been sent by then.
 
     Raises
     ------
     OptionError
-        When the surface has no such region, or several blocks.
+        If the surface has no such region, or several blocks.
     """
     wish = Wish(region)
     wish.check(index.header)

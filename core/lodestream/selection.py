@@ -1,4 +1,4 @@
-"""Which segments and pieces of a container a receiver takes that wants a window, or some attributes only."""
+"""Which segments and pieces of a container are needed for a window or for some attributes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from .capacity import Capacity
 from .container.model import Header, Index, Piece, Segment
 from .container.pieces import windows
 from .errors import OptionError
+from .library import why_missing
 from .reach import check_region, needed_tiles
 from .target import Region, Target
 
@@ -19,22 +20,22 @@ __all__ = ["Selection", "Wish", "restored", "select", "wish_of"]
 
 @dataclass(frozen=True)
 class Wish:
-    """What of a surface is wanted: a window of its points (None: all), and attributes by name (None: all)."""
+    """The requested part of a surface: a window of its points (None: all) and attributes by name (None: all)."""
 
     region: Region | None = None
     attributes: tuple[str, ...] | None = None
 
     def check(self, header: Header) -> None:
-        """Refuse what the surface does not have.
+        """Refuse a region or attributes that the surface does not have.
 
         Raises
         ------
         OptionError
-            When the region is not inside it, or there is no such attribute.
+            If the region is not inside the surface, or there is no such attribute.
         """
         if self.region is not None:
             if len(header.blocks) > 1:
-                raise OptionError(f"expected no region of a surface of {len(header.blocks)} blocks")
+                raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
             check_region(self.region, header.shape)
         names = [kind.name for kind in header.attributes]
         for name in self.attributes or ():
@@ -64,7 +65,8 @@ class Wish:
         """
         sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
         layout = header.layout
-        if self.region is not None and header.arrangement is None:
+        # Without the compiled kernels a window is cut out of the whole surface.
+        if self.region is not None and header.arrangement is None and why_missing() is None:
             rows, columns = restored(header, self.region)
             shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
         elif level is not None and level < layout.levels:

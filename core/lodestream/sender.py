@@ -1,4 +1,4 @@
-"""The server's end of a stream without I/O: messages in; slices to read and messages to send out."""
+"""The server's end of a stream, without I/O: messages in; slices to read and messages to send out."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ _LEAST = 4096
 class Sender:
     """One surface being sent.
 
-    Whoever integrates it moves bytes: each message that comes goes into `receive`; `next_message` gives what is to be
-    sent now; when it gives None, `wanted` names the slice of the container to read and hand to `provide`; when that
-    gives None too, there is nothing to do before the next message comes.
+    The caller moves bytes. It passes each received message to `receive` and sends the messages that `next_message`
+    returns. When that returns None, `wanted` names the slice of the container to read and pass to `provide`. When that
+    returns None too, there is nothing to do before the next message.
 
     Parameters
     ----------
     index : Index
-        What the container holds and where.
+        Index of the container.
     container : str
         SHA-256 of the container, in hexadecimal digits.
 
     Attributes
     ----------
     sent : int
-        Bytes of the container that have been handed out.
+        Bytes of the container that were handed out.
     layers : int
-        Layers or levels that have been handed out; from the first one on there is something to draw.
+        Layers or levels that were handed out; from the first one on the client can draw the surface.
     held : RangeSet
-        Bytes of the container that the client holds from elsewhere, as it said last.
+        Bytes of the container that the client already held when it last opened.
     why : str or None
         Why the stream ended, once it has.
     """
@@ -65,23 +65,23 @@ class Sender:
 
     @property
     def state(self) -> State:
-        """Where the stream is; closed and failed are final once `next_message` gives None."""
+        """State of the stream; closed and failed are final once `next_message` returns None."""
         return self._connection.state
 
     @property
     def pieces(self) -> int:
-        """How many pieces a plan is made of, which is how long it takes to make one."""
+        """Number of pieces that a plan is made of; the time to make a plan is proportional to it."""
         return len(self._index.segments) + len(self.held) + len(self._given)
 
     def receive(self, message: bytes) -> Event:
-        """Take one message; the event that it stands for.
+        """Take one message; returns its event.
 
         Raises
         ------
         MessageError
-            When it is no message, or not one that is allowed now; its ``code`` is the answer to give with `fail`.
+            If it is not a message, or not one that is allowed now; pass its ``code`` to `fail`.
         UnsupportedVersionError
-            When the client speaks another version.
+            If the client speaks another version.
         """
         event = self._connection.receive(message)
         if isinstance(event, Open):
@@ -94,14 +94,14 @@ class Sender:
         return event
 
     def fail(self, code: str, detail: str) -> None:
-        """Refuse: an error, and nothing after it."""
+        """End the stream with an error message."""
         if self.state not in (State.CLOSED, State.FAILED):
             self._outbox = deque([Error(code, CODES[code].title, detail)])
 
     def next_message(self) -> bytes | None:
         """The message to send now, or None.
 
-        One at a time: what a `stop` overtakes is never handed out.
+        Messages are returned one at a time, so that a `stop` takes effect before the next one.
         """
         if not self._outbox:
             return None
@@ -116,7 +116,7 @@ class Sender:
         return self._connection.send(event)
 
     def wanted(self) -> ByteRange | None:
-        """The slice to read now, as much as credit and the size of a message allow; None when there is none."""
+        """The slice to read now, limited by the credit and the size of a message; None if there is none."""
         if not self._ready():
             return None
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
@@ -133,12 +133,12 @@ class Sender:
         return self.state is State.STREAMING and not self._outbox and bool(self._slices and self._connection.credit)
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
-        """Hand over the bytes of a slice that `wanted` has named; after a stop they are dropped.
+        """Pass the bytes of a slice that `wanted` has named; after a stop they are dropped.
 
         Raises
         ------
         CorruptStreamError
-            When they are fewer than asked for: the file has been cut.
+            If there are fewer bytes than requested: the file was truncated.
         """
         if self.state is not State.STREAMING or not self._slices:
             return

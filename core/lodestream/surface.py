@@ -1,4 +1,4 @@
-"""A structured surface in memory: what readers make, `encode` takes and `decode` gives back."""
+"""Structured surfaces in memory: made by readers and by `decode`, taken by `encode` and by writers."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ class Block:
     ----------
     points : array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3)
         Heights; planar points; x, y, z; x, y, z and C - 3 attributes. A curve is (N, 1, C). Integers of 8 to 64 bits
-        or float32/float64, of either byte order; not copied when already in native order and C-contiguous. Where a
-        coordinate of a masked array is masked, there is a hole.
+        or float32/float64, of either byte order; not copied when already in native order and C-contiguous. In a masked
+        array, a point with a masked coordinate is a hole.
     closed : (bool, bool)
-        ``(rows, columns)``: ``rows`` says that axis 0 wraps, so that row H - 1 is followed by row 0.
+        ``(rows, columns)``: ``rows`` means that axis 0 wraps around, so that row 0 follows row H - 1.
     mask : bool array of shape (H, W), optional
-        True where a point is valid; the others are holes, whose values mean nothing. Points with a coordinate that is
-        NaN or infinite are holes as well; those that say something (`kept`) come back all the same. None: only those.
+        True where a point is valid. The other points are holes; their values are not kept. Points with a NaN or
+        infinite coordinate are holes too; those in `kept` are restored as they were. None: only such points are holes.
     attributes : mapping of str to arrays of shape (H, W) or (H, W, K), optional
-        What belongs to the points beside their place, each of one of the types above; NaN and infinities are values.
-        What is masked of a masked array is NaN.
+        Further values at the points, of one of the types above. NaN and infinities are values. Masked values of a
+        masked array become NaN.
 
     Raises
     ------
     InputError
-        When an array is not of such a shape or type, there are fewer than two points, none of them is valid, or an
-        attribute is masked at a valid point and its type has no NaN.
+        If an array has another shape or type, there are fewer than two points, no point is valid, or an attribute of
+        integers is masked at a valid point.
     """
 
     def __init__(
@@ -117,14 +117,14 @@ class Block:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the grid."""
+        """Number of rows and columns of the grid."""
         return self.points.shape[0], self.points.shape[1]
 
     @cached_property
     def kept(self) -> NDArray[np.bool_] | None:
-        """The holes whose values come back bit for bit, shape (H, W); None where there are none.
+        """The holes whose values are kept bit for bit, bool array of shape (H, W); None if there are none.
 
-        They are those with an infinite coordinate, and those with coordinates of which some are NaN and some are not.
+        These are points with an infinite coordinate, and points with NaN in some but not all coordinates.
         """
         if self.mask is None or self.points.dtype.kind != "f":
             return None
@@ -140,7 +140,7 @@ class Block:
 
     @property
     def holes(self) -> int:
-        """Points that are not valid."""
+        """Number of points that are not valid."""
         return 0 if self.mask is None else int(self.mask.size - np.count_nonzero(self.mask))
 
     def __repr__(self) -> str:
@@ -155,23 +155,23 @@ class Surface:
     Parameters
     ----------
     points, closed, mask, attributes
-        Of the only block, see `Block`.
+        Of a surface with one block, see `Block`.
     metadata : mapping of str to plain values
-        Anything that MessagePack can hold, kept with the surface: name, unit, ``crs`` (WKT), ``geotransform`` (six
-        numbers in GDAL's order), source format, ...
+        Values that MessagePack can hold; they are kept with the surface. docs/formats.md lists the keys that readers
+        set: name, unit, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ...
     blocks : iterable of Block
-        In place of the first four: blocks of the same type and number of channels, with the same attributes.
+        Instead of the first four: several blocks of the same type and number of channels, with the same attributes.
 
     Attributes
     ----------
     joints : Joints or None
-        Of what comes out of a container, which points are one, whatever their values are so far. None, as of what is
-        made of arrays in memory: those with the same values, see `lodestream.mesh`.
+        For a decoded surface: which points of its blocks are the same vertex, independent of their current values.
+        None for a surface made from arrays: points with equal values are the same vertex, see `lodestream.mesh`.
 
     Raises
     ------
     InputError
-        When the arrays cannot be a surface, see `Block`, or the blocks differ in kind.
+        If the arrays are not valid, see `Block`, or the blocks differ in type, channels or attributes.
     """
 
     def __init__(
@@ -216,12 +216,12 @@ class Surface:
 
     @property
     def closed(self) -> Closed:
-        """Which axes of the only block wrap."""
+        """Which axes of the only block are closed."""
         return self._only().closed
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Valid points of the only block; None: all."""
+        """Mask of the valid points of the only block; None if all are valid."""
         return self._only().mask
 
     @property
@@ -245,7 +245,9 @@ class Surface:
 
 def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
     """What is masked of a masked array, of its shape; None where nothing is."""
-    hidden = values.mask if isinstance(values, np.ma.MaskedArray) else np.ma.nomask
+    if type(values) is np.ndarray or not isinstance(values, np.ma.MaskedArray):  # a plain array need not load numpy.ma
+        return None
+    hidden = values.mask
     return np.broadcast_to(hidden, np.shape(values)) if np.any(hidden) else None
 
 

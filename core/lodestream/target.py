@@ -1,4 +1,4 @@
-"""What a receiver wants of a surface: how far to refine it, and in which order."""
+"""The part of a surface that a receiver requests: how far to refine it, and in which order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Region = tuple[tuple[int, int], tuple[int, int]]
 
 
 def check_spans(region: Region) -> None:
-    """Refuse a region without a point, of whatever surface.
+    """Refuse a region that contains no point, whatever the surface.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def check_spans(region: Region) -> None:
 class Tolerance:
     """An error in the surface's unit, or relative to its extent.
 
-    The extent is the range of the values (heights) or the diagonal of the box (otherwise).
+    The extent is the range of the heights, or the diagonal of the bounding box of other points.
     """
 
     value: float
@@ -43,12 +43,12 @@ class Tolerance:
 
     @classmethod
     def parse(cls, text: str) -> Tolerance:
-        """Read ``0.5`` (in the unit) or ``1e-3d`` (times the extent).
+        """Parse ``0.5`` (in the surface's unit) or ``1e-3d`` (1e-3 times the extent).
 
         Raises
         ------
         OptionError
-            When the text is neither.
+            If the text is neither.
         """
         number, relative = (text[:-1], True) if text.endswith("d") else (text, False)
         try:
@@ -57,37 +57,37 @@ class Tolerance:
             raise OptionError(f"expected a number such as 0.5, or 1e-3d (times the extent), got {text!r}") from None
 
     def __str__(self) -> str:
-        """The text that `parse` reads as this very tolerance: one spelling for each."""
+        """The canonical text of this tolerance, which `parse` reads back."""
         return f"{float(self.value)!r}{'d' if self.relative else ''}"
 
     def absolute(self, extent: float) -> float:
-        """The tolerance in the surface's unit, for a surface of this extent."""
+        """The tolerance in the unit of a surface with this extent."""
         return self.value * extent if self.relative else self.value
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """Where to stop, and the order on the way there; without limits, the whole surface.
+    """What to decode or receive, where to stop, and in which order; by default the whole surface.
 
     Parameters
     ----------
     level : int or None
-        Decode levels up to this one only and nothing finer; excludes the other limits.
+        Levels up to this one and nothing finer; cannot be combined with the other limits.
     until_rms, until_max : Tolerance or None
-        Stop at the first layer whose error is at most this.
+        Stop at the first layer with an error of at most this.
     max_bytes : int or None
         Stop at the last layer that ends within so many bytes of the container.
     seconds : float or None
-        Stop when so much time has passed; the receiver's business, `plan` does not look at it.
+        Stop after so much time. The receiver takes care of this; `plan` ignores it.
     order : "quality" or "level"
-        Quality order sends bits in order of what they do to the error; level order sends level by level, and limits
-        then stop at a level's end.
+        Quality order: the data that reduce the error most come first. Level order: level by level; limits then stop at
+        the end of a level.
     region : ((int, int), (int, int)) or None
         Only this window: rows and columns, half-open, in full-resolution indices.
     attributes : tuple of str or None
-        Only the attributes of these names beside the points; None: all.
+        Names of the attributes to include; None: all.
     first : ((int, int), (int, int)) or None
-        Of all that is sent, what this region needs comes before the rest; rows and columns as those of `region`.
+        The data that this region needs come first, then the rest; rows and columns as in `region`.
     """
 
     level: int | None = None

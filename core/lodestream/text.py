@@ -1,4 +1,4 @@
-"""Text of others, made fit for a terminal."""
+"""Making text from files and servers safe to print."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ __all__ = ["printable"]
 
 
 def printable(text: str) -> str:
-    r"""Text that a terminal shows, and does nothing else with.
+    r"""Replace the characters of a text that could do more than be shown on a terminal.
 
-    What came from a file or a server may hold sequences that move a cursor, set a title or fill a clipboard, characters
-    that turn the order of those around them, and others that are not seen at all. These are shown as Python writes
-    them: ``\x1b``, ``\u202e``. Letters, marks, digits, signs and spaces of any script stay.
+    Text from a file or a server may contain sequences that move the cursor, set a title or fill the clipboard,
+    characters that change the direction of text, and invisible ones. These are shown as Python writes them: ``\x1b``,
+    ``\u202e``. Letters, marks, digits, symbols and spaces of all scripts stay.
 
     Examples
     --------

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import COLUMNS, ROWS
-from .bitplanes import SUMS, code_passes
 from .quantiser import Quantiser
 from .tiles import Tiles, TileTable
 
@@ -60,23 +59,10 @@ class TileCoder:
         coefficients = int((rows[:, ROWS] * rows[:, COLUMNS]).sum())
         # A decision takes at most 11 bits (a probability of 32 / 2**16), a coefficient two of them in a plane.
         data = np.empty(64 + 3 * passes * coefficients, np.uint8)
-        length = code_passes(
-            False,
-            rows,
-            first - 1,
-            first - passes,
-            tiles.known,
-            tiles.sign,
-            tiles.flags,
-            tiles.early,
-            self._channels[channel].true,
-            tiles.models[tile],
-            data,
-            np.zeros(0, np.float64) if costs is None else costs,
-            tiles.trellis,
-            np.empty(SUMS, np.uint32),
-        )
-        return data[:length].tobytes()
+        bands = tiles.table.first[tile]
+        run = np.array([[bands, len(rows), tile, first - 1, first - passes, 0, data.size]], np.int64)
+        tiles.code(False, run, self._channels[channel].true, data, np.zeros(0) if costs is None else costs)
+        return data[: run[0, -1]].tobytes()
 
 
 def planes_of(table: TileTable, true: NDArray[np.int32], tile: int) -> int:

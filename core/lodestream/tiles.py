@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
-from .bitplanes import SUMS, code_passes, new_model
+from .bitplanes import PADDING, code_passes, new_models
 from .layout import REMEMBERED, Band, Layout
-from .numba_kernels import kernel
 from .quantiser import Quantiser, step_of
 from .spreading import UNANNOUNCED, spread_bands
 
@@ -20,6 +19,9 @@ __all__ = ["TileTable", "Tiles", "gather"]
 
 #: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
 _NO_PARENT = (1, 0, 31, 31)
+
+#: Where reading: no coefficients that would be written, and no costs.
+_NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
 
 #: By grid and kind, a tile's bands, where they begin in the flat arrays, and their strides there.
 _Places = dict[tuple[int, int], tuple[Band, int, int]]
@@ -83,7 +85,7 @@ class TileTable:
         places = np.array(windows, np.int64).reshape(-1, 3)
         of = [np.array(numbers, np.int64) for numbers in of_grid]
         described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
-        return TileTable(layout, members, described, first, size + 8, blocks, places, of)
+        return TileTable(layout, members, described, first, size + PADDING, blocks, places, of)
 
     def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
         """The step of each band, in lattice steps; int64, shape (band,)."""
@@ -121,17 +123,27 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
         self.trellis = quantiser is not None
-        self.models = np.tile(new_model(self.trellis), (len(table.members), 1))
+        self.models = new_models(len(table.members), self.trellis)
 
     def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
         """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
-        ends = np.cumsum([len(data) for *_, data in runs])
-        places = np.array([(tile, first, last, end) for (tile, first, last, _), end in zip(runs, ends, strict=True)])
+        tile, first, last, length = np.array([(*run[:3], len(run[3])) for run in runs], np.int64).reshape(-1, 4).T
+        bands = np.array(self.table.first)
+        count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
         data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
-        table = self.table
-        first_bands = np.array(table.first)
-        arrays = self.known, self.sign, self.flags, self.early, self.models
-        _read(table.bands, first_bands, places, *arrays, data, self.trellis)
+        self.code(True, np.stack([bands[tile], count, tile, first, last, start, length], 1), _NOTHING, data, _FREE)
+
+    def code(
+        self,
+        reading: bool,
+        runs: NDArray[np.int64],
+        true: NDArray[np.int32],
+        data: NDArray[np.uint8],
+        costs: NDArray[np.float64],
+    ) -> None:
+        """Read or write runs of passes, see `bitplanes.code_passes`."""
+        arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
+        code_passes(reading, self.table.bands, runs, *arrays, self.trellis)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
@@ -178,10 +190,7 @@ class Tiles:
         origin: tuple[int, int] = (0, 0),
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
-        rows, columns = array.shape
-        pitch = array.strides[0] // array.itemsize
-        line = np.lib.stride_tricks.as_strided(array, ((rows - 1) * pitch + columns,), (array.itemsize,))
-        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, line, pitch, *origin)
+        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
@@ -196,43 +205,6 @@ def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, st
 
 def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
     return coefficients[slice(*band.rows), slice(*band.columns)]
-
-
-@kernel
-def _read(
-    bands: NDArray[np.int64],
-    first: NDArray[np.int64],
-    runs: NDArray[np.int64],
-    known: NDArray[np.int32],
-    sign: NDArray[np.int8],
-    flags: NDArray[np.uint8],
-    early: NDArray[np.uint8],
-    models: NDArray[np.int32],
-    data: NDArray[np.uint8],
-    trellis: bool,
-) -> None:
-    truth, costs, sums = np.zeros(0, np.int32), np.zeros(0, np.float64), np.empty(SUMS, np.uint32)
-    start = 0
-    for run in range(runs.shape[0]):
-        tile, stop = runs[run, 0], runs[run, 3]
-        rows, coded = bands[first[tile] : first[tile + 1]], data[start:stop]
-        code_passes(
-            True,
-            rows,
-            runs[run, 1],
-            runs[run, 2],
-            known,
-            sign,
-            flags,
-            early,
-            truth,
-            models[tile],
-            coded,
-            costs,
-            trellis,
-            sums,
-        )
-        start = stop
 
 
 def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:

@@ -7,16 +7,17 @@ by a forward step of the curve's points. Curves are therefore stepped first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import kernels
 from .axis import AxisStep
 from .layout import Layout, Source
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
-from .numba_kernels import kernel
 from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
 
 __all__ = [
@@ -32,6 +33,8 @@ _CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
 #: Unused columns at the end of an array of coefficients, see `allocate`.
 PADDING = 24
 _SAMPLE_LINES = 96
+#: Values in one call of a kernel that fits.
+_AT_ONCE = 1 << 22
 _NORM_LEVELS = 6
 
 
@@ -166,109 +169,96 @@ def _take_details(
         target[step.coarse :] = line[0, step.coarse :]
 
 
+class _Sample(NamedTuple):
+    """Factors of a and b in v_k, and d_k, of some midpoints: int32, flat; and what no magnitude of the factors exceeds.
+
+    Details with what the third step needs around them: k from 2 to midpoints - 4.
+    """
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    details: NDArray[np.int32]
+    largest: int
+
+    def parts(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
+        """Factors and details, so many as a kernel takes at once."""
+        for start in range(0, self.details.size, _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            yield self.first[part], self.second[part], self.details[part]
+
+    def bits(self, a: int, b: int) -> float:
+        """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
+        total = np.zeros(1)
+        for part in self.parts():
+            kernels.predictor_bits(*part, self.largest, a, b, total)
+        return float(total[0])
+
+    def moments(self, a: float, b: float, weighted: bool) -> list[float]:
+        """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
+        sums = np.zeros(5)
+        for part in self.parts():
+            kernels.predictor_moments(*part, a, b, weighted, sums)
+        found: list[float] = sums.tolist()
+        return found
+
+
 def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
     """The (a, b) that makes the details along axis 0 of some of the columns smallest, in bits."""
-    lines = sum(corner.shape[1] for corner, _ in grids)
-    samples = []
-    for corner, step in grids:
-        if step.midpoints and step.run >= FIT_NODES:
-            stride = max(1, min(lines // _SAMPLE_LINES, corner.shape[1]))
-            sample = np.array(corner[:, ::stride], order="C")
-            forward_step(sample, 0, step, (0, 0))
-            samples.append(_surroundings(sample, step.coarse, step.midpoints))
-    first, second, details = samples[0]
-    if len(samples) > 1:
-        first, second, details = (np.concatenate([s[i].ravel() for s in samples])[:, None] for i in range(3))
+    sample = _sample(grids)
     costs: dict[tuple[int, int], float] = {}
 
     def bits(ab: tuple[int, int]) -> float:
         if ab not in costs:
-            costs[ab] = _bits(first, second, details, *ab)
+            costs[ab] = sample.bits(*ab)
         return costs[ab]
 
-    best = min([*_CANDIDATES, *_least_squares(first, second, details)], key=bits)
+    best = min([*_CANDIDATES, *_least_squares(sample)], key=bits)
     for reach in (4, 2, 1):
         around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
         best = min((ab for ab in around if max(map(abs, ab)) <= 127), key=bits)
     return best
 
 
-@kernel
-def _surroundings(
-    sample: NDArray[np.int32], coarse: int, midpoints: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Factors of a and b in v_k, and d_k, for the inner midpoints k: 2 ... midpoints - 4."""
-    shape = midpoints - 5, sample.shape[1]
-    first, second, details = np.empty(shape), np.empty(shape), np.empty(shape)
-    for k in range(shape[0]):
-        for j in range(shape[1]):
-            near = np.float64(sample[k + 2, j]) + np.float64(sample[k + 3, j])
-            first[k, j] = near - sample[k + 1, j] - sample[k + 4, j]
-            second[k, j] = near - sample[k, j] - sample[k + 5, j]
-            details[k, j] = sample[coarse + k + 2, j]
-    return first, second, details
+def _sample(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> _Sample:
+    """Some of the columns, stepped without the third step."""
+    lines = sum(corner.shape[1] for corner, _ in grids)
+    samples = []
+    for corner, step in grids:
+        if step.midpoints and step.run >= FIT_NODES:
+            stride = max(1, min(lines // _SAMPLE_LINES, corner.shape[1]))
+            columns = np.array(corner[:, ::stride], order="C")
+            forward_step(columns, 0, step, (0, 0))
+            samples.append(_surroundings(columns, step.coarse, step.midpoints))
+    if len(samples) == 1:
+        return samples[0]
+    first, second, details = (np.concatenate([sample[i] for sample in samples]) for i in range(3))
+    return _Sample(first, second, details, max(sample.largest for sample in samples))
 
 
-def _least_squares(
-    first: NDArray[np.float64], second: NDArray[np.float64], details: NDArray[np.float64]
-) -> list[tuple[int, int]]:
+def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sample:
+    count, width = midpoints - 5, lines.shape[1]
+    first, second, details = np.empty((3, count * width), np.int32)
+    largest, height = 0, max(1, _AT_ONCE // width)
+    for start in range(0, count, height):
+        stop = min(start + height, count)
+        part = slice(start * width, stop * width)
+        planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
+        largest = max(largest, kernels.predictor_factors(*planes, first[part], second[part], details[part]))
+    return _Sample(first, second, details, largest)
+
+
+def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
     """Fits of 256 d = a u + b w, residuals reweighted towards small ones in turn."""
     found = []
     a = b = 0.0
     for turn in range(5):
-        uu, uw, ww, ud, wd = _moments(first, second, details, a, b, turn > 0)
+        uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
             break
         a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
         found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
     return found
-
-
-@kernel
-def _moments(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    details: NDArray[np.float64],
-    a: float,
-    b: float,
-    weighted: bool,
-) -> tuple[float, float, float, float, float]:
-    """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details; good to 1e-12."""
-    rows, columns = details.shape
-    sums = np.zeros((5, columns))
-    weight = 1.0
-    for i in range(rows):
-        for j in range(columns):
-            u, w, d = first[i, j], second[i, j], details[i, j]
-            if weighted:
-                weight = 1.0 / (1.0 + abs(d - (a * u + b * w) * 0.00390625))
-            sums[0, j] += weight * u * u
-            sums[1, j] += weight * u * w
-            sums[2, j] += weight * w * w
-            sums[3, j] += weight * u * d
-            sums[4, j] += weight * w * d
-    return sums[0].sum(), sums[1].sum(), sums[2].sum(), sums[3].sum(), sums[4].sum()
-
-
-@kernel
-def _bits(
-    first: NDArray[np.float64], second: NDArray[np.float64], details: NDArray[np.float64], a: float, b: float
-) -> float:
-    """About the bits that the details take with (a, b): the sum of log2(1 + |e|), good to 1e-12."""
-    rows, columns = details.shape
-    products = np.empty(columns)
-    total = 0.0
-    for start in range(0, rows, 16):
-        # Sixteen factors of less than 2**37 each are far from overflow: one logarithm does for all of them.
-        products[:] = 1.0
-        for i in range(start, min(start + 16, rows)):
-            for j in range(columns):
-                e = details[i, j] - np.floor((a * first[i, j] + b * second[i, j] + 128.0) * 0.00390625)
-                products[j] *= 1.0 + abs(e)
-        for j in range(columns):
-            total += np.log2(products[j])
-    return total
 
 
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
@@ -303,44 +293,40 @@ def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> ND
                 stepping.append((level, *predictor(predictors, layout.grids[number], step, level, axis)))
         for level in range(layout.levels + 1):
             above = tuple(step for step in stepping if step[0] >= level)
-            lines[axis, level] = [_line_norm(above, max(level, 1), kind) for kind in (0, 1)]
+            lines[axis, level] = _line_norm(above, max(level, 1))
     return lines
 
 
 @lru_cache(maxsize=4096)
-def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int, kind: int) -> float:
-    """Squared norm along one axis of a node (kind 0) or detail (kind 1) of a band of level ``first``.
+def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[float, float]:
+    """Squared norms along one axis of a node and of a detail of a band of level ``first``.
 
     ``stepping``: level and (a, b) of the steps from this level on.
     """
     if not stepping:
-        return 1.0
-    length, line = 16, np.zeros(16)
-    is_node = kind == 0 or stepping[0][0] != first
-    for count, (_, a, b) in enumerate(stepping[:_NORM_LEVELS]):
-        details = np.zeros(length)
-        if count == 0:
-            (line if is_node else details)[length // 2] = 1.0
-        line = _synthesis_line(line, details, a, b)
-        length = line.size
-    return float((line * line).sum()) * 2.0 ** max(0, len(stepping) - _NORM_LEVELS)
+        return 1.0, 1.0
+    nodes, details = np.zeros((2, 2, 16))
+    nodes[0, 8] = 1.0
+    (details if stepping[0][0] == first else nodes)[1, 8] = 1.0
+    for _, a, b in stepping[:_NORM_LEVELS]:
+        nodes = _synthesised(nodes, details, a, b)
+        details = np.zeros_like(nodes)
+    squares = (nodes * nodes).sum(axis=1) * 2.0 ** max(0, len(stepping) - _NORM_LEVELS)
+    return float(squares[0]), float(squares[1])
 
 
-@kernel
-def _synthesis_line(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
-    """One inverse step of a closed line without rounding."""
-    n = nodes.size
-    details = np.empty(n)
-    for k in range(n):
-        near = nodes[k] + nodes[(k + 1) % n]
-        v = a * (near - nodes[(k + 2) % n] - nodes[k - 1]) + b * (near - nodes[(k + 3) % n] - nodes[k - 2])
-        details[k] = surplus[k] + v / 256.0
-    line = np.empty(2 * n)
-    for k in range(n):
-        total = 0.0
-        for j in range(REACH):
-            total += TAPS[j] * (details[(k + j) % n] + details[k - 1 - j])
-        line[2 * k] = nodes[k] - total / 2.0**24
-    for k in range(n):
-        line[2 * k + 1] = details[k] + (line[2 * k] + line[(2 * k + 2) % (2 * n)]) / 2.0
+def _synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
+    """One inverse step of closed lines without rounding; float64, shape (line, sample)."""
+    count = nodes.shape[1]
+    c = np.concatenate([nodes[:, -2:], nodes, nodes[:, :3]], axis=1)
+    before, own, after = (c[:, k : k + count] for k in (1, 2, 3))
+    v = a * (own + after - c[:, 4:-1] - before) + b * (own + after - c[:, 5:] - c[:, :-5])
+    details = surplus + v / 256.0
+    d = np.concatenate([details[:, -REACH:], details, details[:, : REACH - 1]], axis=1)
+    total = np.zeros_like(nodes)
+    for j, tap in enumerate(TAPS):
+        total += tap * (d[:, REACH + j : REACH + j + count] + d[:, REACH - 1 - j : REACH - 1 - j + count])
+    line = np.empty((2, 2 * count))
+    line[:, ::2] = even = nodes - total / 2.0**24
+    line[:, 1::2] = details + (even + np.concatenate([even[:, 1:], even[:, :1]], axis=1)) / 2.0
     return line

@@ -1,4 +1,4 @@
-"""A state of a surface that is being received, and the surface that it shows."""
+"""Views: the states of a surface while its container is being received."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ __all__ = ["View"]
 
 @dataclass(frozen=True)
 class View:
-    """A state of the surface; its points are decoded when they are asked for, also when finer states have come since.
+    """One state of a surface. Its points are computed on request, even if more data have arrived since.
 
     Attributes
     ----------
     number : int
-        Of the layer (of the level, where levels come one after another); the exact end has the next number.
+        Number of the layer, or of the level in level order. The exact end has the next number.
     level : int
-        Finest level with a decoded segment.
+        Finest level of which there are decoded data.
     bytes : int
-        Bytes held of header, layers and exactness.
+        Bytes received of header, layers and exactness.
     rms, max_error : float
-        Measured errors of the full-resolution picture, in the surface's unit.
+        Measured errors at full resolution, in the surface's unit.
     complete : bool
-        Nothing more comes.
+        Whether this is the last state.
     """
 
     number: int
@@ -58,30 +58,30 @@ class View:
 
     @property
     def points(self) -> NDArray[Any]:
-        """The full-resolution picture of the only block, with the dtype and axes of the original.
+        """The points of the only block at full resolution, with the dtype and axes of the original.
 
         Raises
         ------
         InputError
-            When there are several blocks: `surface` has them.
+            If there are several blocks; use `surface`.
         """
         return self.surface().points
 
     def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
-        """The grid of a coarser level, of that level's shape.
+        """The grid of a coarser level, an array with that level's shape.
 
         Parameters
         ----------
         level : int
         block : int, optional
-            Of a surface of several blocks.
+            Number of the block; needed if there are several.
 
         Raises
         ------
         OptionError
-            When there is no such level or block.
+            If there is no such level or block.
         InputError
-            When there are several blocks, and none was named.
+            If there are several blocks and none was given.
         """
         surface = self.surface(level)
         if block is None:
@@ -91,10 +91,10 @@ class View:
         return surface.blocks[block].points
 
     def window(self, region: Region) -> Surface:
-        """A window of the full-resolution picture, for which nothing outside of what it needs is looked at.
+        """The points of a window at full resolution; costs time and memory for the window only.
 
-        Heights on a lattice of their own are exact in it as soon as all that it needs has come, whatever is missing
-        elsewhere: a picture of the whole is computed between lattice steps until then.
+        Heights whose values lie on a lattice (integers, decimals) are exact in the window as soon as the data that it
+        needs have arrived. `points` is exact only when everything has arrived.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class View:
         Raises
         ------
         OptionError
-            When the surface has no such region, or several blocks, or the view shows another region only.
+            If the region is outside the surface, the surface has several blocks, or the view holds another region only.
         """
         header, shown = self._reconstruction.header, self._wish.region
         wish = Wish(region, self._wish.attributes)
@@ -118,21 +118,21 @@ class View:
         return replace(self, _wish=wish, _state=state).surface()
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
-        """The full-resolution picture as a surface, or the grids of a coarser level.
+        """The state as a `Surface`, at full resolution or at a coarser level.
 
         Parameters
         ----------
         level : int, optional
-            Of a coarser level of heights the geotransform spans what the surface spans.
+            A level; None: full resolution. The geotransform of a coarser level spans the same area.
         metadata : mapping, optional
-            In place of the container's own, which are there only as far as they have come.
+            Used instead of the container's metadata, which may not have arrived yet.
 
         Raises
         ------
         OptionError
-            When there is no such level.
+            If there is no such level.
         CorruptStreamError
-            When the complete surface is not the one that was encoded, or nothing that was is finite.
+            If the SHA-256 of the complete surface is wrong, or no value is finite.
         """
         header = self._reconstruction.header
         asked, finest = level is not None, level is None or level == header.levels
@@ -145,7 +145,7 @@ class View:
         digest = self._digest.get(DIGEST)
         region = self._wish.region
         if not finest and region is not None:
-            raise OptionError(f"expected no level of a window but the finest, {header.levels}, got {level}")
+            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
         chosen = self._wish.channels(header)
         if region is None:
             grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)

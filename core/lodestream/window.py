@@ -1,14 +1,14 @@
-"""How much credit a client has outstanding, by what it measures of the link.
+"""How much credit a client keeps outstanding, measured from the link.
 
-Too little leaves the link idle between grants; too much stands in a queue before the slowest part of the way, and still
-has to be taken after a `stop`. What fills a link is the bytes that it carries in one round trip. The window is twice
-that: grants come in steps and the first of them are small, so that a link that was idle for want of credit is given
-twice as much from one round to the next, and one that was busy keeps what it needs.
+With too little credit the link is idle between grants. With too much, data queue in front of the slowest part of the
+link, and still have to be received after a `stop`. A link is busy with as many bytes in flight as it carries in one
+round trip. The window is twice that. It starts small: if the link was idle for lack of credit, it doubles from one
+round trip to the next, otherwise it stays.
 
-Both quantities are measured without sending anything for it. The *round trip* is the shortest time seen between a grant
-and the first byte that only this grant allowed, or what the first answer took: in a queue times are longer, never
-shorter. The *rate* is that of a whole window as it came, over at least a round trip, since bytes that were held up
-somewhere arrive together and prove nothing.
+Both quantities are measured from the stream itself. The *round-trip time* is the shortest time seen between a grant and
+the first byte that only this grant allowed, or the time until the first answer; queues make these times longer, never
+shorter. The *rate* is that at which a whole window arrived, over at least one round trip, because bytes that were held
+up arrive together.
 """
 
 from __future__ import annotations
@@ -24,20 +24,19 @@ _GAIN = 2.0
 
 
 class Window:
-    """The window of one connection, fed with times in seconds of any clock that does not go back.
+    """The window of one connection. Times are seconds of any clock that does not go back.
 
     Parameters
     ----------
     fixed : int or None
-        A size of 1 to `MAX_CREDIT` that stays as it is; None for one between `MIN_WINDOW` and `MAX_CREDIT` that is
-        measured.
+        A constant size, 1 to `MAX_CREDIT`; None: measured, between `MIN_WINDOW` and `MAX_CREDIT`.
 
     Attributes
     ----------
     size : int
         Bytes that may be outstanding now.
     round_trip : float or None
-        Shortest time seen, in seconds.
+        Shortest round-trip time seen, in seconds.
     """
 
     def __init__(self, fixed: int | None = None) -> None:
@@ -52,24 +51,24 @@ class Window:
         self._round: tuple[int, float] | None = None
 
     def heard(self, seconds: float) -> None:
-        """A round trip took at most so long."""
+        """A round trip took at most this long."""
         if seconds > 0 and (self.round_trip is None or seconds < self.round_trip):
             self.round_trip = seconds
 
     def grant(self, size: int, now: float | None = None) -> None:
-        """So many bytes have just been granted."""
+        """This many bytes have just been granted."""
         if now is not None and self._granted:
             self._grants.append((self._granted, now))
         self._granted += size
 
     def restart(self) -> None:
-        """What was granted and has not come will not come any more."""
+        """Forget what was granted and has not arrived; it will not arrive any more."""
         self._granted = self._arrived
         self._grants.clear()
         self._round = None
 
     def arrive(self, size: int, now: float | None = None) -> None:
-        """So many bytes have come and been used."""
+        """This many bytes have arrived and been used."""
         self._arrived += size
         if now is None or not self._measured:
             return

@@ -1,9 +1,9 @@
-"""Who may do what: tokens, and whoever sits at this very machine.
+"""Access control: tokens, and the exception for callers on the same machine.
 
-Without a token one may read where `Settings.public_reads` says so, and do anything where nobody else can be asking:
-the socket and the Host are this machine's, nothing says that a proxy is in between, and no page of another site asks.
-That ends as soon as there is a token, or a proxy that the operator knows of: a proxy on this machine looks like
-somebody who sits at it.
+Without a token a caller may read if `Settings.public_reads` is set. It may do everything if nobody else can be calling:
+the socket and the Host header belong to this machine, no header shows a proxy, and no page of another site is asking.
+This exception ends as soon as there is a token, or a proxy in the settings, because a proxy on this machine looks like
+a caller on this machine.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ _DEFAULT_PORTS = {"http": "80", "https": "443"}
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks.
+    """The caller of a request.
 
     Attributes
     ----------
     key : str
-        What limits for one client count by: a token, or an address (of IPv6 the network).
+        What limits for one client are counted by: a token, or an address (for IPv6 its /64 network).
     name : str
-        What stands in the log.
+        Name for the log.
     owner : str or None
-        Name of the token, to which belongs what is uploaded with it.
+        Name of the token, which owns what is uploaded with it.
     admin : bool
-        May do what the scope ``admin`` allows.
+        Whether the caller may do what the scope ``admin`` allows.
     token : str or None
         Hash of the token.
     """
@@ -59,12 +59,12 @@ class Caller:
     token: str | None = None
 
     def may_delete(self, owner: str | None) -> bool:
-        """Whether a surface of this owner may be removed: by its owner and by an admin."""
+        """Whether this caller may delete a surface of this owner: its owner and an admin may."""
         return self.admin or (owner is not None and owner == self.owner)
 
 
 class Access:
-    """What the server's settings and tokens allow.
+    """Decides what the settings and tokens of a server allow.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ class Access:
     Raises
     ------
     LodestreamError, OSError
-        When the token file cannot be used; when there is no token, and the address can be reached by others without
-        ``insecure``, or pages of any site would be let in.
+        If the token file cannot be used; or if there is no token, and others can reach the address without
+        ``insecure``, or pages of any site would be allowed.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -82,46 +82,46 @@ class Access:
         self._tokens = Tokens(settings.tokens)
         if not (settings.insecure or self._tokens.used or is_loopback(settings.host)):
             raise LodestreamError(
-                f"expected a token, since others can reach {settings.host}, and there is none in {settings.tokens}: "
-                "make one with `lodestream token create`, or serve everything to everybody with --insecure"
+                f"expected a token in {settings.tokens}, since others can reach {settings.host}, got none; create one "
+                "with `lodestream token create`, or allow everything to everybody with --insecure"
             )
 
         anywhere = _ANY_SITE & set(settings.origins)
         if anywhere and not self._tokens.used:
             raise LodestreamError(
-                f"expected a token, since LODESTREAM_ORIGINS={min(anywhere)} lets the pages of all sites in, and there "
-                f"is none in {settings.tokens}: make one with `lodestream token create`, or name the sites"
+                f"expected a token in {settings.tokens}, since LODESTREAM_ORIGINS={min(anywhere)} allows the pages of "
+                "all sites, got none; create one with `lodestream token create`, or name the sites"
             )
 
     @property
     def alone(self) -> bool:
-        """Whether only somebody who sits at this machine can write, so that there is nobody to share with."""
+        """Whether only programs on this machine can write, so that there is nobody to share limits with."""
         return not (self._tokens.used or self._settings.insecure)
 
     def check_origin(self, connection: HTTPConnection) -> None:
-        """Refuse what the page of another site asks.
+        """Refuse requests of pages of other sites.
 
         Raises
         ------
         ForeignOriginError
-            When there is an Origin, and it is neither our own nor one that the settings name.
+            If there is an Origin header that is neither the server's own nor one of the settings.
         """
         for origin in connection.headers.getlist("origin"):
             named = self._settings.origins
             if origin not in named and "*" not in named and not _is_own(origin, connection):
                 raise ForeignOriginError(
-                    f"expected a page of this server or of its origins to ask, got {origin[:80]!a}"
+                    f"expected the origin of this server or one of its setting origins, got {origin[:80]!a}"
                 )
 
     def authorize(self, connection: HTTPConnection, scope: str) -> Caller:
-        """Who asks, once they may do what the scope allows.
+        """The caller, if it may do what the scope allows.
 
         Raises
         ------
         NoTokenError
-            When a token is needed and none came.
+            If a token is needed and there is none.
         BadTokenError, SmallScopeError
-            When the token is not known, or does not allow it.
+            If the token is not known, or does not allow it.
         """
         text = _bearer(connection)
         # A server without tokens cannot tell a good one from a bad one, and whoever sends one gets no more for it.
@@ -129,16 +129,16 @@ class Access:
             return self._holder(text, scope)
         hindrance = self._hindrance(connection, scope)
         if hindrance is not None:
-            raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none, and {hindrance}")
+            raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none; {hindrance}")
         return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
-        """Who opens a stream; None when their ``open`` has to hold a token.
+        """The caller that opens a stream; None if its ``open`` message must contain a token.
 
         Raises
         ------
         BadTokenError, SmallScopeError
-            When there is a token that is not known, or does not allow it.
+            If there is a token that is not known, or does not allow it.
         """
         try:
             return self.authorize(connection, "read")
@@ -146,24 +146,24 @@ class Access:
             return None
 
     def reader_with(self, text: str | None) -> Caller:
-        """Who shows a token in ``open``, where reading needs one.
+        """The caller with the token of an ``open`` message, if reading needs one.
 
         Raises
         ------
         NoTokenError, BadTokenError, SmallScopeError
-            When there is none, or it is not known, or does not allow to read.
+            If there is no token, it is not known, or it does not allow reading.
         """
         if text is None or not self._tokens.used:
-            raise NoTokenError("expected a token with the handshake or in open as the first message, got neither")
+            raise NoTokenError("expected a token in the handshake or in open as the first message, got neither")
         return self._holder(text, "read")
 
     def check(self, caller: Caller) -> None:
-        """Look whether somebody who was let in earlier still may be here.
+        """Check that a caller that was admitted earlier still has access.
 
         Raises
         ------
         BadTokenError
-            When their token was revoked or has expired.
+            If its token was revoked or has expired.
         """
         if caller.token is not None and self._tokens.known(caller.token) is None:
             raise BadTokenError("expected a token that is still valid, got one that was revoked or has expired")
@@ -171,9 +171,9 @@ class Access:
     def _holder(self, text: str, scope: str) -> Caller:
         token = self._tokens.find(text)
         if token is None:
-            raise BadTokenError("expected a token that this server knows, got one that it does not, or no longer")
+            raise BadTokenError("expected a valid token, got one that is unknown, expired or revoked")
         if not token.allows(scope):
-            raise SmallScopeError(f"expected a token that allows to {scope}, got one for {', '.join(token.scopes)}")
+            raise SmallScopeError(f"expected a token with the scope {scope}, got one with {', '.join(token.scopes)}")
         return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
     def _hindrance(self, connection: HTTPConnection, scope: str) -> str | None:
@@ -181,7 +181,7 @@ class Access:
         if scope == "read" and self._settings.public_reads:
             return None
         if self._tokens.used:
-            return f"this server wants one from whoever wants to {scope}"
+            return f"this server needs one for the scope {scope}"
         if self._settings.insecure:
             return None
         return next(_signs_of_others(connection, self._settings), None)
@@ -202,7 +202,7 @@ def _signs_of_others(connection: HTTPConnection, settings: Settings) -> Iterator
 
 
 def key_of(owner: str | None) -> str:
-    """The key of whoever has a token of this name; one for all those who have none, where nothing else is known."""
+    """The key of callers with a token of this name, or of all callers without a token."""
     return "nobody" if owner is None else f"token {owner}"
 
 
@@ -239,7 +239,7 @@ def _bearer(connection: HTTPConnection) -> str | None:
 
 
 def anybody(connection: HTTPConnection) -> Caller:
-    """Whoever asks without a token: an address."""
+    """A caller without a token, known by its address."""
     host = connection.client.host if connection.client is not None else "unknown"
     try:
         address = ipaddress.ip_address(host)

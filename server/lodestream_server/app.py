@@ -1,4 +1,4 @@
-"""The application: its parts, its routes, and its life from start to end."""
+"""The application: its parts, its routes, and its lifetime."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
 import lodestream
+from lodestream.library import require
 
 from . import files, interface, pages, problems, streams, surfaces
 from .access import Access
@@ -32,7 +33,7 @@ __all__ = ["create_app"]
 _DESCRIPTION = """Structured surfaces, coarsest level first.
 
 Upload a surface, wait until it is ready, stream it: `WS /v1/surfaces/{id}/stream`, subprotocol `lodestream.v1`,
-MessagePack messages, described in `docs/protocol.md`. Errors are problem documents (RFC 9457)."""
+MessagePack messages, see `docs/protocol.md`. Errors are problem documents (RFC 9457)."""
 
 
 # What levels take of the disk where the settings say nothing, unless the disk is small.
@@ -41,23 +42,24 @@ _LEAST_LEVEL_DISK = 2 << 20
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """Make the application of one server.
+    """Create the application of one server.
 
     Parameters
     ----------
     settings : Settings or None
-        None takes them from the environment.
+        None: from the environment.
 
     Returns
     -------
     FastAPI
-        An ASGI application. It opens its folder when it starts and leaves it when it ends.
+        An ASGI application. It opens its data folder when it starts and releases it when it ends.
 
     Raises
     ------
     LodestreamError, OSError
-        When there is no token where one is needed, or the token file cannot be used.
+        If the compiled kernels are missing, there is no token although one is needed, or the token file cannot be used.
     """
+    require("serving surfaces")
     chosen = Settings() if settings is None else settings
     access, metrics, pace = Access(chosen), Metrics(), Pace()
 

@@ -1,4 +1,4 @@
-"""Setting aside what cannot be placed: it is moved into ``damaged/``, never deleted."""
+"""Moving files that have no place into ``damaged/``; nothing is deleted."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["set_aside"]
 
 
 def set_aside(at: Folders, path: Path) -> Path:
-    """Move a file or a folder into ``damaged/``; where it is then.
+    """Move a file or folder into ``damaged/``; returns its new path.
 
-    Where that lies on another disk it is copied, and removed here once the copy is on disk and the same.
+    If ``damaged/`` is on another disk, the file is copied, and removed here once the copy is on disk and equal.
 
     Raises
     ------
     OSError
-        When it cannot be moved; then it still lies where it lay.
+        If it cannot be moved; it is then unchanged.
     """
     folder = at.damaged / path.parent.relative_to(at.root)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The bytes of requests, counted as h11 reads them: how much of a body is to come, and what its chunks cost."""
+"""HTTP request bodies, counted as h11 reads them: how much of a body is still to come, and what its chunks cost."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _FRAMING = 256 * 1024
 
 
 class CountedConnection(h11.Connection):
-    """The server's side of HTTP/1.1, which counts the bytes and chunks of each request.
+    """The server's side of HTTP/1.1, with counts of the bytes and chunks of each request.
 
     Attributes
     ----------
     chunks : int
-        Chunks that have begun, of all requests.
+        Number of chunks that have begun, of all requests.
     offence : str or None
-        What was wrong with the chunks of a body, once it was; `next_event` raises then.
+        What is wrong with the chunks of a body, once something is; `next_event` then raises.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class CountedConnection(h11.Connection):
 
     @property
     def remaining(self) -> int:
-        """Bytes of the body that are to come, where it says how long it is."""
+        """Bytes of the body that are still to come, if its length was announced."""
         return self._promised - self._taken if self._whole else 0
 
     def receive_data(self, data: bytes) -> None:
@@ -57,12 +57,12 @@ class CountedConnection(h11.Connection):
         super().receive_data(data)
 
     def next_event(self) -> Any:
-        """As h11 does it.
+        """Like h11's.
 
         Raises
         ------
         h11.RemoteProtocolError
-            Also when the chunks of a body are too small.
+            Also if the chunks of a body are too small.
         """
         event = super().next_event()
         if isinstance(event, h11.Request):
@@ -72,7 +72,7 @@ class CountedConnection(h11.Connection):
         return event
 
     def send(self, event: h11.Event) -> Any:
-        """As h11 does it; an answer to a request of which much is to come says that it is the last one."""
+        """Like h11's; adds ``Connection: close`` if much of the request's body has not arrived."""
         if type(event) is h11.Response and self.their_state is h11.SEND_BODY and not self._ends_soon():
             headers = [header for header in event.headers if header[0] != b"connection"] + [(b"connection", b"close")]
             event = h11.Response(status_code=event.status_code, headers=headers, reason=event.reason)
@@ -96,12 +96,12 @@ class CountedConnection(h11.Connection):
         if event.chunk_start:
             self.chunks += 1
             if not self._allowed.take():
-                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on the whole, got smaller ones")
+                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on average, got smaller ones")
             if self._came > 2 * self._taken + _FRAMING:
                 self._refuse(
-                    f"less around chunks than in them, got {self._came} bytes with {self._taken} bytes of body"
+                    f"less framing than data in a chunked body, got {self._came} bytes with {self._taken} bytes of data"
                 )
 
     def _refuse(self, words: str) -> None:
-        self.offence = f"expected {words}; send larger chunks, or the length of the body with it"
+        self.offence = f"expected {words}; send larger chunks, or Content-Length"
         raise h11.RemoteProtocolError(self.offence)

@@ -1,6 +1,6 @@
-"""What follows from the machine and the settings: bounds that no operator has to choose.
+"""Limits that follow from the machine and the settings, so that no operator has to choose them.
 
-A program that starts a server by itself (`create_app`, `running_server`) may choose others; the tests do.
+A program that starts a server by itself (`create_app`, `running_server`) may set them; the tests do.
 """
 
 from __future__ import annotations
@@ -25,45 +25,52 @@ def _follows(least: int, meaning: str) -> Any:
 
 
 class Bounds(BaseModel):
-    """Bounds of a server; None where the value follows from what there is at the start, as its description says."""
+    """Limits of a server. None: the value is computed when the server starts, as the description says."""
 
-    upload_files: int = _count(64, "files of one upload")
-    max_uploads: int = _count(64, "uploads at the same time")
+    upload_files: int = _count(64, "files in one upload")
+    max_uploads: int = _count(64, "uploads in progress")
     max_vertices: int = _count(1 << 28, "vertices of one surface")
-    max_surfaces: int = _count(100_000, "surfaces")
+    max_surfaces: int = _count(100_000, "surfaces on the server")
     owner_bytes: int | None = _follows(
         1,
-        "bytes on the disk, of uploads and containers, of one token's name, or of all those without a token together: "
-        "as much as stays free beside them; no limit where only this machine can write",
+        "bytes on disk, uploads and containers, of one owner (a token's name, or all callers without a token "
+        "together): half of what the owner has there plus what is free; no limit while only programs on this machine "
+        "can write",
     )
     max_connections: int | None = _follows(
-        1, "connections of all kinds: 5000, or as many as the limit of open files (ulimit -n) is enough for"
+        1, "connections of all kinds: 5000, or fewer if the limit of open files (ulimit -n) does not allow as many"
     )
     max_streams: int = _count(
-        2000, "streams at the same time, and beside them as many connections that have yet to show a token"
+        2000, "open streams; in addition as many connections whose first message, with the token, has not arrived"
     )
-    max_client_streams: int = _count(1000, "streams at the same time of one token, or without one of one address")
-    max_level_requests: int = _count(32, "requests for levels that wait at the same time")
+    max_client_streams: int = _count(1000, "open streams of one token, or of one address without a token")
+    max_level_requests: int = _count(32, "requests for levels as files that wait at the same time")
     max_client_level_requests: int = _count(
-        16, "requests for levels of one client at the same time, counted until the answer has been read"
+        16, "requests of one client for levels as files; each counts until the client has read its answer"
     )
     level_memory: int | None = _follows(
-        256 << 20, "memory of the process that makes levels as files, one at a time: half of `memory`, at least 1 GiB"
+        256 << 20, "memory of the process that makes a level as a file: half of `memory`, but at least 1 GiB"
     )
     level_disk: int | None = _follows(
         2 << 20,
-        "disk space for levels as files, of which one may take a quarter: 4 GiB, or a twentieth of the disk if that is "
-        "less",
+        "disk space for levels as files, of which one file may use a quarter: 4 GiB, or a twentieth of the disk if "
+        "that is less",
     )
     max_builds: int = _count(1000, "builds that wait or run")
-    build_memory: int | None = _follows(256 << 20, "memory of one build: `memory` divided by `workers`")
-    build_seconds: float = _seconds(3600.0, "time of one build, and its processor time")
-    level_seconds: float = _seconds(120.0, "time in which one level is made")
+    build_memory: int | None = _follows(
+        256 << 20, "memory of one build: `memory` divided by `workers`, but at least 512 MiB"
+    )
+    build_seconds: float = _seconds(3600.0, "seconds that one build may take, by the clock and in processor time")
+    level_seconds: float = _seconds(120.0, "seconds that making one level as a file may take")
     idle_seconds: float = _seconds(
-        60.0, "silence of a client, in a stream, an upload or an answer that it does not take"
+        60.0, "seconds for which a client may send nothing of an upload, do nothing in a stream, or not read its answer"
     )
     upload_rate: int = Field(
-        default=1024, ge=0, description="least bytes a second of an upload, over each stretch of `idle_seconds`"
+        default=1024,
+        ge=0,
+        description="bytes a second that an upload must reach at least, on average over each `idle_seconds`",
     )
-    head_seconds: float = _seconds(20.0, "time in which the head of a request has to come, or the token of a stream")
-    bye_seconds: float = _seconds(10.0, "wait for a client's bye after the end of a stream")
+    head_seconds: float = _seconds(
+        20.0, "seconds until the head of a request is complete, or until the token of a stream has arrived"
+    )
+    bye_seconds: float = _seconds(10.0, "seconds that the server waits for the client's bye after the end of a stream")

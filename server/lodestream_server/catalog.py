@@ -1,4 +1,4 @@
-"""The records of all surfaces in memory, found by what they have in common."""
+"""The records of all surfaces in memory, with indexes by upload, hash and container."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Position = tuple[float, str]
 
 @dataclass
 class _Thing:
-    """An upload or a container on the disk that is one owner's, and how many of the owner's surfaces have it."""
+    """An upload or container of one owner on disk, and how many of the owner's surfaces use it."""
 
     size: int
     users: int = 0
@@ -38,9 +38,9 @@ def _on_disk(record: Record) -> Iterator[tuple[str, int]]:
 
 
 class Catalog:
-    """Records by id, by upload, by container, and in the order in which they were made.
+    """Records by id, by upload, by container, and in order of creation.
 
-    Changes want a lock; reading does not: each look is one step of the interpreter.
+    Changes need a lock. Reads do not: each is one atomic step of the interpreter.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Catalog:
         return self._records.get(surface)
 
     def put(self, record: Record) -> None:
-        """Add a record, or replace that of the same surface, which is known all the while."""
+        """Add a record, or replace the record of the same surface; the surface stays visible all the time."""
         before = self._records.get(record.id)
         self._records[record.id] = record
         self._count(record, 1)
@@ -83,14 +83,14 @@ class Catalog:
             self._forget(before, record)
 
     def drop(self, surface: str) -> None:
-        """Forget a surface, if it is known."""
+        """Remove a surface, if it is there."""
         record = self._records.pop(surface, None)
         if record is not None:
             self._discharge(record)
             self._forget(record)
 
     def kept(self, owner: str | None) -> int:
-        """Bytes of the uploads and containers of an owner's surfaces; those that several of them share count once."""
+        """Bytes of an owner's uploads and containers; shared ones count once."""
         return self._bytes.get(owner, 0)
 
     def _charge(self, record: Record) -> None:
@@ -139,20 +139,20 @@ class Catalog:
         return self._known(self._order[:])
 
     def after(self, position: Position, most: int) -> list[Record]:
-        """At most so many records that come after a place in the order."""
+        """At most `most` records that come after a position in the order."""
         start = bisect_right(self._order, position)
         return self._known(self._order[start : start + most])
 
     def of_digest(self, sha256: str) -> Iterator[Record]:
-        """The surfaces that were made of files with this hash."""
+        """The surfaces whose uploaded files have this hash."""
         return self._chosen(self._digests, sha256)
 
     def has_upload(self, folder: str) -> bool:
-        """Whether there is a surface whose uploaded files lie in a folder of this name."""
+        """Whether a surface uses the upload folder of this name."""
         return folder in self._uploads
 
     def has_container(self, sha256: str) -> bool:
-        """Whether there is a surface that has a container, or had it before it was lost."""
+        """Whether a surface has a container, or had it before the container was lost."""
         return sha256 in self._containers
 
     def of_container(self, sha256: str) -> list[str]:
@@ -160,18 +160,18 @@ class Catalog:
         return list(self._containers.get(sha256, ()))
 
     def one_of_container(self, sha256: str) -> Record | None:
-        """One of the surfaces that have a container, or had it before it was lost; they say the same of it."""
+        """One of the surfaces that have a container or had it before it was lost; all describe it in the same way."""
         surface = next(iter(tuple(self._containers.get(sha256, ()))), None)
         return None if surface is None else self._records.get(surface)
 
     def serves(self, sha256: str) -> bool:
-        """Whether a surface that is ready has a container."""
+        """Whether a ready surface has this container."""
         return sha256 in self._served
 
     def has_size(self, size: int | None, *, form: bool) -> bool:
-        """Whether there may be an upload of a size that did not fail; a form is larger than what is in it.
+        """Whether an upload of this size that did not fail may exist; a form is larger than its contents.
 
-        It does not look at each: a form that is smaller than all uploads passes as well.
+        It does not check every upload: for a form the answer may be True although none fits.
         """
         return bool(self._sizes) if size is None or form else size in self._sizes
 

@@ -1,6 +1,6 @@
-"""``lodestream serve``, which the command line finds through the entry points of the group ``lodestream.commands``.
+"""The command ``lodestream serve``, found through the entry points of the group ``lodestream.commands``.
 
-Only what the parser needs is imported here: whoever runs another command does not wait for the web framework.
+Only what the parser needs is imported here, so that other commands do not wait for the web framework.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "serve",
         help="start a server",
-        description="Start a server. Each option is an environment variable too: --upload-bytes is "
-        "LODESTREAM_UPLOAD_BYTES. The command line wins. Sizes may be written like 500MB or 4GiB.",
+        description="Start a server. Each option can also be set by an environment variable: --upload-bytes by "
+        "LODESTREAM_UPLOAD_BYTES. The command line takes precedence. Sizes may be written like 500MB or 4GiB.",
         allow_abbrev=False,
     )
     groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
@@ -34,7 +34,7 @@ def register(subparsers: Any) -> None:
 
 
 def add_option(parser: Any, setting: Setting) -> None:
-    """Offer a setting as an option; what is not given is None, so that the environment is asked."""
+    """Add a setting as an option. Its default is None, so that the environment is used."""
     words = f"{setting.meaning} (default: {setting.default_text})".replace("%", "%%")
     if setting.default is False:
         parser.add_argument(setting.option, action=argparse.BooleanOptionalAction, help=words)
@@ -55,15 +55,14 @@ def _type(setting: Setting) -> Callable[[str], Any]:
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Run a server until it is told to end; the exit code.
+    """Run a server until it is told to end; returns the exit code.
 
     Raises
     ------
     OptionError
-        When a variable of the environment has a value that cannot be used.
+        If an environment variable has an invalid value.
     LodestreamError, OSError
-        When others can reach the address, and there is no token; or the data folder cannot be used, or not all of it
-        is there.
+        If others can reach the address and there is no token, or the data folder cannot be used or is not complete.
     """
     settings = chosen_settings(args)
     from .logs import configure
@@ -79,12 +78,12 @@ def serve(args: argparse.Namespace) -> int:
 
 
 def chosen_settings(args: argparse.Namespace) -> Settings:
-    """What the command line says, and the environment where it says nothing.
+    """The settings of the command line, completed from the environment.
 
     Raises
     ------
     OptionError
-        When a variable of the environment has a value that cannot be used.
+        If an environment variable has an invalid value.
     """
     from pydantic import ValidationError
 

@@ -1,8 +1,8 @@
-"""HTTP connections that do not wait for ever, and read only so much that nobody wants.
+"""HTTP connections with limits on waiting and reading.
 
-They wait for the head of a request, and for a client to take an answer, only so long. What comes is looked at in small
-pieces, so that others have their turn between them. Of a request that was answered before it was whole a bounded rest
-is read, so that the client sees the answer; then the connection is cut.
+The head of a request must arrive in time, and a client must read its answer in time. Received data are processed in
+small pieces, so that other connections get their turn. If a request is answered before all of it has arrived, a bounded
+rest is read so that the client sees the answer; then the connection is cut.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _CHUNKS_A_TURN = 16
 _REST_SECONDS = 3.0
 
 _TITLES = {
-    "bad-request": "Not a request",
-    "busy": "As much to do as the server can; come back",
-    "idle": "Nothing was heard for too long",
-    "small-chunks": "A body in chunks that are too small",
+    "bad-request": "Not a valid request",
+    "busy": "The server is busy; try again later",
+    "idle": "The client was too slow",
+    "small-chunks": "The chunks of the body are too small",
 }
 
 
 def connections(settings: Settings, cuts: Cuts, pace: Pace) -> type[H11Protocol]:
-    """The class of a server's connections; uvicorn makes one for each."""
+    """The class of a server's HTTP connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         head_seconds = settings.head_seconds
@@ -98,7 +98,7 @@ class _Connection(H11Protocol):
         super().connection_made(cast(asyncio.Transport, self._guarded))
         self._watch = _Watch(transport, self.loop, self.idle_seconds)
         if len(self.connections) > self.most:
-            self._refuse(503, "busy", f"expected at most {self.most} connections; come back in a few seconds")
+            self._refuse(503, "busy", f"expected at most {self.most} connections; try again in a few seconds")
         else:
             self._follow_head()
 
@@ -149,7 +149,7 @@ class _Connection(H11Protocol):
         code = "bad-request" if self.conn.offence is None else "small-chunks"
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             self.cuts.note(code, self.client)
-            self._refuse(400, code, self.conn.offence or "expected a request of HTTP/1.1 that can be read")
+            self._refuse(400, code, self.conn.offence or "expected a valid HTTP/1.1 request")
         else:
             # The answer is under way already, or was sent.
             self._cut(code)
@@ -251,7 +251,7 @@ class _Connection(H11Protocol):
     def _head_is_late(self) -> None:
         self._head_timer = None
         if self.conn.our_state is h11.IDLE:
-            self._refuse(408, "idle", f"expected the whole head of a request within {self.head_seconds:g} s")
+            self._refuse(408, "idle", f"expected the complete head of a request within {self.head_seconds:g} s")
         else:
             self._cut("refused-body")
 

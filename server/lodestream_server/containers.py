@@ -1,4 +1,4 @@
-"""Stored containers as they are read: open files, and their indexes."""
+"""Stored containers that are open for reading, and their indexes."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ _NOWAIT = getattr(os, "RWF_NOWAIT", 0)
 
 @dataclass(frozen=True)
 class OpenContainer:
-    """A container open for reading; deleting it does not disturb whoever reads it."""
+    """A container that is open for reading; it stays readable if it is deleted meanwhile."""
 
     sha256: str
     index: Index
     file: BinaryIO
 
     def read(self, place: ByteRange) -> bytes:
-        """The bytes of a slice, fewer where the file ends; from any thread."""
+        """Read a slice; fewer bytes if the file ends. May be called from any thread."""
         return read_from(self.file.fileno(), place.offset, place.length)
 
     def read_at_once(self, place: ByteRange) -> bytes | None:
-        """The same without waiting for a disk: None where the system would have to, or cannot tell."""
+        """Read a slice if that needs no disk access; None if it would, or if the system cannot tell."""
         if not _NOWAIT:
             return None
         buffer = bytearray(place.length)
@@ -63,13 +63,13 @@ class OpenContainer:
 
 
 class Containers:
-    """The containers of a storage, with the indexes used last and those of all that are open.
+    """The containers of a storage, with the indexes of open containers and the most recently used others.
 
     Parameters
     ----------
     storage : Storage
     most : int or None
-        Bytes of memory that all indexes may take; None for `most_for_indexes`.
+        Bytes of memory that all indexes may take; None: `most_for_indexes`.
     """
 
     def __init__(self, storage: Storage, most: int | None = None) -> None:
@@ -87,13 +87,13 @@ class Containers:
         Raises
         ------
         NotFoundError
-            When there is none.
+            If there is none.
         MissingError
-            When it is not on the disk.
+            If it is not on disk.
         StreamError
-            When it is damaged.
+            If it is damaged.
         BusyError
-            When the indexes of those that are open leave no room for its own.
+            If the indexes of open containers leave no memory for its index.
         """
         try:
             file = self._storage.container(sha256).open("rb")
@@ -138,7 +138,7 @@ class Containers:
             if taken + size > self._most:
                 raise BusyError(
                     f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
-                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; come back soon"
+                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; try again soon"
                 )
             self._coming += size
         try:
@@ -168,12 +168,12 @@ class _Reader:
 
 
 def most_for_indexes() -> int:
-    """Bytes of memory that indexes may take: an eighth of what there is."""
+    """Bytes of memory that indexes may take: an eighth of the memory available."""
     return memory_limit() // 8
 
 
 def index_memory(file: BinaryIO) -> int:
-    """Bytes that the index of a container will take in memory, by its footer; 0 where there is none."""
+    """Bytes of memory that a container's index will take, computed from the footer; 0 if there is no footer."""
     from lodestream.container.reader import INDEX_GROWTH
     from lodestream.container.sections import FOOTER_LENGTH, parse_footer
 
@@ -198,7 +198,7 @@ def _read_index(file: BinaryIO) -> Index:
 
 
 def read_from(handle: int, offset: int, length: int) -> bytes:
-    """Bytes of a file, fewer where it ends; the system may give fewer at a time for other reasons."""
+    """Read bytes of a file, fewer if it ends; repeats reads that the system cuts short."""
     data = bytearray()
     while len(data) < length:
         piece = os.pread(handle, length - len(data), offset + len(data))

@@ -1,4 +1,4 @@
-"""What a connection may cost before it is cut, and what is written down of those that were."""
+"""Limits for connections that are cut when they exceed them, and the record of those that were."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ REASONS = ("bad-request", "control-data", "fragments", "frames", "refused-body",
 
 
 class Allowance:
-    """How many of something may come: so many at once, so many more each second, and what is earned.
+    """A token bucket: so many at once, so many more each second, and more that are earned.
 
     Parameters
     ----------
     most : float
-        How many may come at once.
+        How many are allowed at once.
     rate : float
-        How many more may come for each second.
+        How many more are allowed each second.
     """
 
     __slots__ = ("_left", "_most", "_rate", "_seen")
@@ -36,19 +36,19 @@ class Allowance:
         self._seen = time.monotonic()
 
     def take(self) -> bool:
-        """Count one; whether it was still allowed."""
+        """Count one; returns whether it was allowed."""
         now = time.monotonic()
         self._left = min(self._most, self._left + (now - self._seen) * self._rate) - 1
         self._seen = now
         return self._left >= 0
 
     def earn(self, number: float) -> None:
-        """Allow more, but never more at once than at the beginning."""
+        """Allow more, up to the initial number."""
         self._left = min(self._most, self._left + number)
 
 
 class Cuts:
-    """The connections of a server that were cut: each is counted, and the log has a line for each reason (`repeats`).
+    """Records connections that were cut: counts them in the metrics and logs a line for each reason (`repeats`).
 
     Parameters
     ----------
@@ -59,14 +59,14 @@ class Cuts:
         self._metrics = metrics
 
     def note(self, reason: str, client: tuple[str, int] | None) -> None:
-        """Write down that a connection was cut.
+        """Record that a connection was cut.
 
         Parameters
         ----------
         reason : str
             One of `REASONS`.
         client : (host, port) or None
-            Whose connection it was.
+            Address of the client.
         """
         self._metrics.failed(reason)
         event(_log, f"connection cut: {reason}", logging.WARNING, client=client[0] if client else None)

@@ -1,4 +1,4 @@
-"""What the operator is told of a container that turns out to be damaged while it is read."""
+"""The log message about a container that turns out to be damaged when it is read."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ _MOST_NAMES = 5
 
 
 def tell(storage: Storage, sha256: str, error: StreamError) -> None:
-    """Log that a container is damaged, of which surfaces, and what to do; repetitions are counted (`repeats`).
+    """Log that a container is damaged, which surfaces have it, and what to do; repetitions are counted (`repeats`).
 
-    ``lodestream_errors_total`` has each of them as ``damaged``, where it is answered.
+    ``lodestream_errors_total`` counts each of them as ``damaged`` when the request is answered.
 
     Parameters
     ----------
     storage : Storage
     sha256 : str
-        The container's name.
+        Name of the container.
     error : StreamError
-        What is wrong with it. It may differ from time to time, hence it is a field and not part of the line.
+        What is wrong. It is a field of the log record and not part of the line, because it may differ from time to
+        time.
     """
     surfaces = storage.surfaces_of(sha256)
     named = ", ".join(surfaces[:_MOST_NAMES]) or "none"
     more = f" and {len(surfaces) - _MOST_NAMES} more" if len(surfaces) > _MOST_NAMES else ""
     event(
         _log,
-        f"{storage.place_of(sha256)} is damaged, the container of surface {named}{more}: stop the server and run "
+        f"{storage.place_of(sha256)}, the container of surface {named}{more}, is damaged: stop the server and run "
         f"lodestream fsck --repair {storage.root}, which builds it again from its upload",
         logging.ERROR,
         problem=str(error),

@@ -1,4 +1,4 @@
-"""The page ``/docs``: the OpenAPI document as HTML, made here, so that it needs no script and no other host."""
+"""The page ``/docs``: the OpenAPI document as HTML, without scripts and without resources of other hosts."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def render(document: Mapping[str, Any], address: str) -> str:
     Parameters
     ----------
     document : mapping
-        OpenAPI, as `lodestream_server.interface.describe` makes it.
+        The OpenAPI document of `lodestream_server.interface.describe`.
     address : str
-        Where the document itself is.
+        URL of that document.
     """
     info = document["info"]
     return "".join(

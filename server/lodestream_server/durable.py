@@ -1,7 +1,7 @@
-"""Files that are on disk, whole, when these functions return: everything that the server keeps goes through here.
+"""Writing files that survive a power failure; the server makes all changes of its folder through this module.
 
-Every step that changes the disk is a method of `Disk`, and all of them are made on one object, `disk`: tests put
-another there, to fill the disk at any step or to lose what was never synchronised.
+Every step that changes the disk is a method of `Disk`, called on the one object `disk`. Tests replace it, to simulate a
+full disk at any step or the loss of everything that was not synchronised.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _log = logging.getLogger(__name__)
 
 
 class Disk:
-    """The steps in which the server changes its folder, each of which may fail for want of space."""
+    """The steps in which the server changes its folder; each may fail for lack of space."""
 
     def make_folder(self, path: Path) -> None:
-        """Make a folder, its owner's alone."""
+        """Create a folder that only its owner can access."""
         path.mkdir(0o700)
 
     def create(self, path: Path) -> BinaryIO:
-        """Open a new file for writing, its owner's alone from the first byte."""
+        """Open a new file for writing that only its owner can access."""
         # Unbuffered: the bytes reach the file in `write`, and nothing is left to fail when it is closed.
         return open(path, "xb", buffering=0, opener=_private)
 
@@ -39,19 +39,19 @@ class Disk:
             rest = rest[file.write(rest) :]
 
     def sync(self, handle: int, path: Path) -> None:
-        """Put a file's bytes, or a folder's names, on disk."""
+        """Synchronise a file's bytes, or the names in a folder, to disk."""
         os.fsync(handle)
 
     def rename(self, source: Path, target: Path) -> None:
-        """Give a file or folder another name, in place of what has it."""
+        """Rename a file or folder, replacing what has the new name."""
         source.replace(target)
 
     def unlink(self, path: Path) -> None:
-        """Remove a file, if there is one."""
+        """Remove a file, if it exists."""
         path.unlink(missing_ok=True)
 
     def remove_folder(self, path: Path) -> None:
-        """Remove a folder with what is in it."""
+        """Remove a folder with its contents."""
         with suppress(RecursionError):  # one that was made to be too deep
             shutil.rmtree(path, ignore_errors=True)
         if path.is_dir():
@@ -83,9 +83,9 @@ disk = Disk()
 
 
 class NewFile:
-    """A file being written, of which nothing remains unless it was kept.
+    """A file being written. It is removed if the ``with`` block fails.
 
-    It is on disk when the ``with`` block ends; whoever writes it then renames it, or the folder around it.
+    When the block ends, the file is on disk. The caller then renames it, or the folder around it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,13 +118,13 @@ class NewFile:
 
 
 def make_folder(path: Path) -> Path:
-    """Make a folder; its name is on disk once the folder around it is synchronised."""
+    """Create a folder; its name is on disk once the parent folder is synchronised."""
     disk.make_folder(path)
     return path
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file, or replace one: at every moment it is the old one or the new one."""
+    """Write or replace a file atomically: at every moment it has the old or the new contents."""
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(8)}.new")
     with NewFile(temporary) as file:
         file.write(data)
@@ -136,13 +136,13 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def rename(source: Path, target: Path) -> None:
-    """Give a file or folder that is on disk its final place; where that fails it keeps its own."""
+    """Give a file or folder that is on disk its final name; if that fails it keeps the old one."""
     disk.rename(source, target)
     sync_folder(target.parent)
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder with what is in it; nothing happens if there is none."""
+    """Remove a file, or a folder with its contents; does nothing if there is none."""
     if path.is_dir() and not path.is_symlink():
         disk.remove_folder(path)
     else:
@@ -150,18 +150,18 @@ def remove(path: Path) -> None:
 
 
 def discard(path: Path) -> None:
-    """Remove what nobody needs any more; where that fails it stays until the next start, and the log says so.
+    """Remove something that is no longer needed; if that fails, log it and leave it for the next start to remove.
 
-    For what a start sweeps away: whatever was done before is done all the same.
+    For files whose removal does not matter to the caller: the work before was successful in any case.
     """
     try:
         remove(path)
     except OSError as error:
-        _log.warning("%s is not needed any more, and could not be removed: %s", path, error.strerror or error)
+        _log.warning("%s is no longer needed, but could not be removed: %s", path, error.strerror or error)
 
 
 def sync_folder(path: Path) -> None:
-    """Put the names in a folder on disk."""
+    """Synchronise the names in a folder to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         disk.sync(handle, path)

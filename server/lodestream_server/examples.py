@@ -1,4 +1,4 @@
-"""What OpenAPI shows: one surface through its life, and the shapes of bodies that the framework does not see."""
+"""Examples for OpenAPI: one surface in each state, and the shapes of bodies that the framework does not know."""
 
 from __future__ import annotations
 
@@ -71,23 +71,23 @@ UPLOAD: dict[str, Any] = {
         for name, description, values, example in (
             (
                 "precision",
-                "greatest error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P is for "
-                "the attribute NAME; may be repeated",
+                "maximum error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P sets it "
+                "for the attribute NAME; may be repeated",
                 None,
                 "1e-4d",
             ),
             (
                 "rms",
-                "root mean square error, in the same words: the shortest stream that has it at most, made for nothing "
-                "else; not beside a precision of the points",
+                "encode for this root mean square error, in the same notation; cannot be combined with a precision of "
+                "the points",
                 None,
                 "1e-3d",
             ),
-            ("closed", "axes that wrap", ["auto", "none", "rows", "cols", "both"], None),
-            ("name", "what to call the surface", None, "Jacksboro"),
-            ("filename", "name of a raw body's file", None, "jacksboro.npy"),
-            ("array", "of an NPZ file: name of the array", None, None),
-            ("band", "of a GeoTIFF file: number of the band", None, None),
+            ("closed", "closed axes", ["auto", "none", "rows", "cols", "both"], None),
+            ("name", "name of the surface", None, "Jacksboro"),
+            ("filename", "name of the file of a raw body", None, "jacksboro.npy"),
+            ("array", "NPZ: name of the array", None, None),
+            ("band", "GeoTIFF: number of the band", None, None),
         )
     ],
     "requestBody": {
@@ -122,7 +122,7 @@ PROBLEM_SCHEMA: dict[str, Any] = {
 
 
 def answer(description: str, example: dict[str, Any], *, location: bool = False) -> dict[str, Any]:
-    """A response of OpenAPI with an example."""
+    """An OpenAPI response with an example."""
     documented: dict[str, Any] = {
         "description": description,
         "content": {"application/json": {"schema": {"type": "object"}, "example": example}},

@@ -1,4 +1,4 @@
-"""The routes of containers and levels: what is fetched as a file."""
+"""The routes of containers and levels, which are fetched as files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
 )
 @needs("read")
 async def find(request: Request, parts: Parts, surface: str) -> Response:
-    """Redirect to the container; while it is being built, 409 with Retry-After."""
+    """Redirect to the container; 409 with Retry-After while it is being built."""
     record = ready(parts, surface)
     address = f"{request.scope.get('root_path', '')}{router.prefix}/containers/{record.container}.lode"
     return RedirectResponse(address, headers={"cache-control": "no-cache"})
@@ -60,7 +60,7 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
 )
 @needs("read")
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
-    """A container never changes: its name is the hash of its content, which is its strong ETag."""
+    """A container never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
     path = parts.storage.container(sha256)
     etag = f'"{sha256}"'
     # What needs a token must not come out of a shared cache for those who have none.
@@ -103,7 +103,7 @@ async def level(
     level: int,
     format_name: Annotated[str, Query(alias="format", description=", ".join(MEDIA_TYPES))] = "npy",
 ) -> Response:
-    """The grid of one level, 0 being the coarsest: what ``lodestream decode --level`` writes."""
+    """The grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes."""
     record = ready(parts, surface)
     _check(record, level, format_name)
     etag = f'"{record.container}-{level}-{format_name}"'
@@ -139,7 +139,7 @@ class _File(FileResponse):
             if not complete:
                 raise
             # The connection would be cut, perhaps with the client's next request on it.
-            _log.warning("%s was sent, and could not be closed: %s", self.path, error.strerror or error)
+            _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
 
 
 class _Borrowed(_File):
@@ -162,22 +162,22 @@ def ready(parts: State, surface: str) -> Record:
     Raises
     ------
     NotFoundError
-        When there is no such surface.
+        If there is no such surface.
     NotReadyError, PostponedError, BuildFailedError
-        When it has none yet, has to be tried again, or never will.
+        If it is still being built, waits for a retry, or has failed.
     MissingError
-        When it is not on the disk now.
+        If it is not on disk now.
     """
     record = parts.storage.get(surface)
     if record.state == "failed":
         raise BuildFailedError(f"{surface} could not be built: {record.reason}")
     if record.state == "waiting":
-        raise PostponedError(f"{surface} could not be built and waits for another attempt: {record.reason}")
+        raise PostponedError(f"{surface} could not be built and waits for a retry: {record.reason}")
     if record.state == "missing":
-        raise MissingError(f"expected {surface} on the server's disk: {record.reason}")
+        raise MissingError(f"{surface} is not on the server's disk now: {record.reason}")
     if record.state != "ready":
         state, progress = parts.builder.state(record)
-        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); come back soon")
+        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); try again soon")
     return record
 
 

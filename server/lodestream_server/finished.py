@@ -1,8 +1,8 @@
-"""Containers that are uploaded: there is nothing to build, so they are looked through and kept as they came.
+"""Uploaded containers: they are not built but checked, and kept unchanged.
 
-Of such a surface the upload is the container. Whatever may lie in it was written by a stranger, so all of it is checked
-and decoded once, in a build's process and under a build's limits; see `lodestream.inspection`. If the container is lost
-it is checked and copied again, and never encoded again.
+The upload of such a surface is its container. A stranger wrote it, so all of it is checked and decoded once, in a build
+process and under the limits of a build; see `lodestream.inspection`. If the container is lost, it is checked and copied
+again from the upload, and never encoded again.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _MOST_SECTIONS = 10_000
 
 
 def is_container(path: Path) -> bool:
-    """Whether a file begins like a container, of whichever version."""
+    """Whether a file begins like a container, of any version."""
     from lodestream.container.sections import SIGNATURE, is_container
 
     with path.open("rb") as file:
@@ -50,37 +50,34 @@ def is_container(path: Path) -> bool:
 
 
 def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
-    """Refuse an upload, some file of which is a container, where the first bytes show that it is wrong.
+    """Check an upload that includes a container, as far as its first bytes allow.
 
     Parameters
     ----------
     files : sequence of Path
     options : collection of str
-        All that was asked for but a name.
+        Names of the given options, except ``name`` and ``filename``.
 
     Returns
     -------
     Format
-        One that the library's table does not have: nothing is read from a container but itself.
+        A format that is not in the library's table, because containers are not read but decoded.
 
     Raises
     ------
     FormatError
-        When there are other files beside it.
+        If there are other files beside the container.
     OptionError
-        When there is any option.
+        If there is any option.
     TooLargeError
-        When its metadata are longer than a container's may be.
+        If its metadata are longer than allowed.
     """
     from lodestream.formats import Format
 
     if len(files) > 1:
         raise FormatError(f"expected a container by itself, got it among {len(files)} files")
     for option in options:
-        raise OptionError(
-            "expected no option but name and filename with a container, which says all else itself, "
-            f"got {option[:80]!a}"
-        )
+        raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
     _check_metadata(files[0])
     return Format("lode", (".lode",), lambda head, suffix: False)
 
@@ -98,15 +95,15 @@ def _check_metadata(path: Path) -> None:
 
 
 def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, str]:
-    """Check the container that was uploaded, and copy it to a path; its SHA-256, and whose word its errors are.
+    """Check an uploaded container, and copy it to a path; returns its SHA-256 and who vouches for its errors.
 
     Raises
     ------
     StreamError
-        When it is damaged, cut short, followed by something, or of a version that this server does not read; or its
-        metadata are longer than any may be, or nothing that JSON can tell.
+        If it is damaged, cut short, followed by more bytes, or of a version that this server does not read; or if its
+        metadata are too long or cannot be expressed in JSON.
     TooLargeError
-        When it has more vertices than allowed.
+        If it has more vertices than allowed.
     """
     from lodestream.container import describe
     from lodestream.inspection import inspect
@@ -124,15 +121,16 @@ def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, 
 
 
 def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Path]) -> dict[str, Any]:
-    """What is told of a surface whose container has this index.
+    """The description of a surface whose container has this index.
 
     Parameters
     ----------
     index : Index
     known : mapping or None
-        What was told before: whose word its errors are stands nowhere else.
+        The earlier description; it alone says who vouches for the errors.
     files : sequence of Path
-        The upload, as far as it is there. Where it is a container, and nothing was told before, nothing is vouched for.
+        The upload, as far as it exists. If it is a container and there is no earlier description, nobody vouches for
+        the errors.
     """
     from lodestream.container import describe
 
@@ -146,11 +144,12 @@ def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Pa
 
 
 def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
-    """What is told of a container, in plain values that JSON has; refused where it has no words for them.
+    """The description of a container as plain JSON values.
 
     Raises
     ------
     CorruptStreamError, TooLargeError
+        If JSON cannot express it.
     """
     place = index.metadata
     name = index.metadata_values.get("name", "")
@@ -162,5 +161,5 @@ def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
         told: dict[str, Any] = plain(info)
         json.dumps(told, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise CorruptStreamError(f"expected metadata that JSON can tell: {error}"[:300], place.offset) from None
+        raise CorruptStreamError(f"expected metadata that JSON can express: {error}"[:300], place.offset) from None
     return told

@@ -1,21 +1,21 @@
-"""Where everything lies in the data folder of a server.
+"""The layout of a server's data folder.
 
 ::
 
     DATA/records/{id}.json            one `Record`
-    DATA/records/{id}.deleted         the record of a surface that is being removed
+    DATA/records/{id}.deleted         the record of a surface that is being deleted
     DATA/uploads/{upload}/0, 1, ...   uploaded files, shared by the surfaces that were made of the same bytes
-    DATA/uploads/{upload}/{id}.json   the record of each of these surfaces, as it was when the files came
-    DATA/containers/{sha256}.lode     never changed, named by their content, shared likewise
-    DATA/incoming/                    uploads under way
-    DATA/work/                        builds under way
-    DATA/levels/                      levels that were made for whoever fetched them, emptied at each start
-    DATA/damaged/                     what was set aside: by a start, or by ``lodestream fsck --repair``
-    DATA/lock                         held by the one process that works in the folder
+    DATA/uploads/{upload}/{id}.json   the record of each of these surfaces, as it was at the upload
+    DATA/containers/{sha256}.lode     never changed, named by their SHA-256, shared likewise
+    DATA/incoming/                    uploads in progress
+    DATA/work/                        builds in progress
+    DATA/levels/                      level files made on request, removed at each start
+    DATA/damaged/                     files moved away by a start or by ``lodestream fsck --repair``
+    DATA/lock                         locked by the one process that uses the folder
 
-Records, uploads and containers are whole where they stand: they were written elsewhere, put on disk, and renamed. Each
-of their folders has a marker (`markers`). The folder of an upload is named by the SHA-256 of its files; the earlier
-versions of the server named it by its one surface, and called the record in it ``record.json``.
+Records, uploads and containers are always complete: they are written elsewhere, synchronised, and renamed. Each of the
+three folders has a marker (`markers`). The folder of an upload is named by the SHA-256 of its files. Earlier versions
+of the server named it after its surface, and called the record in it ``record.json``.
 """
 
 from __future__ import annotations
@@ -61,39 +61,39 @@ class Folders:
 
     @property
     def incoming(self) -> Path:
-        """Uploads under way."""
+        """Uploads in progress."""
         return self.root / "incoming"
 
     @property
     def work(self) -> Path:
-        """Builds under way."""
+        """Builds in progress."""
         return self.root / "work"
 
     @property
     def levels(self) -> Path:
-        """Levels that were made for whoever fetched them."""
+        """Level files that were made on request."""
         return self.root / "levels"
 
     @property
     def damaged(self) -> Path:
-        """What was set aside; made when it is needed."""
+        """Files that were moved away; created when needed."""
         return self.root / "damaged"
 
     @property
     def known(self) -> Collection[str]:
-        """Names of everything that may lie in the data folder."""
+        """Names of everything that may be in the data folder."""
         # A disk of its own has lost+found.
         files = ("lock", "marking", "tokens.json", "lost+found")
         return {*files, self.damaged.name, *(folder.name for folder in self.written)}
 
     @property
     def kept(self) -> tuple[Path, Path, Path]:
-        """The folders of what was acknowledged."""
+        """The folders of acknowledged data."""
         return self.records, self.uploads, self.containers
 
     @property
     def written(self) -> tuple[Path, ...]:
-        """The folders into which a server writes all the time."""
+        """The folders that a server writes to."""
         return *self.kept, self.incoming, self.work
 
     def record(self, surface: str) -> Path:
@@ -101,7 +101,7 @@ class Folders:
         return self.records / f"{surface}.json"
 
     def tombstone(self, surface: str) -> Path:
-        """The record of a surface while the surface is removed."""
+        """The record of a surface that is being deleted."""
         return self.records / f"{surface}{_DELETED}"
 
     def upload(self, record: Record) -> Path:
@@ -113,11 +113,11 @@ class Folders:
         return [self.upload(record) / str(number) for number in range(len(record.filenames))]
 
     def copy(self, record: Record) -> Path:
-        """The record of a surface that lies beside its uploaded files."""
+        """The copy of a surface's record beside its uploaded files."""
         return self.upload(record) / f"{record.id}.json"
 
     def copies_of(self, record: Record) -> list[Path]:
-        """The same, under the name of earlier versions too."""
+        """The copies of a surface's record, including the name used by earlier versions."""
         earlier = [self.upload(record) / "record.json"] if record.folder == record.id else []
         return [self.copy(record), *earlier]
 
@@ -126,19 +126,19 @@ class Folders:
         return self.containers / f"{sha256}.lode"
 
     def all_records(self) -> Iterator[Path]:
-        """Every record, in the order of their names."""
+        """All records, sorted by name."""
         return (path for path in _listed(self.records) if path.suffix == ".json")
 
     def tombstones(self) -> Iterator[Path]:
-        """Every record of a surface that is being removed."""
+        """The records of all surfaces that are being deleted."""
         return (path for path in _listed(self.records) if path.suffix == _DELETED)
 
     def all_uploads(self) -> Iterator[Path]:
-        """Every folder of an upload; what has another name was not made here."""
+        """All upload folders; entries with other names are not Lodestream's."""
         return (path for path in _listed(self.uploads) if _UPLOAD.fullmatch(path.name))
 
     def all_containers(self) -> Iterator[Path]:
-        """Every container."""
+        """All containers."""
         return (path for path in _listed(self.containers) if _CONTAINER.fullmatch(path.name))
 
     def copies(self, upload: Path) -> Iterator[Path]:
@@ -146,18 +146,18 @@ class Folders:
         return (path for path in _listed(upload) if _COPY.fullmatch(path.name))
 
     def unfinished(self) -> Iterator[Path]:
-        """Files of records that were being written when the process ended."""
+        """Records that were being written when the process ended."""
         for folder in (self.records, *self.all_uploads()):
             yield from (path for path in _listed(folder) if path.suffix == ".new")
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; where the system cannot tell its error is raised, which `Path.is_file` may hide."""
+    """Whether a file exists; raises the system's error if that cannot be decided, which `Path.is_file` may hide."""
     return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder; where the system cannot tell its error is raised."""
+    """Whether a folder exists; raises the system's error if that cannot be decided."""
     return stat.S_ISDIR(_mode(path))
 
 

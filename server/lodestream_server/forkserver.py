@@ -1,12 +1,13 @@
-"""The process from which the processes of calls are forked: it has loaded everything, and reads nothing of strangers.
+"""The fork server: a process that has loaded everything and reads no untrusted data.
 
-It has one thread, so that forking is safe. Each call has a process to itself, which gives up what the call does not
-need before the call begins (`lodestream.confinement`) and ends with it: whatever a file did to its reader is gone
-before the next one is read.
+The processes of calls are forked from it. It has one thread, so forking is safe. Each call gets a process of its own,
+which gives up all rights that the call does not need before it begins (`lodestream.confinement`), and ends with it. So
+whatever a file does to its reader is gone before the next file is read.
 
-Over one socket come calls: a connection of their own, and the pipe for the answer. Over its connection comes what is
-to be called; back go a line when its process is there and one when it has ended, and when the other side closes it the
-process is killed. What the process itself says goes over the pipe, as JSON, and nobody here listens to it.
+Calls arrive over one socket, each with a connection of its own and the pipe for its answer. Over its connection comes
+the request. The fork server sends one line there when the process exists and one when it has ended. When the other side
+closes the connection, the process is killed. The process itself sends its answer through the pipe, as JSON; the fork
+server does not read it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import ctypes
 import gc
 import importlib
 import json
-import logging
 import math
 import os
 import resource
@@ -46,29 +46,28 @@ _INHERIT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
 _MOST_FILES = 256
 _MOST_SECONDS = 2.0**31
 
-_Warmed = tuple[str | None, str | None]
 _TRACEBACK = 20_000
 
 
 @dataclass(frozen=True)
 class Allowed:
-    """What the process of a call may touch and take.
+    """Rights and limits of the process of a call.
 
     Attributes
     ----------
     read : tuple of Path
-        Files and folders, beside Python and its libraries.
+        Files and folders that it may read, in addition to Python and its libraries.
     write : Path or None
-        A folder, in which its temporary files lie too.
+        A folder that it may write to, also used for temporary files.
     processes : bool
-        Whether it may start processes, which have the same limits each.
+        Whether it may start processes; each has the same limits.
     memory : int or None
-        Bytes that it can write to and shares with nobody: neither code nor files that are mapped for reading. Beyond
-        them it gets MemoryError, or ends.
+        Bytes of private writable memory; code and files mapped for reading do not count. Beyond it the process gets
+        MemoryError or ends.
     seconds : float or None
-        Of processor time.
+        Processor time.
     file_bytes : int or None
-        Of each file that it writes.
+        Largest file that it may write.
     """
 
     read: tuple[Path, ...] = ()
@@ -87,7 +86,7 @@ class _Request:
 
 
 def main() -> None:
-    """Fork for each call that comes over the socket whose number is the first argument, until it is closed."""
+    """Fork for each call that arrives over a socket until it is closed; its number is the first argument."""
     control = socket.socket(fileno=int(sys.argv[1]))
     # Ctrl-C, and the end of a service, reach every process: this one is its parent's to end.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -98,8 +97,8 @@ def main() -> None:
     confinement = _try_confinement()
     _say(control, {"confinement": confinement})
     with _ending_with(parent):
-        problem, note = _warm(sys.argv[2]) if sys.argv[2] else (None, None)
-    _say(control, {"problem": problem, "note": note})
+        problem = _preload(sys.argv[2]) if sys.argv[2] else None
+    _say(control, {"problem": problem})
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     _Server(control).run()
@@ -281,28 +280,24 @@ def _limit(allowed: Allowed) -> None:
         most = math.ceil(min(time.process_time() + allowed.seconds, _MOST_SECONDS))
         # Told so by SIGXCPU; who does not listen is killed.
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
-    kernels = sys.modules.get("lodestream.numba_kernels")
-    folders = () if kernels is None else kernels.cache_folders()
-    if kernels is not None:
-        kernels.keep_no_more()
     write = () if allowed.write is None else (allowed.write,)
-    confine(Rights((*allowed.read, *folders), write, allowed.processes))
+    confine(Rights(allowed.read, write, allowed.processes))
 
 
 def resolve(name: str) -> Callable[..., Any]:
-    """The function of this name, ``module:qualified.name``."""
+    """The function with this name, ``module:qualified.name``."""
     module, _, qualified = name.partition(":")
     function: Callable[..., Any] = attrgetter(qualified)(importlib.import_module(module))
     return function
 
 
 def receive_exactly(connection: socket.socket, length: int) -> bytes:
-    """So many bytes.
+    """Receive exactly so many bytes.
 
     Raises
     ------
     EOFError
-        When fewer come.
+        If fewer arrive.
     """
     data = bytearray()
     while len(data) < length:
@@ -329,26 +324,13 @@ def _try_confinement() -> list[str]:
     return _in_a_fork(lambda: list(confine(Rights()))) or []
 
 
-def _warm(name: str) -> _Warmed:
-    """Call a function once in a process that ends then, and once here."""
-    # Whoever is the parent says it, once.
-    logging.getLogger("lodestream.numba_kernels").disabled = True
+def _preload(name: str) -> str | None:
+    """Call the function of this name; what went wrong, if anything did."""
     try:
-        warm = resolve(name)
+        resolve(name)()
     except Exception:
-        return traceback.format_exc()[-_TRACEBACK:], None
-    # What compiling takes in memory is gone with it; here what it has kept is loaded.
-    first = _in_a_fork(lambda: _attempt(warm))
-    return first if first is not None and first[0] is not None else _attempt(warm)
-
-
-def _attempt(function: Callable[[], object]) -> _Warmed:
-    """What went wrong, and what the function has to say."""
-    try:
-        note = function()
-    except Exception:
-        return traceback.format_exc()[-_TRACEBACK:], None
-    return None, note if isinstance(note, str) else None
+        return traceback.format_exc()[-_TRACEBACK:]
+    return None
 
 
 def _in_a_fork(function: Callable[[], Any]) -> Any:

@@ -1,8 +1,8 @@
-"""WebSocket connections with bounds on what a client may send that is no message, and on what it does not take.
+"""WebSocket connections with limits on control frames and fragments.
 
-uvicorn answers each ping at once, whether or not the pongs are taken, and looks at every frame of what has come before
-anything else has its turn. Here what comes is looked at in small pieces, each frame is counted, and so are the bytes of
-pongs that are not sent yet. Beyond a bound the connection is cut: who does such things reads no close frame.
+uvicorn answers each ping at once, whether or not the client reads the pongs, and processes all received frames before
+anything else gets its turn. Here received data are processed in small pieces, and frames and unsent bytes of pongs are
+counted. A connection that exceeds a limit is cut: a client that does this does not read a close frame.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _EARNED = 4.0
 
 
 def stream_connections(cuts: Cuts, pace: Pace) -> type[WebSocketsSansIOProtocol]:
-    """The class of a server's WebSocket connections; uvicorn makes one for each."""
+    """The class of a server's WebSocket connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         pass

@@ -1,7 +1,8 @@
-"""Looking through a server's folder: is everything whole that its records promise?
+"""Checking a data folder: is everything there and undamaged that its records refer to?
 
-A container is named by its SHA-256, so it is right or it is not; where it is not, its sections' and segments' checksums
-say where. An upload is compared with the hash that was taken while it came in. Nothing is changed here; `repair` does.
+A container is named by its SHA-256, which is checked; if it is wrong, the checksums of sections and segments show
+where. An upload is compared with the hash that was computed when it arrived. Nothing is changed here; `repair` does
+that.
 """
 
 from __future__ import annotations
@@ -35,28 +36,27 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is not as it should be.
+    """Something that is wrong.
 
     Attributes
     ----------
     what : str
-        ``record``, ``upload`` or ``container``: it is damaged or gone. ``figures``: a record says something else of its
-        container than the container itself. ``marker``: the folders do not belong together, or are not all there.
-        ``version``: a whole container of another version than this server reads; the next start builds it again, and it
-        is no damage.
-        ``leftover``: a file that nothing refers to, as a process leaves them that is killed; the next start removes or
-        sets aside what it finds, and it is no damage.
+        ``record``, ``upload`` or ``container``: damaged or missing. ``figures``: a record's description of its
+        container differs from the container. ``marker``: the folders do not belong together, or one is missing.
+        ``version``: a sound container of another format version; the next start builds it again, and it does not count
+        as damage. ``leftover``: a file that nothing refers to, as killed processes leave them; the next start removes
+        it or moves it away, and it does not count as damage.
     path : Path
     surface : str or None
-        Whose it is.
+        The surface that it belongs to.
     problem : str
-        What was expected and what came.
+        What was expected and what was found.
     repair : str or None
         What was done about it.
     repaired : bool
-        Another look, after that, found nothing any more.
+        Whether a second check found nothing wrong.
     lost : bool
-        The surface cannot be served, nor built again from what is here.
+        Whether the surface can neither be served nor built again from this folder.
     """
 
     what: What
@@ -69,26 +69,26 @@ class Finding:
 
     @property
     def key(self) -> tuple[What, Path, str | None]:
-        """What it is found again by."""
+        """Identifies the finding in a second check."""
         return self.what, self.path, self.surface
 
 
 @dataclass
 class Report:
-    """What was looked at, and what was found.
+    """What was checked, and what was found.
 
     Attributes
     ----------
     folder : Path
     surfaces : int
-        Records, those that cannot be used among them.
+        Records, including unusable ones.
     containers, uploads : int
-        Those that are there, whole or damaged, and that a record speaks of; what several surfaces share counts once.
+        Containers and uploads that exist and that a record refers to, sound or damaged; shared ones count once.
     bytes : int
-        Of these containers and uploads, on the disk.
+        Their size on disk.
     seconds : float
     findings : list of Finding
-        What should be there and is not is among them.
+        Including files that are missing.
     records : dict of Record
         By surface.
     """
@@ -104,12 +104,12 @@ class Report:
 
     @property
     def damage(self) -> list[Finding]:
-        """The findings that are neither leftovers nor of another version."""
+        """The findings that count as damage: all but leftovers and other versions."""
         return [finding for finding in self.findings if finding.what not in ("leftover", "version")]
 
     @property
     def clean(self) -> bool:
-        """Nothing is damaged, or everything that was has been repaired."""
+        """Whether nothing is damaged, or all damage has been repaired."""
         return all(finding.repaired for finding in self.damage)
 
     def to_json(self) -> dict[str, Any]:
@@ -138,14 +138,14 @@ class Report:
 
 
 def check(root: Path) -> Report:
-    """Look through a folder in which nobody works meanwhile.
+    """Check a folder that no server uses meanwhile.
 
     Raises
     ------
     LodestreamError
-        When it is no folder of a server.
+        If it is not the data folder of a server.
     OSError
-        When something in it cannot be looked at.
+        If something in it cannot be read.
     """
     at = Folders(root)
     if not any(is_folder(folder) for folder in at.kept):
@@ -205,17 +205,17 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
         # Where its bytes are not those of its name, that is what the text says.
         yield Finding("version" if index == other_version(path) else "container", path, record.id, index)
     elif figures_of(index, record.info, at.files(record)) != record.info:
-        problem = "expected the figures that the container has, got others"
+        problem = "expected the description that the container gives, got another"
         yield Finding("figures", at.record(record.id), record.id, problem)
 
 
 def check_container(path: Path, sha256: str) -> Index | str:
-    """The index of a container that is whole, or what is wrong with it.
+    """The index of a sound container, or a description of what is wrong with it.
 
     Raises
     ------
     OSError
-        When it is there and cannot be read: what is wrong then is the disk, and perhaps for a moment only.
+        If it exists and cannot be read: the disk has a problem, which may pass.
     """
     frames, digest = FrameReader(), hashlib.sha256()
     place = None
@@ -270,13 +270,17 @@ def _strays(at: Folders, report: Report) -> Iterator[Finding]:
             if record.id not in deleted and not is_file(at.record(record.id)):
                 yield Finding("record", at.record(record.id), record.id, "expected a record, got none")
         if not (owned or unusable or upload.name in folders):
-            yield Finding("leftover", upload, None, "expected what a record refers to, got something else")
+            yield Finding(
+                "leftover", upload, None, "expected a file that a record refers to, got one that no record refers to"
+            )
     for container in () if unusable else stray_containers(at, report.records.values()):
-        yield Finding("leftover", container, None, "expected what a record refers to, got something else")
+        yield Finding(
+            "leftover", container, None, "expected a file that a record refers to, got one that no record refers to"
+        )
     for path in at.tombstones():
         yield Finding("leftover", path, path.stem, "expected no surface that is still being deleted, got one")
     for path in at.unfinished():
         yield Finding("leftover", path, None, "expected a record, got a file that was being written")
     for folder in (at.incoming, at.work, at.levels):
         for path in sorted(folder.iterdir()) if is_folder(folder) else ():
-            yield Finding("leftover", path, None, "expected nothing under way, got something")
+            yield Finding("leftover", path, None, "expected no unfinished uploads, builds or levels, got one")

@@ -1,9 +1,8 @@
-"""``lodestream fsck``, which the command line finds through the entry points of the group ``lodestream.commands``."""
+"""The command ``lodestream fsck``, found through the entry points of the group ``lodestream.commands``."""
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import os
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import LodestreamError, OptionError
+from lodestream.library import require
 from lodestream.text import printable
 
 if TYPE_CHECKING:
@@ -26,44 +26,47 @@ def register(subparsers: Any) -> None:
     """Add ``fsck`` to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "fsck",
-        help="check a server's folder, and repair it",
-        description="Check everything in a server's folder: records, uploads by the hash that was taken when they "
-        "came, containers by their name, sections and segments. No server may be running there. Exit code 0: all is "
-        "well, or was repaired without a loss; 1: something is damaged, or with --retry waits still.",
+        help="check and repair the data folder of a server",
+        description="Check all records, uploads and containers in the data folder of a server, by their hashes and "
+        "checksums. No server may be running in the folder. Exit code 0: nothing is damaged, or all damage was "
+        "repaired without loss; 1: something is damaged, or (with --retry) a surface still waits.",
         allow_abbrev=False,
     )
-    parser.add_argument("data", metavar="DIR", type=Path, help="folder of a server")
+    parser.add_argument("data", metavar="DIR", type=Path, help="data folder of a server")
     parser.add_argument(
         "--repair",
         action="store_true",
-        help="move what is damaged into DIR/damaged, and build it again from its upload",
+        help="move damaged files to DIR/damaged, and build their containers again from the uploads",
     )
     parser.add_argument(
         "--adopt",
         action="store_true",
-        help="say that records, uploads and containers in DIR belong together, after they were moved there: their "
-        "markers are written anew, and uploads that have a record of their own are taken in",
+        help="declare that records, uploads and containers in DIR belong together, after you moved them there: rewrite "
+        "their identity files, and add uploads that have only their own copy of a record",
     )
     parser.add_argument(
         "--retry",
         action="store_true",
-        help="build again what waits, since it could not be built for a reason that may have passed",
+        help="also build the surfaces that wait because an earlier build failed for a temporary reason",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, repair it if asked to, and print what was found; the exit code.
+    """Check a folder, repair it if requested, and print what was found; returns the exit code.
 
     Raises
     ------
     LodestreamError
-        When it is no folder of a server, or another process works in it.
+        If it is not the data folder of a server, or another process uses it; or if the folder is to be changed and the
+        compiled kernels are missing.
     """
     from .folders import Folders
 
     folder: Path = args.data
+    if args.repair or args.adopt or args.retry:
+        require("building surfaces again")
     if args.adopt and args.repair:
         raise OptionError("expected --adopt or --repair, got both: adopt first, and see that all is there")
     if not any(place.is_dir() for place in Folders(folder).kept):
@@ -88,6 +91,8 @@ def _looked_through(folder: Path, args: argparse.Namespace) -> tuple[Report, Map
         report = _first(folder, args)
     if not changes:
         return report, report.records
+    import asyncio
+
     from .command import chosen_settings
     from .repair import compare, rebuild
 
@@ -144,7 +149,7 @@ def _print(report: Report, waiting: Sequence[Record]) -> None:
     problems = "nothing is damaged" if not found else f"{found} damaged"
     problems += f", {repaired} of these repaired" if repaired else ""
     problems += f", {lost} lost" if lost else ""
-    problems += f", {len(waiting)} surfaces wait for another attempt" if waiting else ""
+    problems += f", {len(waiting)} surfaces wait for a retry" if waiting else ""
     others = sum(finding.what == "version" and finding.repair is None for finding in report.findings)
     problems += f", {others} of another version, which the next start builds again" if others else ""
     leftovers = sum(finding.what == "leftover" for finding in report.findings)

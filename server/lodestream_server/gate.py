@@ -1,4 +1,4 @@
-"""What stands before every route: whoever may not pass learns why, and nothing else; no body is read before."""
+"""Access control in front of every route; a request is refused before its body is read."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Gate:
         self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, or answer it."""
+        """Pass a request on, or refuse it."""
         if scope["type"] in ("http", "websocket"):
             try:
                 scope[_CALLER] = self._admit(scope)
@@ -59,7 +59,9 @@ class Gate:
 
 
 def caller_of(connection: HTTPConnection) -> Caller | None:
-    """Who asks; None on a route that is open to everybody, and for a stream whose ``open`` has to hold a token."""
+    """The caller of a request; None on a route that is open to everybody, and for a stream whose ``open`` must have a
+    token.
+    """
     found: Caller | None = connection.scope[_CALLER]
     return found
 

@@ -1,4 +1,4 @@
-"""The frame of every page that a browser is shown: no script, nothing from another host, and a policy that says so."""
+"""The frame of every HTML page: no scripts, no resources of other hosts, and a policy that says so."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _HEADERS = {
 
 
 def html_page(title: str, body: str) -> Response:
-    """A page of HTML.
+    """An HTML page.
 
     Parameters
     ----------
     title : str
         Plain text.
     body : str
-        HTML without scripts, styles and pictures: the policy of the page forbids them.
+        HTML without scripts, styles and images; the page's policy forbids them.
     """
     page = (
         f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'

@@ -1,4 +1,4 @@
-"""What `/openapi.json` says: the routes as they are answered, errors and tokens included."""
+"""The OpenAPI document: the routes with their errors and tokens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SCHEME = "token"
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document of an application; made once."""
+    """The OpenAPI document of an application; computed once."""
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = schema.setdefault("components", {})

@@ -1,28 +1,28 @@
-"""Builds: a queue of surfaces in front of processes that may die or be killed without harm.
+"""Builds: a queue of surfaces, and processes that may die or be killed without harm to the server.
 
-The queue is on disk: it is the records whose state is queued. What happens to a build, and what comes of it:
+The queue is on disk: it consists of the records whose state is queued. What can happen to a build:
 
 ======================================  ================================================================================
-the reader refuses the bytes            the surface has failed, for good
+the reader rejects the file             the surface is failed, for good
 the surface is deleted                  its process is killed
-the process dies, or lacks memory       one more attempt in another process, then it waits
-the process is told to end (SIGTERM)    another attempt, at most `_ENDINGS` in all: a service is being stopped
-it takes longer than it may             it waits
-a library is missing, a limit or        it waits
-setting of this server is in its way,
-or an uploaded container is of another
-version than this server reads
-the disk is full, or its owner has      it stays in the queue until there is room
-more there than one may have
-the server dies                         the next one takes it up, after those of its caller that have not been tried so
-                                        often; when `_CRASHES` servers have died under it, it waits
+the process dies, or lacks memory       one more attempt in another process, then the surface waits
+the process gets SIGTERM                another attempt, at most `_ENDINGS` in all: a service is being stopped
+it takes too long                       the surface waits
+a library is missing, a limit or        the surface waits
+setting of this server prevents it, or
+an uploaded container has a version
+that this server does not read
+the disk is full, or the owner exceeds  it stays in the queue until there is room
+its share of the disk
+the server dies                         the next server builds it, after the caller's builds with fewer attempts; when
+                                        `_CRASHES` servers have died during it, the surface waits
 ======================================  ================================================================================
 
-Callers, who are tokens or without one addresses, take turns: the next build is that of a caller who has the fewest
-running and whose builds have had processes for the least time lately. After a restart the caller is the owner.
+Callers (tokens, or addresses without a token) take turns: the next build is that of the caller with the fewest running
+builds and the least process time recently. After a restart the caller is the owner.
 
-What waits keeps its upload and its reason until somebody asks for another attempt (`Builder.retry`). What was ready
-once never fails: that its bytes are refused now is the server's doing.
+A surface that waits keeps its upload and the reason until somebody retries it (`Builder.retry`). A surface that was
+ready before never becomes failed: if its file is rejected now, the server must be the cause.
 """
 
 from __future__ import annotations
@@ -90,29 +90,29 @@ class _LaterError(Exception):
     def of(cls, number: int | None) -> _LaterError:
         """What stands behind an error of the system."""
         return cls(
-            "room on the server's disk" if number in _ROOM else f"the server's system ({os.strerror(number or 0)})"
+            "space on the server's disk" if number in _ROOM else f"the server's system ({os.strerror(number or 0)})"
         )
 
 
 class Builder:
-    """Builds surfaces in other processes.
+    """Builds surfaces in separate processes.
 
     Parameters
     ----------
-    storage : Storage
-    settings : Settings
+    storage : Storage settings : Settings
     finished : callable (state, seconds) or None
-        Told how each build ended (``ready``, ``failed``, ``waiting``, ``missing``), and how long its last attempt took.
+        Called when a build ends, with the state (``ready``, ``failed``, ``waiting``, ``missing``) and the duration of
+        its last attempt.
     patient : bool
-        Whether builds that find no room on the disk wait until there is some. Otherwise they are given up after a few
-        attempts and stay in the queue, for the next server to build.
+        Whether builds that find the disk full wait until there is space. Otherwise they are given up after a few
+        attempts and stay in the queue, for the next server.
 
     Attributes
     ----------
     ready : bool
-        The kernels are compiled.
+        Whether the kernels are compiled.
     fork_server : ForkServer
-        From which the processes are forked; others may use it until this is closed.
+        The fork server of the build processes; others may use it until this is closed.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Builder:
         self._settings = settings
         self._finished = finished
         self._memory = settings.memory_of_build
-        self.fork_server = ForkServer(worker.warm)
+        self.fork_server = ForkServer(worker.preload)
         self._pool = Pool(settings.workers, self.fork_server)
         self._turns = Turns(settings.workers, _REMEMBERED)
         self._callers: dict[str, str] = {}  # of the builds that wait or run
@@ -137,45 +137,45 @@ class Builder:
         self._pending: Counter[str] = Counter()
         self._running: dict[str, _Running] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._warming: asyncio.Task[None] | None = None
+        self._preloading: asyncio.Task[None] | None = None
         self._room = asyncio.Event()
         self._closing = False
         self._deleting = set[str]()
 
     @property
     def pending(self) -> int:
-        """Builds that wait or run."""
+        """Number of builds that wait or run."""
         return len(self._tasks)
 
     def pending_of(self, caller: str) -> tuple[int, int]:
-        """Builds that wait or run, and how many of them are of the caller with this key."""
+        """Number of builds that wait or run: all of them, and those of the caller with this key."""
         return len(self._tasks), self._pending.get(caller, 0)
 
     def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
-        """Warm the kernels, and take up what was queued when the server went down.
+        """Start the process that builds come from, and continue builds queued when the server last ended.
 
         Parameters
         ----------
         check_owner : callable or None
-            Raises FullError when this owner has more on the disk than one may have: builds of theirs wait meanwhile.
+            Raises FullError if an owner uses more disk space than allowed; that owner's builds then wait.
         """
         self._check_owner = check_owner
-        self._warming = asyncio.create_task(self._warm())
+        self._preloading = asyncio.create_task(self._preload())
         queued = [record for record in self._storage.records() if record.state == "queued"]
         # What may have killed a server comes last: everything else is built before it does so again.
         for record in sorted(queued, key=lambda record: record.attempts):
             self.submit(record)
 
     async def accept(self, record: Record, upload: Path, caller: str | None = None) -> tuple[Record, bool]:
-        """Store an upload and build its surface, as `Storage.add` says; both happen even if the caller is cancelled.
+        """Store an upload and build its surface, see `Storage.add`; both happen even if the calling task is cancelled.
 
         Parameters
         ----------
         record : Record
         upload : Path
-            This function's from now on: it is removed where it is not kept.
+            Folder of the files. This function takes it over, and removes it if it is not kept.
         caller : str or None
-            Key of whoever the build is for; None for its owner.
+            Key of the caller for whom the build runs; None: its owner.
         """
         return await asyncio.shield(asyncio.create_task(self._accept(record, upload, caller)))
 
@@ -190,7 +190,7 @@ class Builder:
         return record, new
 
     def submit(self, record: Record, caller: str | None = None) -> None:
-        """Build a surface when a process is free and it is the turn of the caller, by default of its owner."""
+        """Queue a build. It runs when a process is free and it is the turn of the caller (by default, of its owner)."""
         if record.id not in self._tasks and not self._closing:
             task = asyncio.create_task(self._build(record))
             self._tasks[record.id] = task
@@ -214,27 +214,28 @@ class Builder:
             self.submit(record, caller)
 
     async def retry(self, surface: str, caller: str | None = None) -> Record:
-        """Build a surface again that failed, waits or is missing, if there is something to build it from; its record.
+        """Build a surface again that failed, waits or is missing, if there is something to build it from; returns its
+        record.
 
         Parameters
         ----------
         surface : str
         caller : str or None
-            Key of whoever asks for it; None for its owner.
+            Key of the caller that asked for it; None: its owner.
 
         Raises
         ------
         NotFoundError
-            When there is none.
+            If there is no such surface.
         OSError
-            When the disk does not let it be taken up.
+            If its record cannot be written.
         """
         record = await asyncio.to_thread(self._storage.retry, surface)
         self._resume(record, caller)
         return record
 
     def state(self, record: Record) -> tuple[State, float]:
-        """What a surface is doing now, and how much of its build is done."""
+        """The current state of a surface, and the fraction of its build that is done."""
         if record.state != "queued":
             return record.state, float(record.state == "ready")
         running = self._running.get(record.id)
@@ -243,14 +244,14 @@ class Builder:
         return "building", worker.read_progress(running.folder)
 
     async def delete(self, surface: str) -> None:
-        """Remove a surface; the process that builds it is killed. Builds that wait for room on the disk try again.
+        """Delete a surface; a running build of it is killed. Builds that wait for disk space try again.
 
         Raises
         ------
         NotFoundError
-            When there is none.
+            If there is no such surface.
         OSError
-            When it could not be removed; it is still there, and built as before.
+            If it could not be deleted; it still exists, and is built as before.
         """
         self._storage.get(surface)
         self._deleting.add(surface)
@@ -270,14 +271,14 @@ class Builder:
         room.set()
 
     async def wait(self) -> None:
-        """Wait until nothing is queued any more."""
+        """Wait until the queue is empty."""
         while self._tasks:
             await asyncio.wait(self._tasks.values())
 
     async def close(self) -> None:
-        """Kill what is running; it is taken up again after a restart."""
+        """Kill running builds; they start again after a restart."""
         self._closing = True
-        tasks = [*self._tasks.values(), *([self._warming] if self._warming else [])]
+        tasks = [*self._tasks.values(), *([self._preloading] if self._preloading else [])]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -286,34 +287,32 @@ class Builder:
 
     @property
     def confinement(self) -> str | None:
-        """What the kernel holds builds to, as ``/readyz`` says it; None before it is known."""
+        """How builds are confined, as ``/readyz`` says it; None before it is known."""
         held = self.fork_server.confinement
         return None if held is None else "+".join(held) or "none"
 
-    async def _warm(self) -> None:
+    async def _preload(self) -> None:
         try:
-            problem, unkept = await asyncio.to_thread(self.fork_server.wait)
+            problem = await asyncio.to_thread(self.fork_server.wait)
         except ProcessDiedError as error:
-            _log.warning("the process that compiles the kernels: %s", error)
+            _log.warning("the process that builds are forked from: %s", error)
             return
         except OSError as error:
-            _log.error("the kernels could not be compiled: %s", error)
+            _log.error("the process that builds are forked from could not be started: %s", error)
             return
         held = self.confinement
         if held == "landlock+seccomp":
             _log.info("builds are confined by landlock and seccomp")
         else:
             _log.warning(
-                "builds are not confined as they should be: the kernel has %s, of landlock and seccomp; whatever takes "
-                "a reader over can do what this server can",
+                "builds are not fully confined: of landlock and seccomp the kernel has %s; a file that exploits its "
+                "reader has all rights of this server",
                 "neither" if held == "none" else f"only {held}",
             )
         if problem is None:
             self.ready = True
         else:
-            _log.error("the kernels could not be compiled: %s", problem)
-        if unkept is not None:
-            _log.warning("%s", unkept)
+            _log.error("what builds need could not be loaded: %s", problem)
 
     async def _build(self, record: Record) -> None:
         delay, said, attempts = _FIRST_DELAY, "", 0
@@ -335,8 +334,8 @@ class Builder:
                 delay = min(2 * delay, _LONGEST_DELAY)
                 continue
             except Exception:
-                _log.exception("the build of %s failed for a reason that nobody foresaw", record.id)
-                state = await self._postpone(record, "the build failed inside")
+                _log.exception("the build of %s failed unexpectedly", record.id)
+                state = await self._postpone(record, "the build failed with an internal error")
             if self._finished is not None:
                 self._finished(state, time.monotonic() - started)
             return
@@ -377,7 +376,7 @@ class Builder:
             try:
                 await self._check_owner(record.owner)
             except FullError as error:
-                raise _LaterError(f"the room of its owner: {error}") from None
+                raise _LaterError(f"disk space of its owner: {error}") from None
 
     async def _attempt(self, record: Record) -> State:
         folder = self._storage.work_folder(record.id)
@@ -389,7 +388,7 @@ class Builder:
         try:
             result: worker.Built | worker.Refused | None = await self._run(call)
             if isinstance(result, worker.Built):
-                self.ready = True  # as a build shows, whatever became of the process that was to warm them
+                self.ready = True  # as a build shows, whatever was wrong before
                 result = await self._keep(record, job, result)
             if result is None:
                 return "ready"
@@ -409,8 +408,8 @@ class Builder:
         except UnforeseenError as error:
             if error.errno in _PASSING:
                 raise _LaterError.of(error.errno) from None
-            _log.error("a build failed for a reason that nobody foresaw: %s", error.traceback)
-            return worker.Refused(f"the build failed inside: {error.kind}", final=False)
+            _log.error("a build failed unexpectedly: %s", error.traceback)
+            return worker.Refused(f"the build failed with an internal error: {error.kind}", final=False)
         except OSError as error:
             # No folder could be made, or no process started.
             return _not_now(error)
@@ -434,7 +433,7 @@ class Builder:
         if problem is not None:
             return await self._postpone(record, problem)
         if record.info is not None:
-            return await self._postpone(record, f"it was ready, and cannot be built again: {reason}")
+            return await self._postpone(record, f"it was ready before, and cannot be built again: {reason}")
         _log.info("%s failed: %s", record.id, reason)
         await asyncio.to_thread(self._storage.failed, record.id, reason)
         return "failed"
@@ -445,15 +444,15 @@ class Builder:
             problem = await asyncio.to_thread(check_upload, self._storage.upload_files(record), record)
         except OSError as error:
             problem = error.strerror
-        return None if problem is None else f"the upload cannot be read as it came: {problem}"
+        return None if problem is None else f"the upload is damaged or cannot be read: {problem}"
 
     async def _postpone(self, record: Record, reason: str) -> State:
-        _log.warning("%s waits for somebody to try again: %s", record.id, reason)
+        _log.warning("%s waits for a retry: %s", record.id, reason)
         await asyncio.to_thread(self._storage.postpone, record.id, reason)
         return "waiting"
 
     def _out_of_memory(self) -> str:
-        return f"the build needed more memory than one may have, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
+        return f"the build needed more memory than its share, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
 
     def _job(self, record: Record, folder: Path) -> worker.Job:
         options = dict(record.options)

@@ -1,4 +1,4 @@
-"""The files of levels that were made: as many as there is room for, those asked for last."""
+"""Level files on disk: the most recently requested ones, within a limit on disk space."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Key", "Lease", "LevelFiles"]
 
 
 class Key(NamedTuple):
-    """What a file holds."""
+    """Identifies a level file."""
 
     container: str
     level: int
@@ -32,7 +32,7 @@ class _File:
 
 
 class Lease:
-    """A file that stays as long as somebody reads it.
+    """A level file in use; it is not removed before it is released.
 
     Attributes
     ----------
@@ -49,12 +49,12 @@ class Lease:
         file.readers += 1
 
     def again(self) -> Lease:
-        """Another one of the same file."""
+        """Another lease of the same file."""
         assert self._files is not None, "it was not given back"
         return Lease(self._files, self._file)
 
     def release(self) -> None:
-        """Give it back; once is enough."""
+        """Release the file; further calls do nothing."""
         files, self._files = self._files, None
         if files is not None:
             self._file.readers -= 1
@@ -62,11 +62,11 @@ class Lease:
 
 
 class LevelFiles:
-    """Files in a folder of their own, which is made with the first of them.
+    """Level files in a folder of their own, which is created with the first of them.
 
-    All of them together, and what is written while one is made, take no more than ``most`` bytes of the disk: before
-    one is made, those that nobody reads go until half of that is free. Everything but the disk's own work happens in
-    the event loop, so nothing needs a lock.
+    All files together, including a file that is being made, take at most ``most`` bytes. Before a file is made, files
+    that nobody reads are removed until half of that is free. Everything except disk access happens in the event loop,
+    so no lock is needed.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class LevelFiles:
     most : int
         Bytes.
     free : callable
-        How many bytes of the disk may be taken at all, now.
+        Returns how many bytes of the disk may be used now.
     """
 
     def __init__(self, folder: Path, most: int, free: Callable[[], Awaitable[int]]) -> None:
@@ -86,21 +86,21 @@ class LevelFiles:
         self._lent = 0
 
     def close(self) -> None:
-        """Remove them all."""
+        """Remove all files."""
         discard(self.folder)
 
     @property
     def longest(self) -> int:
-        """Bytes of the longest file that can be made: a library may write one more on the way to it."""
+        """Bytes of the largest file that can be made; a library may write a second one on the way to it."""
         return self.most // 4
 
     @property
     def size(self) -> int:
-        """Bytes of all files, those included that are forgotten and still read."""
+        """Bytes of all files, including removed ones that are still being read."""
         return self._lent + sum(file.size for file in self._files.values() if not file.readers)
 
     def lend(self, key: Key) -> Lease | None:
-        """A file, if it is there."""
+        """A lease of a file, if it exists."""
         file = self._files.get(key)
         if file is None:
             return None
@@ -113,14 +113,14 @@ class LevelFiles:
         return Lease(self, file)
 
     def released(self, file: _File) -> None:
-        """A reader has gone; a `Lease` says so."""
+        """Called by `Lease` when a reader has released a file."""
         if not file.readers:
             self._lent -= file.size
             if file.forgotten:
                 discard(file.path)
 
     async def make_room(self) -> int:
-        """Remove what is in the way of another file; bytes that one may have, 0 if there is no room."""
+        """Remove files to make room for another one; returns the bytes that it may have, 0 if there is no room."""
         await self._shrink(self.most // 2)
         free = await self._free()
         if free < 2 * self.longest:
@@ -138,11 +138,13 @@ class LevelFiles:
                 await asyncio.to_thread(discard, file.path)
 
     def new_folder(self, key: Key) -> Path:
-        """The path of a folder for making a file."""
+        """Path of a folder in which to make a file."""
         return self.folder / f"{key.container}-{key.level}-{key.format_name}.{next(self._numbers)}"
 
     def add(self, key: Key, path: Path, size: int, *, kept: bool) -> Lease:
-        """Take a file that was made in a folder of `new_folder`; one that is not kept goes with its reader."""
+        """Take over a file that was made in a folder of `new_folder`; without `kept` it is removed when its reader
+        releases it.
+        """
         place = path.parent.with_name(f"{path.parent.name}.level")
         path.rename(place)
         file = _File(place, size, forgotten=not kept)
@@ -151,7 +153,7 @@ class LevelFiles:
         return self._lease(file)
 
     def forget(self, container: str) -> None:
-        """Remove the files of a container; those that are read, when they have been."""
+        """Remove the files of a container; those being read, when they are released."""
         for key in [key for key in self._files if key.container == container]:
             file = self._files.pop(key)
             file.forgotten = True

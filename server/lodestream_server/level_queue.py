@@ -1,19 +1,19 @@
-"""Levels as files: made one at a time in a process of its own, under limits, for as long as somebody waits for them.
+"""Levels as files: made one at a time, each in its own process, under limits, while somebody waits for them.
 
-What becomes of a request:
+What happens to a request:
 
 ======================================  ================================================================================
-the file is there                       it is lent at once
-the same level is being made            it waits for that
-otherwise                               it waits its turn: callers take turns, whatever each of them asks for; what
-                                        several wait for is made in the first turn of any of them
-the client goes                         it leaves the queue; when nobody else waits, the process is killed
-the level is too large, its file too    413
-long, or it takes too long
-one caller asks for too much            429
-too many wait, slow readers hold all    503
-the room, or the process dies
-the disk has no room                    507
+the file exists                         it is lent at once
+the same level is being made            the request waits for it
+otherwise                               it waits its turn: callers take turns; a level that several of them wait for is
+                                        made in the first turn of any of them
+the client disconnects                  it leaves the queue; if nobody else waits, the process is killed
+the level needs too much memory or      413
+time, or its file is too large
+one caller has too many requests        429
+too many requests wait, slow readers    503
+occupy the room, or the process dies
+the disk is full                        507
 ======================================  ================================================================================
 """
 
@@ -84,7 +84,7 @@ class _Job:
 
 
 class Loan:
-    """A file that is lent to a caller, who is counted until it is given back.
+    """A level file that is lent to a caller; it counts for the caller until it is released.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Loan:
         self._gave_back: Callable[[], None] | None = gave_back
 
     def release(self) -> None:
-        """Give it back; once is enough."""
+        """Release the file; further calls do nothing."""
         gave_back, self._gave_back = self._gave_back, None
         if gave_back is not None:
             self._lease.release()
@@ -108,18 +108,15 @@ class Loan:
 
 
 class _ReplacedError(Exception):
-    """The container is another file than the one that the process was allowed to read."""
+    """The container was replaced by another file than the one that the process may read."""
 
 
 class LevelQueue:
-    """Who waits for which level, and the process that makes them.
+    """The queue of requests for level files, and the process that makes them.
 
     Parameters
     ----------
-    settings : Settings
-    storage : Storage
-    files : LevelFiles
-    fork_server : ForkServer
+    settings : Settings storage : Storage files : LevelFiles fork_server : ForkServer
     """
 
     def __init__(self, settings: Settings, storage: Storage, files: LevelFiles, fork_server: ForkServer) -> None:
@@ -136,36 +133,36 @@ class LevelQueue:
         self._closing = False
 
     async def borrow(self, request: Request, key: Key, caller: str) -> Loan:
-        """A file, made if it is not there, unless the client goes meanwhile.
+        """A level file, made if it does not exist; given up if the client disconnects meanwhile.
 
         Parameters
         ----------
         request : Request
-            Whose body was not read.
+            Its body must not have been read.
         key : Key
-            A level and a format that there are.
+            An existing level and format.
         caller : str
-            Key of whoever asks.
+            Key of the caller.
 
         Raises
         ------
         TooManyError
-            When this caller asks for as many as one may, or holds too many bytes.
+            If this caller has too many requests, or holds too many bytes.
         BusyError
-            When too many wait, or the room is held by readers.
+            If too many requests wait, or readers occupy the disk space.
         FullError
-            When the disk has no room.
+            If the disk is full.
         TooLargeError
-            When the level needs more memory, bytes or time than one may have.
+            If the level needs more memory, bytes or time than allowed.
         ClientDisconnect
-            When the client has gone.
+            If the client has disconnected.
         LodestreamError
-            As decoding and writing do.
+            From decoding and writing.
         """
         return await _while_there(request, self.take(key, caller))
 
     async def take(self, key: Key, caller: str) -> Loan:
-        """The same for somebody who stays."""
+        """Like `borrow`, for a caller that does not disconnect."""
         self._check_caller(caller)
         self._callers[caller] += 1
         try:
@@ -184,7 +181,7 @@ class LevelQueue:
         return Loan(lease, partial(self._gave_back, caller, lease.size))
 
     async def close(self) -> None:
-        """Kill what is under way, and remove the files."""
+        """Kill the process that makes a level, and remove the files."""
         self._closing = True
         if self._working is not None:
             task = self._working[1]
@@ -193,13 +190,13 @@ class LevelQueue:
                 await task
         for job in self._jobs.values():
             if not job.done.done():
-                job.done.set_exception(RestartingError("expected a level before the server ended; ask again"))
+                job.done.set_exception(RestartingError("the server ended before the level was made; ask again"))
                 job.done.exception()
         await asyncio.to_thread(self._pool.close)
         await asyncio.to_thread(self._files.close)
 
     def forget(self, container: str) -> None:
-        """Remove the files of a container that is gone."""
+        """Remove the files of a deleted container."""
         self._files.forget(container)
         for key, job in self._jobs.items():
             if key.container == container:
@@ -209,8 +206,8 @@ class LevelQueue:
         most = self._settings.max_client_level_requests
         if self._callers[caller] >= most:
             raise TooManyError(
-                f"expected at most {most} requests for levels of one client at the same time, those included of which "
-                "the answer is on the way; come back when some are done"
+                f"expected at most {most} requests for levels of one client at the same time, including answers that "
+                "are still being sent; try again when some are done"
             )
         self._check_bytes(caller)
 
@@ -218,7 +215,7 @@ class LevelQueue:
         # So that one client that reads slowly leaves room for the others.
         if self._lent[caller] >= self._files.most // 4:
             raise TooManyError(
-                f"expected less than {self._files.most // 4} bytes of levels on the way to one client, got "
+                f"expected less than {self._files.most // 4} bytes of levels that one client is reading, got "
                 f"{self._lent[caller]}; read them first"
             )
 
@@ -235,7 +232,7 @@ class LevelQueue:
     async def _wait(self, key: Key, caller: str) -> Lease:
         most = self._settings.max_level_requests
         if self._waiting >= most:
-            raise BusyError(f"expected at most {most} requests for levels at the same time; come back soon")
+            raise BusyError(f"expected at most {most} requests for levels at the same time; try again soon")
         job = self._jobs.get(key)
         if job is None:
             job = self._jobs[key] = _Job(key)
@@ -302,7 +299,7 @@ class LevelQueue:
     def _worked(self, task: asyncio.Task[None]) -> None:
         self._working = None
         if not task.cancelled() and task.exception() is not None:
-            _log.error("a level could not be made for a reason that nobody foresaw", exc_info=task.exception())
+            _log.error("making a level failed unexpectedly", exc_info=task.exception())
         self._go_on()
 
     async def _work(self, job: _Job) -> None:
@@ -342,7 +339,7 @@ class LevelQueue:
             except (ProcessDiedError, _ReplacedError) as error:
                 _log.warning("level %d of %s: %s", key.level, key.container, error)
                 await asyncio.to_thread(_empty, wanted.folder)
-        raise BusyError("the process that made the level was ended, or its container replaced; come back soon")
+        raise BusyError("the process that made the level was killed, or its container was replaced; try again soon")
 
     async def _run(self, wanted: LevelJob, key: Key) -> int:
         advice = "ask for a coarser level, or stream the surface"
@@ -362,11 +359,11 @@ class LevelQueue:
                 raise self._no_room(0) from None
             if error.errno == errno.EACCES and os.access(wanted.container, os.R_OK):
                 raise _ReplacedError("its container was deleted and built again meanwhile") from None
-            _log.error("a level could not be made for a reason that nobody foresaw: %s", error.traceback)
+            _log.error("making a level failed unexpectedly: %s", error.traceback)
             raise
         except OSError as error:
             # No process could be started.
-            raise BusyError(f"the server's system lacks what a process needs: {error.strerror}") from error
+            raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
         if isinstance(made, MadeLevel):
             return await asyncio.to_thread(_checked_size, wanted, made)
         if made.kind == TooLargeError.__name__:
@@ -381,10 +378,11 @@ class LevelQueue:
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.
         if 2 * most + self._files.size + _LEAST_ROOM >= self._files.most:
-            return BusyError(f"expected room for a level, got {most} bytes beside those that others read; come back")
-        return FullError(
-            f"expected room on the disk for a level, got {most} bytes; remove surfaces or enlarge the disk"
-        )
+            return BusyError(
+                f"expected disk space for a level, got {most} bytes beside files that others are reading; try again "
+                "soon"
+            )
+        return FullError(f"expected disk space for a level, got {most} bytes; delete surfaces or enlarge the disk")
 
 
 def _allowed(wanted: LevelJob, memory: int) -> Allowed:

@@ -1,4 +1,4 @@
-"""One level of a surface as a file: what runs in the process that makes it."""
+"""Making one level of a surface as a file; runs in a separate process."""
 
 from __future__ import annotations
 
@@ -52,18 +52,17 @@ _KINDS: tuple[type[LodestreamError], ...] = (
 
 @dataclass(frozen=True)
 class LevelJob:
-    """A level that is to be made.
+    """A level to be made.
 
     Attributes
     ----------
-    container : Path
-    level : int
+    container : Path level : int
     format_name : str
         A key of `MEDIA_TYPES`.
     folder : Path
-        Where files may be written; empty at the start.
+        Folder to write to; empty at the start.
     most_bytes : int
-        Longest that any of them may become.
+        Largest file that may be written.
     """
 
     container: Path
@@ -74,34 +73,35 @@ class LevelJob:
 
     @property
     def path(self) -> Path:
-        """Where the file is written."""
+        """Path of the file to write."""
         return self.folder / "level"
 
 
 @dataclass(frozen=True)
 class MadeLevel:
-    """The file was made, and has so many bytes."""
+    """The file was made; its size in bytes."""
 
     size: int
 
 
 @dataclass(frozen=True)
 class RefusedLevel:
-    """It was not made, for this reason.
+    """The file was not made.
 
     Attributes
     ----------
     kind : str
-        Name of a class: `TooLargeError` where the file became too long; otherwise what was raised, or a base of it.
+        Name of an exception class: `TooLargeError` if the file became too large; otherwise the class that was raised,
+        or a base of it.
     reason : str
-        In one line.
+        One line.
     """
 
     kind: str
     reason: str
 
     def error(self) -> LodestreamError:
-        """What was raised, as far as its process can be believed."""
+        """The exception, limited to known classes: the process is not trusted."""
         kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
         return kind(reason_of(self.reason))
 
@@ -112,7 +112,7 @@ def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
     Raises
     ------
     OSError
-        When the disk does not take it, or there is no such container any more.
+        If the disk does not accept it, or the container does not exist any more.
     """
     # Errors come back as values: not every exception survives the way between processes.
     try:

@@ -1,10 +1,10 @@
-"""How much is taken at the same time, and what is left free: whoever comes after that is told to come back.
+"""Limits on what happens at the same time and on disk space; requests beyond them are told to come back.
 
-A *caller*, a token or without one an address, may have as much as it leaves to the others: of uploads under way, of
-builds to do, and of the disk. One alone gets half of what there is, the next half of what is left, so that there is
-always some for whoever has nothing yet. Where nobody else can write there is nobody to leave anything to.
+A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds and bytes on disk
+as it leaves free for the others: one caller alone gets half of everything, the next one half of the rest. So a caller
+that has nothing yet always finds something. The rule does not apply if nobody else can write.
 
-Everything here runs in the event loop, between two awaits, so nothing is counted twice and nothing needs a lock.
+Everything here runs in the event loop, between two awaits, so no lock is needed.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ _LAST_SECONDS = 2.0
 
 
 class Limits:
-    """What the server has taken on.
+    """Counts what the server has accepted, and refuses what exceeds the limits.
 
     Parameters
     ----------
     settings : Settings
     folder : Path
-        On the disk that is to be left room.
+        A folder on the disk whose space is limited.
     surfaces : callable
-        How many surfaces there are.
+        Returns the number of surfaces.
     builds : callable (caller) -> (int, int)
-        How many builds wait or run: all of them, and those of the caller with this key.
+        Returns how many builds wait or run: all of them, and those of the caller with this key.
     kept : callable (owner) -> int
-        How many bytes are kept on the disk for the surfaces of this owner.
+        Returns the bytes on disk of an owner's surfaces.
     alone : callable
-        Whether there is nobody to share with.
+        Returns whether there is nobody to share with.
     """
 
     def __init__(
@@ -78,23 +78,23 @@ class Limits:
 
     @contextmanager
     def stream(self, client: str) -> Iterator[None]:
-        """Be one of the streams that are open.
+        """Count an open stream for the length of the block.
 
         Parameters
         ----------
         client : str
-            Key of whoever reads it.
+            Key of the client that reads it.
 
         Raises
         ------
         BusyError
-            When there are as many as there may be.
+            If the server has as many as allowed.
         TooManyError
-            When this client has as many as one may have.
+            If this client has as many as allowed.
         """
         most, most_each = self._settings.max_streams, self._settings.max_client_streams
         if self._streams.total() >= most:
-            raise BusyError(f"expected at most {most} streams at the same time; come back in a few seconds")
+            raise BusyError(f"expected at most {most} streams at the same time; try again in a few seconds")
         if self._streams[client] >= most_each:
             raise TooManyError(f"expected at most {most_each} streams of one client at the same time; end one of them")
         self._streams[client] += 1
@@ -105,27 +105,29 @@ class Limits:
 
     @contextmanager
     def opening(self, client: str) -> Iterator[None]:
-        """Be one of the connections that have yet to show a token; as many as streams, and beside them.
+        """Count a connection that has not shown a token yet. The limit equals that of streams, and is separate from it.
 
         Parameters
         ----------
         client : str
-            Key of the address that it comes from.
+            Key of the client's address.
 
         Raises
         ------
         BusyError
-            When there are as many as there may be.
+            If the server has as many as allowed.
         TooManyError
-            When this client has as many as are left to the others.
+            If this client has as many as are left for the others.
         """
         most, there, own = self._settings.max_streams, self._openings.total(), self._openings[client]
         if there >= most:
-            raise BusyError(f"expected at most {most} connections that show no token yet; come back in a few seconds")
+            raise BusyError(
+                f"expected at most {most} connections that have not sent a token yet; try again in a few seconds"
+            )
         if own >= most - there:
             raise TooManyError(
-                f"expected no more connections of one address that show no token yet than are left to others, "
-                f"got {own} and {most - there} left of {most}"
+                f"expected one address to leave as many connections without a token to others as it has, got {own}, "
+                f"with {most - there} of {most} left"
             )
         self._openings[client] += 1
         try:
@@ -135,23 +137,23 @@ class Limits:
 
     @asynccontextmanager
     async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
-        """Be one of the uploads under way: the request, which watches its own body as it comes.
+        """Count an upload in progress; yields a request that checks the limits while its body arrives.
 
-        One that is not stored needs no room and makes no surface, so that only the number of uploads is a limit to it.
+        An upload that is not stored needs no disk space and makes no surface, so only the number of uploads limits it.
 
         Raises
         ------
         BusyError
-            When there are as many uploads or builds as there may be.
+            If the server has as many uploads or builds as allowed.
         TooManyError
-            When the caller has as many of them as one may have.
+            If the caller has as many as allowed.
         FullError
-            When there are as many surfaces as there may be, the caller has as much on the disk as one may have, or the
-            disk has no room for what the caller's uploads say they are.
+            If there are as many surfaces as allowed, the caller uses as much disk space as allowed, or the disk has no
+            room for the announced sizes of the caller's uploads.
         RestartingError
-            When the server ends meanwhile.
+            If the server ends meanwhile.
         """
-        self._check_share("uploads at the same time", self._settings.max_uploads, self._count(caller.key), caller)
+        self._check_share("uploads in progress", self._settings.max_uploads, self._count(caller.key), caller)
         if stored:
             self.check_builds(caller)
             self._check_surfaces()
@@ -177,53 +179,53 @@ class Limits:
             _subtract(self._taken, caller.owner, room.taken)
 
     def end(self) -> None:
-        """The server ends: uploads that are not whole soon do, too."""
+        """The server ends: uploads that are not complete soon are ended too."""
         for clock in self._uploads:
             clock.reschedule(asyncio.get_running_loop().time() + _LAST_SECONDS)
 
     def check_builds(self, caller: Caller) -> None:
-        """Look whether there may be one more build.
+        """Check that one more build is allowed.
 
         Raises
         ------
         BusyError, TooManyError
-            When there are as many as there may be, or the caller has as many as one may have.
+            If the server, or the caller, has as many as allowed.
         """
-        self._check_share("builds to do", self._settings.max_builds, self._builds(caller.key), caller)
+        self._check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
 
     async def check_disk(self, caller: Caller, *, new: bool) -> None:
-        """Look whether everything that a caller has promised has room.
+        """Check that everything that a caller has announced fits on the disk.
 
-        What others have promised is not counted: it takes no room before it has come.
+        Sizes that other callers have announced are not counted, because they use no space before their data arrive.
 
         Parameters
         ----------
         caller : Caller
         new : bool
-            Look also whether the caller may have as much: it takes more than it was told it may have.
+            Also check the caller's share, because the upload is new or exceeds its announced size.
 
         Raises
         ------
         FullError
-            When it has no room, or the caller may not have as much.
+            If it does not fit, or exceeds the caller's share.
         """
         free, kept = await self._free()
         promised = self._promised[caller.key]
         if free < promised:
             raise FullError(
-                f"expected room for the upload beside the {kept} bytes that stay free on the server's disk, got "
-                f"{max(free, 0)} bytes for all uploads of {caller.name}; remove surfaces or enlarge the disk"
+                f"expected disk space for the upload beside the {kept} bytes that the server keeps free, got "
+                f"{max(free, 0)} bytes for all uploads of {caller.name}; delete surfaces or enlarge the disk"
             )
         if new:
             self._check_bytes(caller.owner, free, promised)
 
     async def check_owner(self, owner: str | None) -> None:
-        """Look whether an owner has no more on the disk than one may have; FullError when there is more."""
+        """Check that an owner uses no more disk space than allowed; raises FullError otherwise."""
         free, _ = await self._free()
         self._check_bytes(owner, free, 0)
 
     async def room(self) -> int:
-        """Bytes that something else may take of the disk beside what stays free; a promise takes nothing yet."""
+        """Bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
         return max((await self._free())[0], 0)
 
     async def _free(self) -> tuple[int, int]:
@@ -240,16 +242,16 @@ class Limits:
         if most is None:
             if self._alone():
                 return
-            most, why = (has + free) // 2, ", half of what they have there and what is free"
+            most, why = (has + free) // 2, ", half of what they use there plus what is free"
         if has + promised > most:
             whose = "those without a token" if owner is None else owner
             raise FullError(
                 f"expected at most {most} bytes of {whose} on the server's disk{why}, got {has} bytes and {promised} "
-                "to come; remove some of their surfaces"
+                "to come; delete some of their surfaces"
             )
 
     def took(self, room: _Room, size: int) -> None:
-        """Some bytes of an upload have come: what is on the disk is promised no more."""
+        """Count bytes of an upload that have arrived; they are no longer announced but used."""
         room.taken += size
         self._taken[room.caller.owner] += size
         size = min(size, room.promised)
@@ -263,17 +265,17 @@ class Limits:
     def _check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
         everybody, own = there
         if everybody >= most:
-            raise BusyError(f"expected at most {most} {what} on this server, and there are as many; come back soon")
+            raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
         if own >= most - everybody and not self._alone():
             raise TooManyError(
-                f"expected no more {what} of {caller.name} than are left to others, got {own} of theirs and "
-                f"{most - everybody} left of {most}; come back when some of theirs are done"
+                f"expected {caller.name} to leave as many {what} to others as they have, got {own}, with "
+                f"{most - everybody} of {most} left; try again when some are done"
             )
 
     def _check_surfaces(self) -> None:
         most = self._settings.max_surfaces
         if self._surfaces() >= most:
-            raise FullError(f"expected at most {most} surfaces on this server; remove some of them")
+            raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
 
 
 class _Room:

@@ -1,4 +1,4 @@
-"""The log: lines of words and fields, for people or as JSON, each with the id of the request that it belongs to."""
+"""The log: text or JSON lines with fields, each with the id of the request that it belongs to."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ _PLAIN = re.compile(r"[A-Za-z0-9._:/@+*,;<>()\[\]-]+", re.ASCII)
 
 
 def configure(style: str, level: str) -> None:
-    """Write the log to standard error, without ever waiting for whoever reads it.
+    """Write the log to standard error, without waiting for its reader.
 
     Parameters
     ----------
     style : "text" or "json"
     level : str
-        The least that is worth a line, of what this server says; libraries are heard from ``warning`` on.
+        Least severe messages of this server that are logged; libraries are logged from ``warning`` on.
     """
     handler = _Patient()
     handler.setFormatter(_Json() if style == "json" else _Text())
@@ -60,25 +60,25 @@ def configure(style: str, level: str) -> None:
 
 
 def drain() -> None:
-    """Give whoever reads the log a second to take what is left of it."""
+    """Wait up to a second until the log has been written."""
     for handler in logging.getLogger().handlers:
         handler.flush()
 
 
 def event(log: logging.Logger, words: str, level: int = logging.INFO, **fields: Any) -> None:
-    """Say that something has happened, and what is known of it."""
+    """Log an event with its fields."""
     log.log(level, words, extra={_FIELDS: fields})
 
 
 def new_request(offered: str | None) -> str:
-    """Begin a request; its id, which is what the client or a proxy calls it, if that is usable."""
+    """Begin a request; returns its id, which is the one that the client or a proxy sent if that is usable."""
     name = offered if offered is not None and _USABLE_ID.fullmatch(offered) else secrets.token_hex(8)
     _request.set(name)
     return name
 
 
 def request_id() -> str | None:
-    """The id of the request that is being answered."""
+    """The id of the current request."""
     return _request.get()
 
 
@@ -156,7 +156,10 @@ class _Patient(logging.Handler):
                     continue
                 self._idle.clear()
             if self._lost:
-                line, self._lost = f"{self._lost} lines of the log were lost, since nobody took them\n{line}", 0
+                line, self._lost = (
+                    f"{self._lost} log lines were dropped, because the reader of the log was too slow\n{line}",
+                    0,
+                )
             data = f"{line}\n".encode("utf-8", "backslashreplace")
             try:
                 # Not through Python's own stream, whose lock would be held when the process ends.

@@ -1,8 +1,8 @@
-"""Markers: do these folders belong together, and are all of them there?
+"""Marker files: do these folders belong together, and are all of them there?
 
-A folder that is not mounted looks like an empty one. So each folder of what was acknowledged holds a file ``identity``
-with one and the same random number. A server does not start where a marker is missing or another's: what it would take
-for lost is only elsewhere.
+A folder that is not mounted looks like an empty one. So each of the three folders holds a file ``identity`` with the
+same random number. A server does not start if one is missing or different, because data that seem lost may only be
+elsewhere.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ _IDENTITY = re.compile(rb"[0-9a-f]{32}\n")
 
 
 def establish(at: Folders) -> str:
-    """Check the markers; a folder that has none yet, a new one or one of an earlier version, is marked.
+    """Check the markers; create them in a new folder or in one of an earlier version.
 
     Returns
     -------
     str
-        What each of them says.
+        The number in the markers.
 
     Raises
     ------
     LodestreamError
-        When a marker is missing or another's, or a folder without markers does not have what its records speak of.
+        If a marker is missing or different, or if a folder without markers lacks what its records refer to.
     OSError
-        When the folders cannot be read or written.
+        If the folders cannot be read or written.
     """
     marking = _read(at.root / _MARKING)
     problem = fault(at)
     if problem is not None:
         raise LodestreamError(
-            f"{problem}. Is a disk not mounted? Nothing was changed. Where the folders were moved here on purpose, "
-            f"`lodestream fsck --adopt {at.root}` says that they belong together"
+            f"{problem}. Is a disk not mounted? Nothing was changed. If the folders were moved here on purpose, run "
+            f"`lodestream fsck --adopt {at.root}`"
         )
     found = identity(at.records)
     if marking is None and found is not None and all(identity(folder) for folder in at.kept):
@@ -59,20 +59,20 @@ def establish(at: Folders) -> str:
 
 
 def identity(folder: Path) -> str | None:
-    """What the marker in a folder says; None where there is none.
+    """The number in the marker of a folder; None if there is no marker.
 
     Raises
     ------
     LodestreamError
-        When it is no marker.
+        If the file is not a marker.
     OSError
-        When it cannot be read.
+        If it cannot be read.
     """
     return _read(folder / MARKER)
 
 
 def fault(at: Folders) -> str | None:
-    """Why a server would not start in a folder; None where it would."""
+    """The reason why a server would not start in a folder; None if it would."""
     marking = _read(at.root / _MARKING)
     found = {folder: identity(folder) for folder in at.kept}
     known = {mark for mark in (*found.values(), marking) if mark is not None}
@@ -88,12 +88,12 @@ def fault(at: Folders) -> str | None:
 
 
 def adopt(at: Folders) -> None:
-    """Mark the folders as belonging together, whatever marked them before; what is not there is made.
+    """Mark the folders as belonging together, whatever their markers say; missing folders are created.
 
     Raises
     ------
     OSError
-        When the folders cannot be read or written.
+        If the folders cannot be read or written.
     """
     for folder in at.kept:
         remove(folder / MARKER)
@@ -108,13 +108,15 @@ def _fault_of_unmarked(at: Folders) -> str | None:
         if any(at.tombstones()) or not (has_uploads or has_containers):
             return None
         there = " and ".join(name for name, has in (("uploads/", has_uploads), ("containers/", has_containers)) if has)
-        return f"expected records in records/ of {at.root}, which has no marker yet, got none beside what is in {there}"
+        return (
+            f"expected records in records/ of {at.root}, which has no marker yet, got none although there are {there}"
+        )
     needed = _needed(at)
     for folder, has in ((at.uploads, has_uploads), (at.containers, has_containers)):
         if folder in needed and not has:
             return (
-                f"expected in {folder.name}/ of {at.root}, which has no marker yet, what {needed[folder]} of its "
-                "records speak of, got nothing"
+                f"expected in {folder.name}/ of {at.root}, which has no marker yet, the files that {needed[folder]} of "
+                "its records refer to, got none"
             )
     return None
 

@@ -1,4 +1,4 @@
-"""What the server counts and measures, for Prometheus."""
+"""Metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BUILD_SECONDS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 
 
 class Metrics:
-    """The figures of one server, in a registry of its own."""
+    """The metrics of one server, in a registry of its own."""
 
     media_type = CONTENT_TYPE_LATEST
 
@@ -34,63 +34,69 @@ class Metrics:
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         self._requests = self._counter("requests", "HTTP requests answered", "method", "route", "status")
-        self._request_seconds = self._histogram("request_seconds", "from a request to the end of its answer", _SECONDS)
-        self._errors = self._counter("errors", "requests and streams refused or failed, by kind", "kind")
+        self._request_seconds = self._histogram(
+            "request_seconds", "time from a request to the end of its answer", _SECONDS
+        )
+        self._errors = self._counter("errors", "refused or failed requests and streams, by kind", "kind")
         self._streams_open = Gauge("lodestream_streams_open", "streams open now", registry=self._registry)
-        self._streams = self._counter("streams", "streams ended, by how", "result")
+        self._streams = self._counter("streams", "ended streams, by result", "result")
         self._first_surface = self._histogram(
-            "first_surface_seconds", "from the open of a stream to the first drawable surface being sent", _SECONDS
+            "first_surface_seconds",
+            "time from the open of a stream until the first drawable surface was sent",
+            _SECONDS,
         )
         self._sent = self._counter("stream_bytes", "bytes of containers sent in streams")
         self._saved = self._counter(
             "stream_saved_bytes",
-            "bytes of surfaces that clients did not hold and were not sent, since they had seen enough",
+            "bytes that were not sent because the target was met or the client stopped, without those it held",
         )
         self._uploaded = self._counter("upload_bytes", "bytes of uploads received")
         self._build_seconds = self._histogram(
-            "build_seconds", "duration of builds, by what became of them", _BUILD_SECONDS, "state"
+            "build_seconds", "duration of builds, by resulting state", _BUILD_SECONDS, "state"
         )
 
     def watch(self, folder: Path, surfaces: Callable[[], int], builds: Callable[[], int]) -> None:
-        """Look at these whenever somebody asks: the disk of a folder, the surfaces there are, the builds to do."""
+        """Set the sources of gauges: the disk of a folder, the number of surfaces, the number of builds."""
         self._gauge("surfaces", "surfaces in the data folder", surfaces)
         self._gauge("builds_pending", "builds that wait or run", builds)
-        self._gauge("disk_free_bytes", "free space where the data lies", lambda: shutil.disk_usage(folder).free)
+        self._gauge(
+            "disk_free_bytes", "free space on the disk of the data folder", lambda: shutil.disk_usage(folder).free
+        )
 
     def answered(self, method: str, route: str, status: int, seconds: float) -> None:
-        """An HTTP request is over."""
+        """Count an HTTP request that was answered."""
         self._requests.labels(method, route, status).inc()
         self._request_seconds.observe(seconds)
 
     def failed(self, kind: str) -> None:
-        """Something was refused or failed; the kind is the ``code`` of a problem document or an ``error``."""
+        """Count a refusal or failure; the kind is the ``code`` of a problem document or an ``error``."""
         self._errors.labels(kind).inc()
 
     def stream_opened(self) -> None:
-        """A stream has begun."""
+        """Count a stream that has begun."""
         self._streams_open.inc()
 
     def first_surface(self, seconds: float) -> None:
-        """The first layer or level of a stream has been sent."""
+        """Record the time until the first layer or level of a stream was sent."""
         self._first_surface.observe(seconds)
 
     def stream_ended(self, result: str, sent: int, saved: int) -> None:
-        """A stream is over."""
+        """Count a stream that has ended."""
         self._streams_open.dec()
         self._streams.labels(result).inc()
         self._sent.inc(sent)
         self._saved.inc(saved)
 
     def uploaded(self, size: int) -> None:
-        """An upload has come."""
+        """Count the bytes of an upload."""
         self._uploaded.inc(size)
 
     def built(self, state: str, seconds: float) -> None:
-        """A build is over."""
+        """Record the duration of a build."""
         self._build_seconds.labels(state).observe(seconds)
 
     def text(self) -> bytes:
-        """All of it, as Prometheus reads it."""
+        """All metrics in Prometheus' text format."""
         return generate_latest(self._registry)
 
     def _counter(self, name: str, meaning: str, *labels: str) -> Counter:

@@ -1,4 +1,4 @@
-"""What is written down of every request: an id, a line in the log, figures."""
+"""Id, log line and metrics of every request."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ _METHODS = {"DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT"}
 
 
 class Observation:
-    """ASGI middleware around everything else.
+    """The outermost ASGI middleware.
 
     Parameters
     ----------
-    app : ASGI application
-    metrics : Metrics
+    app : ASGI application metrics : Metrics
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -33,7 +32,7 @@ class Observation:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, and watch."""
+        """Pass a request on, and record it."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return

@@ -1,4 +1,4 @@
-"""How many files this process may have open, and how many connections that is enough for."""
+"""The limit of open files of this process, and how many connections it allows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OTHER_FILES = 40
 
 
 def raise_file_limit(settings: Settings) -> None:
-    """Let this process open as many files as it may need, or as many as the system lets it."""
+    """Raise this process's limit of open files to what it may need, or as far as the system allows."""
     wanted = _MOST if settings.max_connections is None else settings.max_connections
     needed = _FILES_EACH * wanted + _others(settings)
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -44,7 +44,7 @@ def raise_file_limit(settings: Settings) -> None:
 
 
 def most_connections(settings: Settings) -> int:
-    """How many connections there may be: what the settings say, or what the open files are enough for."""
+    """The largest number of connections: that of the settings, or what the limit of open files allows."""
     if settings.max_connections is not None:
         return settings.max_connections
     soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]

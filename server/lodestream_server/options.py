@@ -1,4 +1,4 @@
-"""The query of an upload: the surface options, and what can be said of an upload at once."""
+"""The query of an upload: the surface options, and early checks of an upload."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class SurfaceOptions:
     Attributes
     ----------
     name : str or None
-        What the surface is to be called.
+        Name of the surface.
     filename : str or None
-        Name of the file, where the body does not tell it.
+        Name of the file, if the body has none.
     chosen : mapping of str to str
-        ``precision`` and ``rms`` in one spelling, ``precision=NAME`` for attributes, ``closed`` unless it is auto, and
-        options of the format as they came: what makes another surface of the same bytes.
+        The options that distinguish surfaces made from the same bytes: ``precision`` and ``rms`` in canonical spelling,
+        ``precision=NAME`` of attributes, ``closed`` unless it is auto, and options of the format as given.
     """
 
     name: str | None
@@ -44,13 +44,13 @@ class SurfaceOptions:
 
     @classmethod
     def parse(cls, query: Iterable[tuple[str, str]]) -> SurfaceOptions:
-        """Read a query; what is not an option of every surface is taken for one of the format.
+        """Parse a query; unknown keys are taken for options of the format.
 
         Raises
         ------
         OptionError
-            When a value is not one that its option takes, an option stands there twice, or both a precision and a root
-            mean square error of the points do.
+            If a value is invalid, an option is given twice, or both a precision and a root mean square error of the
+            points are given.
         """
         values: dict[str, str] = {}
         for key, value in query:
@@ -82,25 +82,25 @@ def check(
     options: SurfaceOptions,
     allowed: Collection[str] | None = None,
 ) -> Format:
-    """Refuse what a look at the first bytes shows to be wrong; the first file's format.
+    """Check an upload as far as its first bytes allow; returns the first file's format.
 
     Parameters
     ----------
     files : list of Path
     names : list of (str or None)
-        What their owner calls them.
+        Original names of the files.
     options : SurfaceOptions
     allowed : collection of str or None
-        Names of the formats that this server reads; None for all.
+        Names of the formats that this server reads; None: all.
 
     Raises
     ------
     FormatError
-        When a file is of no format that can be read.
+        If the format of a file is unknown or cannot be read.
     SwitchedOffError
-        When the first file, whose format reads the others too, is of one that this server does not read.
+        If this server does not read the format of the first file, which decides about the others.
     OptionError
-        When the format has no such option.
+        If the format has no such option.
     """
     from lodestream.formats import formats, sniff
 
@@ -132,9 +132,10 @@ def _check_allowed(formats: Sequence[str], filename: str | None, allowed: Collec
 def identify(
     digest: hashlib._Hash, format_: Format, filename: str | None, options: SurfaceOptions, owner: str | None
 ) -> str:
-    """The id of a surface: 20 hexadecimal digits of SHA-256 over the upload's bytes, format, options, name and owner.
+    """The id of a surface: 20 hexadecimal digits of a SHA-256 over the upload's bytes, format, options, name and owner.
 
-    What the name of the first file tells, like the place of an .hgt, counts as an option; the name itself does not.
+    What the name of the first file implies, such as the position of an .hgt, counts as an option; the file's name
+    itself does not count.
     """
     told = dict(format_.named(filename)) if format_.named and filename else {}
     whole = digest.copy()
@@ -147,10 +148,10 @@ def identify(
 
 
 def plain_name(text: str) -> str | None:
-    """A name as it is shown to people: the last part of a path, and nothing that could upset a terminal."""
+    """A name for display: the last part of a path, without characters that are unsafe on a terminal."""
     return printable(text.replace("\\", "/").rpartition("/")[2])
 
 
 def printable(text: str) -> str | None:
-    """A name without what could upset a terminal, as a stranger's container may have it."""
+    """A name without characters that are unsafe on a terminal; names come from strangers' containers too."""
     return "".join(character for character in text if character.isprintable())[:_LONGEST_NAME].strip() or None

@@ -1,9 +1,9 @@
-"""Work that can wait: a few pieces of it in each turn of the event loop.
+"""Spreading work that can wait over iterations of the event loop.
 
-A turn of the loop runs everything that is ready, and a request needs several turns. Of a thousand connections that have
-something to do at the same time each does a millisecond, and a turn takes a second. So whatever may come in such
-numbers is done here, in the order in which it came, and a turn stays short. Probes do not wait: an operator must not
-take a server for dead that is busy and well.
+An iteration of the loop runs every callback that is ready, and a request needs several iterations. If a thousand
+connections each have a millisecond of work at the same time, an iteration takes a second. So work that may come in such
+numbers is done here, in order of arrival, a few pieces in each iteration. Health checks do not wait: a server that is
+busy must not look dead.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _PROBES = {"/healthz", "/readyz"}
 
 
 class Pace:
-    """Does what can wait; only within the event loop."""
+    """Runs work that can wait; to be used from the event loop only."""
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[Callable[[], object], Context]] = deque()
 
     def later(self, work: Callable[[], object]) -> None:
-        """Call this in one of the next turns.
+        """Call a function in one of the next iterations.
 
         Parameters
         ----------
         work : callable
-            Takes a few milliseconds at the most; what it raises goes to the loop's handler of exceptions.
+            Takes a few milliseconds at most; its exceptions go to the loop's exception handler.
         """
         if not self._waiting:
             asyncio.get_running_loop().call_soon(self._some, context=Context())
@@ -62,12 +62,11 @@ class Pace:
 
 
 class Paced:
-    """ASGI middleware: requests begin in turn, probes at once.
+    """ASGI middleware: requests begin in turn, health checks at once.
 
     Parameters
     ----------
-    app : ASGI application
-    pace : Pace
+    app : ASGI application pace : Pace
     """
 
     def __init__(self, app: ASGIApp, pace: Pace) -> None:
@@ -75,7 +74,7 @@ class Paced:
         self._pace = pace
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through in its turn."""
+        """Pass a request on in its turn."""
         if scope["type"] in ("http", "websocket"):
             path: str = scope["path"]
             if path.removeprefix(scope.get("root_path", "")) not in _PROBES:

@@ -18,10 +18,10 @@ __all__ = ["router"]
 router = APIRouter(tags=["server"])
 
 _HOME = f"""<h1>Lodestream {lodestream.__version__}</h1>
-<p>This server sends structured surfaces over the network, coarsest level first. The error is known at every moment.</p>
+<p>This server streams structured surfaces, coarsest level first. The error is known at each step.</p>
 <pre>
 lodestream push surface.npy HOST      upload
-lodestream list HOST                  what is here
+lodestream list HOST                  list the surfaces
 lodestream pull URL out.npy --until-rms 1e-3d
 </pre>
 <ul>
@@ -34,7 +34,7 @@ lodestream pull URL out.npy --until-rms 1e-3d
 @readable(router, "/", include_in_schema=False)
 @needs(None)
 async def home() -> Response:
-    """What this is, for whoever opens it in a browser."""
+    """A start page for browsers."""
     return html_page("Lodestream", _HOME)
 
 
@@ -71,9 +71,9 @@ async def healthz() -> Response:
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Say whether the kernels are compiled; before that the server works, but the first build waits for them.
+    """Whether the kernels are compiled. Before that the server works, but the first build waits for them.
 
-    ``confinement`` is what the kernel holds builds to: ``landlock+seccomp``, one of the two, or ``none``.
+    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``.
     """
     confinement = parts.builder.confinement
     if parts.builder.ready:
@@ -90,7 +90,7 @@ async def readyz(parts: Parts) -> Response:
 )
 @needs("admin")
 async def metrics(parts: Parts) -> Response:
-    """What the server has counted and measured since it started."""
+    """All metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
 
 

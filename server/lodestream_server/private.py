@@ -1,4 +1,4 @@
-"""Folders that are their owner's alone, and can be written by them."""
+"""Folders that only their owner can access."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _OTHERS = 0o077
 
 
 def make_private(folder: Path) -> bool:
-    """Make a folder into which its owner alone can look; whether there was none.
+    """Create a folder that only its owner can access; returns whether it is new.
 
     Raises
     ------
     OSError
-        When it cannot be made, or something else is in its place.
+        If it cannot be created, or something else has this name.
     """
     try:
         folder.mkdir(_PRIVATE, parents=True)
@@ -40,47 +40,49 @@ def make_private(folder: Path) -> bool:
 
 
 def tighten(folder: Path, known: Collection[str]) -> None:
-    """Take away from others what they may do in a folder that there was; where that cannot be, the log warns.
+    """Remove other users' rights to an existing folder; if that is not possible, log a warning.
 
     Parameters
     ----------
     folder : Path
     known : collection of str
-        Names of what belongs into it. A folder that holds anything else is left as it is: it may be somebody's home.
+        Names of files that belong there. A folder with any other file is not changed: it may be somebody's home.
 
     Raises
     ------
     OSError
-        When the folder cannot be read.
+        If the folder cannot be read.
     """
     mode = stat.S_IMODE(folder.stat().st_mode)
     if not mode & _OTHERS:
         return
     strange = sorted(name for name in os.listdir(folder) if name not in known)
-    reason = f"it holds {strange[0]!a}, which is not ours" if strange else None
+    reason = f"it contains {strange[0]!a}, which is not a file of Lodestream" if strange else None
     if reason is None:
         try:
             folder.chmod(mode & ~_OTHERS)
         except OSError as error:
             reason = error.strerror
     if reason is None:
-        _log.info("%s was open to others (mode %03o) and is its owner's alone now", folder, mode)
+        _log.info("removed the rights of other users to %s (mode %03o)", folder, mode)
     else:
-        _log.warning("others can look into %s (mode %03o), which stays so (%s): chmod 700 it", folder, mode, reason)
+        _log.warning(
+            "other users have access to %s (mode %03o), which was not changed (%s): run chmod 700", folder, mode, reason
+        )
 
 
 def check_writable(*folders: Path) -> None:
-    """Refuse folders in which nothing can be made, on a disk that is mounted for reading for instance.
+    """Refuse folders that cannot be written, for example on a disk that is mounted read-only.
 
     Parameters
     ----------
     *folders : Path
-        One that is not there yet is none of them.
+        Folders that do not exist are skipped.
 
     Raises
     ------
     LodestreamError
-        Naming the first.
+        Naming the first such folder.
     """
     for folder in folders:
         if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):

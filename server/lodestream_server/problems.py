@@ -1,4 +1,4 @@
-"""Errors as answers: one table from classes to statuses, and problem documents (RFC 9457) made from it."""
+"""Errors as HTTP answers: one table from exception classes to statuses, and problem documents (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -65,59 +65,59 @@ class BuildFailedError(LodestreamError):
 
 
 class PostponedError(LodestreamError):
-    """The surface could not be built for a reason that may pass, and waits."""
+    """The surface could not be built for a reason that may pass; it waits for a retry."""
 
 
 class MissingError(LodestreamError):
-    """What the server has promised to keep is not on its disk now."""
+    """Data that the server should have are not on its disk now."""
 
     headers: ClassVar = {"retry-after": "60"}
 
 
 class NotOwnerError(LodestreamError):
-    """The surface is somebody else's."""
+    """The surface belongs to another owner."""
 
 
 class SlowUploadError(LodestreamError):
-    """Nothing, or too little, came of an upload for too long."""
+    """An upload was too slow, or stopped."""
 
 
 class NoTokenError(LodestreamError):
-    """A token is needed, and none came."""
+    """A token is needed, and there is none."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream"'}
 
 
 class BadTokenError(LodestreamError):
-    """A token came that is not known, or no longer."""
+    """The token is unknown, expired or revoked."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="invalid_token"'}
 
 
 class SmallScopeError(LodestreamError):
-    """A token came that does not allow this."""
+    """The token's scope does not allow this."""
 
     headers: ClassVar = {"www-authenticate": 'Bearer realm="lodestream", error="insufficient_scope"'}
 
 
 class ForeignOriginError(LodestreamError):
-    """The page of another site asks."""
+    """A page of another site made the request."""
 
 
 class TooManyError(LodestreamError):
-    """One client has as much at the same time as it may."""
+    """One client has as much in progress as allowed."""
 
     headers: ClassVar = {"retry-after": "5"}
 
 
 class BusyError(LodestreamError):
-    """The server has as much at the same time as it can."""
+    """The server has as much in progress as it can handle."""
 
     headers: ClassVar = {"retry-after": "10"}
 
 
 class RestartingError(LodestreamError):
-    """The server ends, and will be back."""
+    """The server is ending and will be back."""
 
     headers: ClassVar = {"retry-after": "5"}
 
@@ -138,25 +138,25 @@ class _Answer:
 #: The first row whose class fits says what is answered. The codes of streams (`lodestream.messages.CODES`) are the same
 #: words where they mean the same.
 _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
-    (TooLargeError, _Answer(413, "too-large", "More than is allowed")),
-    (OptionError, _Answer(422, "bad-option", "An option that does not exist, or a value that it does not take")),
-    (FormatError, _Answer(422, "bad-file", "Not a file of a structured surface")),
-    (InputError, _Answer(422, "bad-input", "Input that cannot be used")),
-    (UnavailableError, _Answer(501, "unavailable", "This server lacks what that needs")),
+    (TooLargeError, _Answer(413, "too-large", "The request is too large")),
+    (OptionError, _Answer(422, "bad-option", "An option does not exist, or its value is not valid")),
+    (FormatError, _Answer(422, "bad-file", "The file cannot be read as a structured surface")),
+    (InputError, _Answer(422, "bad-input", "The input cannot be used")),
+    (UnavailableError, _Answer(501, "unavailable", "This server lacks a library that this needs")),
     (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
-    (SlowUploadError, _Answer(408, "idle", "Nothing was heard for too long")),
+    (SlowUploadError, _Answer(408, "idle", "The client was too slow")),
     (NoTokenError, _Answer(401, "no-token", "A token is needed")),
-    (BadTokenError, _Answer(403, "bad-token", "A token that is not known, or no longer")),
-    (SmallScopeError, _Answer(403, "small-scope", "A token that does not allow this")),
+    (BadTokenError, _Answer(403, "bad-token", "The token is unknown, expired or revoked")),
+    (SmallScopeError, _Answer(403, "small-scope", "The token's scope does not allow this")),
     (NotOwnerError, _Answer(403, "not-owner", "Only the owner of a surface and an admin may do this")),
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
-    (TooManyError, _Answer(429, "too-many", "More at the same time than one client may have")),
-    (BusyError, _Answer(503, "busy", "As much to do as the server can; come back")),
-    (RestartingError, _Answer(503, "restarting", "The server is restarting; come back")),
-    (FullError, _Answer(507, "full", "There is no room for more")),
+    (TooManyError, _Answer(429, "too-many", "The client has too much in progress")),
+    (BusyError, _Answer(503, "busy", "The server is busy; try again later")),
+    (RestartingError, _Answer(503, "restarting", "The server is restarting; try again")),
+    (FullError, _Answer(507, "full", "There is no space for more")),
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
-    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; ask for another attempt")),
+    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; it waits for a retry")),
     (MissingError, _Answer(503, "missing", "The surface is not on the server's disk now")),
     (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
 )
@@ -184,17 +184,17 @@ def install(app: FastAPI) -> None:
 
 
 def problem(error: Exception) -> tuple[int, str, str, str]:
-    """Status, code, title and detail for an error; an unforeseen one tells nothing of the server's inside."""
+    """Status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
     for kind, answer in _ANSWERS:
         if isinstance(error, kind):
             return answer.status, answer.code, answer.title, str(error)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return _FULL.status, _FULL.code, _FULL.title, "nothing was stored; remove surfaces or enlarge the disk"
+        return _FULL.status, _FULL.code, _FULL.title, "nothing was stored; delete surfaces or enlarge the disk"
     return _INTERNAL.status, _INTERNAL.code, _INTERNAL.title, "the server's log says more"
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What OpenAPI says of routes that answer with these problems."""
+    """OpenAPI responses of routes that answer with these problems."""
     return {
         status: {
             "description": http.HTTPStatus(status).phrase,
@@ -224,7 +224,7 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
 
 async def _gone(request: HTTPConnection, error: Exception) -> Response:
     # Nobody is there to read it.
-    return _document(request, 400, "gone", "The client has gone", "the body ended before it was whole", {})
+    return _document(request, 400, "gone", "The client has gone", "the body ended before it was complete", {})
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -255,7 +255,7 @@ async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     places = [(".".join(map(str, item["loc"])), item["msg"]) for item in error.errors()]
     detail = "; ".join(f"{place}: {message}" for place, message in places)
-    return _document(request, 422, "bad-option", "A parameter that cannot be used", detail, {})
+    return _document(request, 422, "bad-option", "A parameter is not valid", detail, {})
 
 
 def _document(

@@ -1,10 +1,10 @@
-"""Functions called in other processes, each of which has one call, what that call needs, and no more.
+"""Calling functions in separate processes, each with one call and only the rights that the call needs.
 
-The processes are forked from one that has loaded everything (`forkserver`) and knows nothing of strangers. Whatever
-becomes of one of them, the others go on, and the next call finds a new one.
+The processes are forked from one that has loaded everything and has read no untrusted data (`forkserver`). If one of
+them dies, the others continue, and the next call gets a new one.
 
-Nothing that such a process says is believed: its answer is JSON, of bounded length, and made into what its function
-says that it returns, or refused.
+The answer of such a process is not trusted: it is JSON of bounded length, which must have the type that the function
+returns, or it is refused.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ _LONGEST_KIND = 100
 
 # What processes that read strangers' files find in their environment: no secret of whoever started the server.
 _ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
-_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "NUMBA_", "PROJ_", "PYTHON")
+_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "PROJ_", "PYTHON")
 
 # Threads of libraries would not be there in a process that is forked, and a build has one processor.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "NUMBA", "OMP", "OPENBLAS")}
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
 
 _PROGRAM = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
 
@@ -74,24 +74,24 @@ class ProcessDiedError(LodestreamError):
 
 
 class WrongAnswerError(ProcessDiedError):
-    """The process ended with an answer that its function does not give, or made something else than it says."""
+    """The process gave an invalid answer, or did not make what it claims."""
 
     def __init__(self, words: str) -> None:
         super().__init__(0)
-        self.args = (f"its process gave an answer that cannot be used: {words}",)
+        self.args = (f"the process gave an invalid answer: {words}",)
 
 
 class UnforeseenError(LodestreamError):
-    """The function raised.
+    """The function raised an exception.
 
     Attributes
     ----------
     kind : str
         Name of the exception's class.
     errno : int or None
-        Of an operating system's error, its number.
+        Error number of an OSError.
     traceback : str
-        As the process tells it, with a bar before each line.
+        As the process reports it, with a bar before each line.
     """
 
     def __init__(self, kind: str, errno: int | None, traceback: str) -> None:
@@ -102,25 +102,25 @@ class UnforeseenError(LodestreamError):
 
 
 class Call:
-    """One call of a function in another process.
+    """One call of a function in a separate process.
 
     Parameters
     ----------
     function : callable
-        Of a module, under its own name. Its arguments, and what it returns, are what JSON holds, or what pydantic makes
-        of that by the function's annotations: paths, tuples, dataclasses.
+        A function of a module, found by its name. Arguments and result are JSON values, or types that pydantic makes
+        from them by the function's annotations: paths, tuples, dataclasses.
     args : tuple
     seconds : float or None
-        Longest time that it may take, and most processor time.
+        Limit on its duration and on its processor time.
     before : callable or None
         Called in this process when a process is free, before the call begins.
     allowed : Allowed
-        What its process may touch and take: nothing, unless it is said.
+        Rights and limits of its process; by default none.
 
     Attributes
     ----------
     begun : threading.Event
-        Set once a process works for it.
+        Set when a process runs the call.
     """
 
     def __init__(
@@ -143,18 +143,18 @@ class Call:
 
     @property
     def ended(self) -> bool:
-        """Nobody waits for it any more."""
+        """Whether nobody waits for it any more."""
         return self._ended
 
     def attach(self, process: _Process | None) -> None:
-        """Say which process works for it now."""
+        """Set the process that runs it now."""
         with self._lock:
             if self._ended and process is not None:
                 process.kill()
             self._process = process
 
     def end(self) -> None:
-        """Kill the process that works for it, now or as soon as one does."""
+        """Kill the process that runs it, now or as soon as there is one."""
         with self._lock:
             self._ended = True
             if self._process is not None:
@@ -170,15 +170,13 @@ class _Started:
         self.settled = threading.Event()
         self.confinement: tuple[str, ...] | None = None
         self.problem: str | None = None
-        self.note: str | None = None
         self.ready = False
         threading.Thread(target=self._listen, name="lodestream-forkserver", daemon=True).start()
 
     def _listen(self) -> None:
         try:
             self.confinement = tuple(self._message()["confinement"])
-            warmed = self._message()
-            self.problem, self.note = warmed["problem"], warmed["note"]
+            self.problem = self._message()["problem"]
             self.ready = True
         except (EOFError, OSError):
             pass
@@ -200,60 +198,60 @@ class _Started:
 
 
 class ForkServer:
-    """The process from which others are forked, started when it is first needed, and again when it has died.
+    """The process from which others are forked; started when first needed, and again after it has died.
 
     Parameters
     ----------
-    warm : callable or None
-        Called in it without arguments before it forks for the first time; it loads what calls need.
+    preload : callable or None
+        Called in it without arguments before it forks for the first time; it imports what calls need.
     """
 
-    def __init__(self, warm: Callable[[], object] | None = None) -> None:
-        self._warm = "" if warm is None else _name(warm)
+    def __init__(self, preload: Callable[[], object] | None = None) -> None:
+        self._preload = "" if preload is None else _name(preload)
         self._lock = threading.Lock()
         self._started: _Started | None = None
         self._closed = False
 
     @property
     def pid(self) -> int | None:
-        """Number of its process, once it was started."""
+        """Number of its process, once it is started."""
         return None if self._started is None else self._started.process.pid
 
     @property
     def confinement(self) -> tuple[str, ...] | None:
-        """What the kernel holds the processes of calls to, see `lodestream.confinement`; None before it is known."""
+        """How the kernel confines the processes of calls, see `lodestream.confinement`; None before it is known."""
         return None if self._started is None else self._started.confinement
 
-    def wait(self, given_up: Callable[[], bool] = lambda: False) -> tuple[str | None, str | None]:
-        """Start it, and wait until it is ready, or nobody waits any more.
+    def wait(self, given_up: Callable[[], bool] = lambda: False) -> str | None:
+        """Start it, and wait until it is ready, or until `given_up` returns True.
 
         Returns
         -------
-        (str or None, str or None)
-            What went wrong in `warm`, if anything did; and what it returned, if that is a text.
+        str or None
+            What went wrong in `preload`, if anything did.
 
         Raises
         ------
         ProcessDiedError
-            When it ended, or was closed.
+            If it ended, or was closed.
         OSError
-            When it could not be started.
+            If it could not be started.
         """
         started = self._running()
         while not started.settled.wait(_LOOK_SECONDS):
             if given_up():
-                return None, None
+                return None
         if not started.ready:
             raise ProcessDiedError(self._exitcode(started))
-        return started.problem, started.note
+        return started.problem
 
     def fork(self, request: bytes) -> _Process:
-        """A process for a call.
+        """Fork a process for a call.
 
         Raises
         ------
         ProcessDiedError
-            When there is no fork server; the next time another one is started.
+            If there is no fork server; the next call starts another one.
         OSError
         """
         started = self._running()
@@ -273,7 +271,7 @@ class ForkServer:
         return _Process(ours, answer, request)
 
     def close(self) -> None:
-        """End it, with every process that was forked from it and is left."""
+        """End it, with all processes that were forked from it."""
         with self._lock:
             self._closed = True
             started = self._started
@@ -300,7 +298,7 @@ class ForkServer:
             for name, value in os.environ.items()
             if name in _ENVIRONMENT or name.startswith(_ENVIRONMENT_PREFIXES)
         }
-        command = [sys.executable, "-c", program, str(theirs.fileno()), self._warm, path]
+        command = [sys.executable, "-c", program, str(theirs.fileno()), self._preload, path]
         try:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, env=environment | _ONE_THREAD, pass_fds=(theirs.fileno(),)
@@ -319,13 +317,13 @@ class ForkServer:
 
 
 class Pool:
-    """Up to ``size`` calls at a time.
+    """Runs up to ``size`` calls at a time.
 
     Parameters
     ----------
     size : int
     server : ForkServer
-        Others may use it too; whoever made it closes it.
+        May be shared; it is closed by whoever created it.
     """
 
     def __init__(self, size: int, server: ForkServer) -> None:
@@ -336,23 +334,22 @@ class Pool:
         self._closed = False
 
     async def run(self, call: Call) -> Any:
-        """Make a call when its turn comes; what the function returns.
+        """Make a call when a place is free; returns what the function returns.
 
-        Cancelling it kills the process, which has ended when this raises.
+        Cancelling it kills the process; the process has ended when this raises.
 
         Raises
         ------
         ProcessDiedError
-            When the process ended, or gave no answer that its function gives (`WrongAnswerError`).
+            If the process ended, or gave an invalid answer (`WrongAnswerError`).
         TimeoutError
-            When the call took longer than its seconds, or more processor time (then it says so); its process was
-            killed.
+            If the call exceeded its seconds, or its processor time (then the error says so); its process was killed.
         MemoryError
-            When the function ran out of memory.
+            If the function ran out of memory.
         UnforeseenError
-            When the function raised anything else.
+            If the function raised anything else.
         OSError
-            When no process could be started, or from what is called before.
+            If no process could be started, or from `before`.
         """
         future = self._threads.submit(self._run, call)
         waiting = asyncio.wrap_future(future)
@@ -366,7 +363,7 @@ class Pool:
             raise
 
     def close(self) -> None:
-        """Kill every process; calls that are under way raise `ProcessDiedError`."""
+        """Kill all processes; their calls raise `ProcessDiedError`."""
         with self._lock:
             self._closed = True
             for process in self._busy:

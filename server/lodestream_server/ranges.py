@@ -1,7 +1,8 @@
-"""The Range header: which requests for parts of a file are obeyed.
+"""The Range header: which requests for parts of a file are accepted.
 
-The framework's file response cuts the ranges. What it answers in plain text, or should not be asked at all, is sorted
-out before: a header that is no list of byte ranges, or one of very many, is ignored as RFC 9110 (14.2) allows.
+The framework's file response handles ranges. Headers that it would answer in plain text, or should not see at all, are
+handled here first. A header that is not a list of byte ranges, or has very many of them, is ignored, as RFC 9110 (14.2)
+allows.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ _RANGE = re.compile(r"\s*(\d{1,18})-(\d{1,18})?\s*|\s*-(\d{1,18})\s*")
 
 
 def sort_out(request: Request, size: int, etag: str) -> None:
-    """Take a Range header out of a request that is to be answered with the whole file.
+    """Remove the Range header of a request that is to be answered with the whole file.
 
     Raises
     ------
     HTTPException
-        416 when the client asks for bytes beyond the end.
+        416 if the client requests bytes beyond the end.
     """
     header = request.headers.get("range")
     if header is None:

@@ -1,4 +1,4 @@
-"""What the server knows of one surface."""
+"""The server's record of one surface."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ State = Literal["queued", "building", "ready", "failed", "waiting", "missing"]
 
 @dataclass(frozen=True)
 class Record:
-    """One surface: what was uploaded, and what became of it.
+    """One surface: what was uploaded, and its state.
 
     Attributes
     ----------
     id : str
-        20 hexadecimal digits, from the upload's bytes and options, the name and the owner.
+        20 hexadecimal digits, derived from the upload's bytes and options, the name and the owner.
     name : str or None
-        What the surface is called.
+        Name of the surface.
     created : float
         Seconds since 1970.
     filenames : tuple of str
-        Names of the uploaded files, as they were told.
+        Original names of the uploaded files.
     upload_bytes : int
     options : mapping
         ``precision`` or ``rms``, ``precision=NAME`` of attributes, ``closed`` and options of the format, as text.
     state : "queued", "building", "ready", "failed", "waiting" or "missing"
-        ``failed``: a reader refused the bytes. ``waiting``: they could not be built here, for a reason that may pass;
-        somebody has to ask for another attempt. ``missing``: neither the upload nor the container is on the disk.
-        On disk a build that has begun is still queued, since after a restart it begins again, and nothing is missing,
-        since what is there is looked for at every start.
+        ``failed``: a reader rejected the file. ``waiting``: it could not be built for a reason that may pass, and needs
+        a retry. ``missing``: neither the upload nor the container is on disk. On disk a running build is ``queued``,
+        because it begins again after a restart, and nothing is ``missing``, because every start looks for the files
+        again.
     reason : str or None
         Why it failed, waits or is missing, in one line.
     container : str or None
@@ -46,17 +46,17 @@ class Record:
     info : mapping or None
         What ``lodestream info --json`` prints of that container.
     upload_sha256 : str or None
-        SHA-256 over the files and their lengths, as `uploads.Upload` computes it; None where an earlier version of the
-        server took the upload, or where the upload is lost.
+        SHA-256 over the files and their lengths, as `uploads.Upload` computes it; None if an earlier version of the
+        server took the upload, or if the upload is lost.
     attempts : int
-        Builds that were begun and of whose end nothing is known: the server itself died under them.
+        Builds that began and did not end because the server itself died.
     upload_lost : bool
-        The upload was damaged and set aside; the container is all there is.
+        Whether the upload was damaged and moved away, so that only the container is left.
     upload : str or None
-        Name of the folder of the uploaded files; None where an earlier version of the server took them, which named it
-        by the surface.
+        Name of the folder of the uploaded files; None if an earlier version of the server stored them, in a folder
+        named after the surface.
     owner : str or None
-        Name of the token that the surface was pushed with; None where none was shown.
+        Name of the token that the surface was uploaded with; None without a token.
     """
 
     id: str
@@ -81,17 +81,17 @@ class Record:
         return self.upload or self.id
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values that `from_json` takes."""
+        """Plain values that `from_json` accepts."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: Any) -> Record:
-        """The record that these values came from; what a later version has added is left out.
+        """A record from plain values; keys added by later versions are ignored.
 
         Raises
         ------
         ValueError
-            When they are not those of a record, in one line.
+            If they are not those of a record, in one line.
         """
         try:
             return _adapter().validate_python(values)
@@ -107,14 +107,14 @@ def _adapter() -> TypeAdapter[Record]:
 
 
 def read_record(path: Path) -> Record:
-    """The record in a file: that of the surface by which it is named, unless it is called ``record.json``.
+    """Read the record in a file; it must be that of the surface in the file's name, unless that is ``record.json``.
 
     Raises
     ------
     ValueError
-        When it is none, or that of another surface; in one line.
+        If it is not a record, or that of another surface; in one line.
     OSError
-        When it cannot be read.
+        If it cannot be read.
     """
     record = Record.from_json(json.loads(path.read_bytes()))
     if path.name != "record.json" and record.id != path.stem:
@@ -123,18 +123,18 @@ def read_record(path: Path) -> Record:
 
 
 def serialize(record: Record) -> bytes:
-    """A record as it stands in its file.
+    """A record as bytes for its file.
 
     Raises
     ------
     ValueError, TypeError
-        When a value is none that JSON has.
+        If JSON cannot express a value.
     """
     return json.dumps(record.to_json(), ensure_ascii=False, allow_nan=False).encode()
 
 
 def plain(value: Any) -> Any:
-    """A value as it comes back from JSON: numbers that JSON has not are null, bytes are hexadecimal digits."""
+    """A value as JSON would return it: numbers that are not finite become null, bytes become hexadecimal digits."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, bytes):

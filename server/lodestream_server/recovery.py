@@ -1,21 +1,21 @@
-"""What a start does with the folder that it finds: nothing that was acknowledged is removed.
+"""What a server start does with its folder; nothing that was acknowledged is removed.
 
 ============================================  ==========================================================================
-what is found                                 what becomes of it
+what is found                                 what is done
 ============================================  ==========================================================================
-a delete that was under way                   it is finished: somebody asked for it
-an upload with its own record, but none in    the record is written again: the surface is adopted
+a delete in progress                          it is completed, because somebody asked for it
+an upload with its own record, but none in    the record is written again (the surface is adopted)
 ``records/``
-a record that cannot be used                  set aside, and the one beside the upload takes its place; without
-                                              that one it stays, and its surface is missing
-an upload without any record                  set aside
-a container that no record speaks of          set aside, unless it may be that of a surface that has none yet
-a record without its container                it is built again from its upload
-a container of another version than this      it is built again from the upload, and kept until that is done; without
-server reads                                  its upload the surface waits
-a record without its container and upload     it is missing, until they are back or it is deleted
-uploads and builds under way, files half      removed: nobody was told that they are there, or they can be made again
-written, levels that were fetched
+an unusable record                            it is moved away and replaced by the one beside the upload; if there is
+                                              none, it stays, and its surface is missing
+an upload without any record                  it is moved away
+a container that no record refers to          it is moved away, unless it may belong to a surface without a container
+a record without its container                the container is built again from the upload
+a container of another format version         it is built again from the upload, and kept until then; without the
+                                              upload the surface waits
+a record without its container and upload     the surface is missing, until they are back or it is deleted
+uploads and builds in progress, files half    removed: they were not acknowledged, or can be made again
+written, level files
 ============================================  ==========================================================================
 """
 
@@ -39,12 +39,12 @@ _log = logging.getLogger(__name__)
 
 
 def recover(at: Folders) -> list[Record]:
-    """Put a folder in order that no server works in; its records, each with the state in which it is now.
+    """Put a folder in order that no server uses; returns its records, each with its current state.
 
     Raises
     ------
     OSError
-        When something cannot be read, so that it is not known what is there.
+        If something cannot be read, so that it is unknown what is there.
     """
     for folder in (at.incoming, at.work):
         folder.mkdir(exist_ok=True)
@@ -70,12 +70,12 @@ def recover(at: Folders) -> list[Record]:
 
 
 def present(at: Folders, record: Record) -> Record:
-    """A record as what lies on the disk shows it: ready, to be built, waiting for its upload, or missing.
+    """A record with the state that the files on disk show: ready, queued, waiting or missing.
 
     Raises
     ------
     OSError
-        When it cannot be seen what is there.
+        If the files cannot be looked at.
     """
     if record.state == "failed":
         return record
@@ -89,7 +89,7 @@ def present(at: Folders, record: Record) -> Record:
             _log.info("%s is built again: %s", record.id, other)
         return replace(record, state="queued", reason=None)
     if other is not None:
-        return replace(record, state="waiting", reason=f"{other}; its upload is not here to build it again from")
+        return replace(record, state="waiting", reason=f"{other}; its upload is missing, so it cannot be built again")
     if record.state == "missing":  # its record cannot be used, which is the reason
         return record
     reason = "neither its upload nor its container is on the server's disk"
@@ -98,7 +98,7 @@ def present(at: Folders, record: Record) -> Record:
 
 
 def has_container(at: Folders, record: Record) -> bool:
-    """Whether the container of a surface is there, and not of another version than this server reads."""
+    """Whether the container of a surface exists and has the format version that this server reads."""
     if record.container is None:
         return False
     path = at.container(record.container)
@@ -106,24 +106,23 @@ def has_container(at: Folders, record: Record) -> bool:
 
 
 def has_upload(at: Folders, record: Record) -> bool:
-    """Whether every uploaded file of a surface is there."""
+    """Whether all uploaded files of a surface exist."""
     return bool(record.filenames) and all(is_file(path) for path in at.files(record))
 
 
 def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_container: bool) -> None:
-    """Remove what a surface had, once its record has been made a tombstone; the tombstone goes last.
+    """Remove the files of a deleted surface, whose record has been made a tombstone; the tombstone is removed last.
 
     Parameters
     ----------
-    at : Folders
-    record : Record
+    at : Folders record : Record
     last_upload, last_container : bool
-        No other surface has the same. An upload stays all the same if another record lies beside it.
+        Whether no other surface uses the same. An upload also stays if another record lies beside it.
 
     Raises
     ------
     OSError
-        When something cannot be removed; the next start tries again.
+        If something cannot be removed; the next start tries again.
     """
     if last_container and record.container is not None:
         remove(at.container(record.container))
@@ -144,7 +143,7 @@ def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_contai
 
 
 def stray_containers(at: Folders, records: Collection[Record]) -> list[Path]:
-    """Containers that no record speaks of, unless one of them may be that of a surface that has none yet."""
+    """Containers that no record refers to; none if a surface exists whose record may lack its container."""
     if any(record.container is None and record.state != "failed" for record in records):
         return []
     known = {record.container for record in records}
@@ -185,7 +184,7 @@ def _finish(at: Folders, tombstone: Path, records: dict[str, Record], unusable: 
             and all(other.container != record.container for other in others),
         )
     except OSError as error:
-        _log.warning("what is left of %s, which was deleted, could not be removed: %s", record.id, error)
+        _log.warning("the remaining files of %s, which was deleted, could not be removed: %s", record.id, error)
 
 
 def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) -> None:
@@ -195,17 +194,17 @@ def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) ->
             try:
                 record = read_record(path)
             except ValueError as error:
-                _log.warning("%s is no record and is left alone: %s", path, error)
+                _log.warning("%s is not a record and is ignored: %s", path, error)
                 continue
             if record.folder != upload.name or record.id in records or record.id in deleted:
                 continue
             if record.id in unusable:
                 where = set_aside(at, at.record(record.id))
                 _log.warning(
-                    "the record of %s cannot be used (%s) and is now %s", record.id, unusable[record.id], where
+                    "the record of %s cannot be used (%s) and was moved to %s", record.id, unusable[record.id], where
                 )
             write_file(at.record(record.id), serialize(record))
-            _log.warning("%s had no record and has that which lies beside its upload, %s", record.id, path)
+            _log.warning("%s had no record; the copy beside its upload is used: %s", record.id, path)
             records[record.id] = record
 
 
@@ -249,11 +248,11 @@ def _set_strays_aside(at: Folders, records: dict[str, Record]) -> None:
     everything |= {_folder_of(path) for path in at.tombstones()}
     for upload in at.all_uploads():
         if upload.name not in everything and all(record.filenames for record in records.values()):
-            _try_aside(at, upload, "no record speaks of it, and it has none of its own")
+            _try_aside(at, upload, "no record refers to it, and it has no record of its own")
     if any(not record.filenames for record in records.values()):
         return  # it may be that of a record that cannot be used
     for container in stray_containers(at, records.values()):
-        _try_aside(at, container, "no record speaks of it")
+        _try_aside(at, container, "no record refers to it")
 
 
 def _folder_of(tombstone: Path) -> str:
@@ -264,6 +263,6 @@ def _folder_of(tombstone: Path) -> str:
 
 def _try_aside(at: Folders, path: Path, reason: str) -> None:
     try:
-        _log.warning("%s is set aside as %s: %s", path, set_aside(at, path), reason)
+        _log.warning("%s was moved to %s: %s", path, set_aside(at, path), reason)
     except OSError as error:
-        _log.warning("%s could not be set aside (%s) and stays: %s", path, reason, error)
+        _log.warning("%s could not be moved away (%s) and stays: %s", path, reason, error)

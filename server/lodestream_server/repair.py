@@ -1,8 +1,8 @@
-"""Putting a folder in order after `fsck` has found damage.
+"""Repairing a folder in which `fsck` has found damage.
 
-What is damaged is set aside, never deleted. A container is built again from its upload, a record is taken from the copy
-beside the upload. Where the upload itself is damaged, its surface is served as long as its container is whole. Then the
-folder is looked through again, and only what is found no more counts as repaired.
+Damaged files are moved away, never deleted. Containers are built again from their uploads, records are restored from
+the copies beside the uploads. If an upload is damaged, its surface is served as long as its container is sound. Then
+the folder is checked again; only what this check does not find any more counts as repaired.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ __all__ = ["compare", "rebuild", "set_aside"]
 
 
 def set_aside(report: Report) -> None:
-    """Move what is damaged out of the way, and write records that are true of what remains.
+    """Move damaged files away, and write records that match what remains.
 
-    `rebuild` has to follow, or a server's start: what lacks its container is built again then, and what no record
-    speaks of is adopted or set aside.
+    `rebuild` or a server start must follow: it builds missing containers, and adopts or moves away what no record
+    refers to.
 
     Raises
     ------
     OSError
-        When something cannot be moved or written; what was not done stays as it was.
+        If something cannot be moved or written; the rest stays as it was.
     """
     at = Folders(report.folder)
     # Records first: those of an upload that is moved away are told so, whichever of them were lost.
@@ -46,23 +46,22 @@ def set_aside(report: Report) -> None:
 
 
 async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> dict[str, Record]:
-    """Build every surface that is queued, as a server would; the records of all surfaces after that.
+    """Build all queued surfaces, as a server would; returns the records of all surfaces after that.
 
-    Those for which there is no room on the disk stay in the queue.
+    Builds for which there is no disk space stay in the queue.
 
     Parameters
     ----------
-    folder : Path
-    settings : Settings
+    folder : Path settings : Settings
     retry : bool
-        Those that wait for another attempt as well.
+        Whether to build waiting surfaces too.
 
     Raises
     ------
     LodestreamError
-        When another process works in the folder, or not all of it is there.
+        If another process uses the folder, or it is not complete.
     OSError
-        When it cannot be read or written.
+        If it cannot be read or written.
     """
     storage = await asyncio.to_thread(Storage, folder)
     try:
@@ -77,16 +76,16 @@ async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> d
 
 
 def compare(report: Report, again: Report, records: dict[str, Record]) -> None:
-    """Say of each finding what became of it, and add those that only the second look found.
+    """Record what became of each finding, and add findings that only the second check made.
 
     Parameters
     ----------
     report : Report
-        Of the first look; changed.
+        The first check; changed.
     again : Report
-        Of the look after everything was done.
+        The check after the repair.
     records : dict of Record
-        What `rebuild` gave.
+        The result of `rebuild`.
     """
     left = {finding.key: finding for finding in again.findings}
     for number, finding in enumerate(report.findings):
@@ -103,13 +102,13 @@ def _after(finding: Finding, found_again: bool, record: Record | None) -> Findin
     if found_again:
         missing = record is not None and record.state == "missing"
         why = "" if record is None or not record.reason else f": {record.reason}"
-        done.append("there is nothing to make it again from" if missing else f"still so{why}")
+        done.append("there is nothing to build it from" if missing else f"not repaired{why}")
         return replace(finding, repair="; ".join(done), lost=finding.lost or missing)
     if finding.what == "leftover":
-        return replace(finding, repair="removed, or set aside", repaired=True)
+        return replace(finding, repair="removed, or moved away", repaired=True)
     if record is None or record.state == "ready":
         if finding.what in ("container", "record"):
-            done.append("whole again")
+            done.append("sound again")
         elif finding.what == "version":
             done.append("built again")
         return replace(finding, repair="; ".join(done) or "gone", repaired=True)
@@ -136,11 +135,11 @@ def _record(at: Folders, report: Report, finding: Finding) -> Finding:
     surface = finding.surface or ""
     copy = _copy_of(at, surface)
     if copy is None:
-        return replace(finding, repair="left as it is, since there is no other record of this surface", lost=True)
+        return replace(finding, repair="not changed, because there is no other record of this surface", lost=True)
     words = _move(at, finding.path) if is_file(finding.path) else "written again"
     # A container of the surface may be whole, and is found by the hash that its record would name: it is built again.
     _write(at, report, copy)
-    return replace(finding, repair=f"{words}; that beside the upload was taken")
+    return replace(finding, repair=f"{words}; restored from the copy beside the upload")
 
 
 def _copy_of(at: Folders, surface: str) -> Record | None:
@@ -167,19 +166,19 @@ def _upload(at: Folders, report: Report, finding: Finding) -> Finding:
         for other in others:
             _write(at, report, replace(other, upload_lost=True))
     elif report.records[record.id].upload_lost:
-        words = "set aside, as said above"
+        words = "moved away, see above"
     else:
-        return replace(finding, repair="left as it is, since nothing of it is here: is it elsewhere?")
+        return replace(finding, repair="not changed, because none of its files are here")
     if record.state == "ready" and not any(
         other.what == "container" and other.surface == record.id for other in report.findings
     ):
-        return replace(finding, repair=f"{words}; the container is whole and is served")
+        return replace(finding, repair=f"{words}; the container is sound and is served")
     return replace(finding, repair=words)
 
 
 def _container(at: Folders, report: Report, finding: Finding) -> Finding:
     # Another surface with the same container may have set it aside already.
-    return replace(finding, repair=_move(at, finding.path) if finding.path.exists() else "set aside, or gone")
+    return replace(finding, repair=_move(at, finding.path) if finding.path.exists() else "moved away, or missing")
 
 
 def _figures(at: Folders, report: Report, finding: Finding) -> Finding:
@@ -200,7 +199,7 @@ _ACTIONS: dict[str, Callable[[Folders, Report, Finding], Finding]] = {
 
 
 def _move(at: Folders, path: Path) -> str:
-    return f"set aside as {aside.set_aside(at, path).relative_to(at.root)}"
+    return f"moved to {aside.set_aside(at, path).relative_to(at.root)}"
 
 
 def _write(at: Folders, report: Report, record: Record) -> None:

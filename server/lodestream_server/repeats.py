@@ -1,4 +1,4 @@
-"""Failures that are said again and again: told once, then counted, so that none of them fills a disk."""
+"""Repeated warnings and errors: logged once, then counted, so that they do not fill a disk."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class _Told:
 
 
 class Repeats:
-    """What was told lately. Times are seconds of any clock."""
+    """Counts repeated log records. Times are seconds of any clock."""
 
     def __init__(self) -> None:
         self._told: dict[_Key, _Told] = {}
 
     def admit(self, record: logging.LogRecord, now: float) -> bool:
-        """Whether to tell it; warnings and errors that were told less than a minute ago are counted instead."""
+        """Whether to log a record; warnings and errors that were logged less than a minute ago are counted instead."""
         if record.levelno < logging.WARNING:
             return True
         key = _key(record)
@@ -41,7 +41,7 @@ class Repeats:
         return told is None
 
     def due(self, now: float) -> list[logging.LogRecord]:
-        """A line for each that was counted for a minute; what was told once and not again is forgotten."""
+        """A line for each record that was counted for a minute; records that did not repeat are forgotten."""
         lines = []
         for key, told in list(self._told.items()):
             if now - told.at >= SECONDS:
@@ -53,7 +53,7 @@ class Repeats:
         return lines
 
     def all(self) -> list[logging.LogRecord]:
-        """A line for each that was counted, at the end."""
+        """A line for each record that was counted; for use when the server ends."""
         lines = [_line(key, told) for key, told in self._told.items() if told.more]
         self._told.clear()
         return lines

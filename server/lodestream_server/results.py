@@ -1,7 +1,7 @@
-"""What a build says that it has made, and what the server believes of it: the bytes of the container, once looked at.
+"""Checking the result of a build: the server trusts only the bytes of the container, after checking them.
 
-A file may have taken its reader over. So the process of a build has no word in what the server tells or keeps, but
-whether it has built, why not, and whose word the errors of an uploaded container are.
+A file may have taken over the process that reads it. So the process decides only whether it has built, why not, and who
+vouches for the errors of an uploaded container; everything else is read from the container.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _LONGEST_REASON = 2000
 
 
 def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
-    """What is told of the container that a build has made, by the container alone.
+    """The description of the container that a build has made, read from the container alone.
 
-    Nobody writes to it any more: the process has ended, with all that it had started.
+    Nobody writes to it any more: the process has ended, with all processes that it started.
 
     Parameters
     ----------
     path : Path
-        Where the container has to be.
+        Where the container must be.
     built : Built
-        The word of the process.
+        The answer of the process.
     files : sequence of Path
         The upload.
 
@@ -52,11 +52,11 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
     Raises
     ------
     WrongAnswerError
-        When there is no such file, it has not the bytes that it should have, or is no container.
+        If there is no such file, its hash is wrong, or it is not a container.
     TooLargeError
-        When its index would take more memory than all indexes of this server may.
+        If its index would take more memory than all indexes of this server may.
     OSError
-        When it cannot be read.
+        If it cannot be read.
     """
     from lodestream.container import read_index
 
@@ -91,6 +91,6 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
 
 
 def reason_of(text: str) -> str:
-    """A reason that a process gives, in one line that upsets no terminal, and no longer than people read."""
+    """A reason given by a process, as one printable line of limited length."""
     words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
     return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

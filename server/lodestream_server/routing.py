@@ -1,4 +1,4 @@
-"""What the routes share: the server's parts, and answering HEAD wherever GET is answered."""
+"""Code shared by the routes: the server's parts, and HEAD for every GET."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _Route = TypeVar("_Route", bound=Callable[..., Any])
 class State:
     """The parts of a running server.
 
-    ``planning`` is had while a large plan is made, which holds up what else Python does: one at a time.
+    ``planning`` is held while a large plan is made: one at a time, because it slows down all other Python code.
     """
 
     settings: Settings
@@ -58,7 +58,7 @@ Parts = Annotated[State, Depends(_parts)]
 
 
 def readable(router: APIRouter, path: str, **options: Any) -> Callable[[_Route], _Route]:
-    """Answer GET, and HEAD likewise; OpenAPI lists GET."""
+    """Decorator for routes that answer GET, and HEAD in the same way; OpenAPI lists GET only."""
 
     def register(route: _Route) -> _Route:
         router.head(path, include_in_schema=False)(route)
@@ -68,7 +68,7 @@ def readable(router: APIRouter, path: str, **options: Any) -> Callable[[_Route],
 
 
 def matches(header: str | None, etag: str) -> Response | None:
-    """The answer 304 when a client's If-None-Match names what it would get again."""
+    """A 304 answer if the client's If-None-Match names this entity tag, else None."""
     named = [item.strip().removeprefix("W/") for item in (header or "").split(",")]
     if etag in named or "*" in named:
         return Response(status_code=304, headers={"etag": etag})

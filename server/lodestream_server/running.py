@@ -1,4 +1,4 @@
-"""Running a server: uvicorn as Lodestream needs it, and a server beside the caller's own work."""
+"""Running a server: uvicorn configured for Lodestream, and a server in a thread of another program."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _PING_TIMEOUT = 60.0
 
 
 class Server(uvicorn.Server):
-    """A uvicorn server that says where it listens, once it does.
+    """A uvicorn server that reports its address once it listens.
 
     Attributes
     ----------
     refusal : LodestreamError, OSError or None
-        Why its data folder could not be opened, or nothing can listen at its address, so that it did not start.
+        Why it did not start: its data folder could not be opened, or it cannot listen at its address.
     """
 
     def __init__(self, config: uvicorn.Config, data: Path, listening: Callable[[str], None]) -> None:
@@ -52,7 +52,7 @@ class Server(uvicorn.Server):
         self._state = getattr(config.app, "state", None)
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
-        """Open the data folder, listen, start, then tell the address."""
+        """Open the data folder, listen, start, then report the address."""
         assert self._state is not None, "the application is that of `create_app`"
         try:
             storage = await asyncio.to_thread(Storage, self._data)
@@ -77,7 +77,7 @@ class Server(uvicorn.Server):
         self.should_exit = True
 
     async def shutdown(self, sockets: list[Any] | None = None) -> None:
-        """Tell whoever is connected, wait a little for them, and end."""
+        """Notify connected clients, wait a little for them, and end."""
         parts = getattr(self._state, "parts", None)
         if parts is not None:
             parts.limits.end()
@@ -100,12 +100,12 @@ async def _listen(host: str, port: int, backlog: int) -> list[socket.socket]:
         for ours in found:
             ours.close()
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
-        raise LodestreamError(f"expected an address to listen at, got {host} port {port}: {reason}") from None
+        raise LodestreamError(f"cannot listen on {host} port {port}: {reason}") from None
     return found
 
 
 def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
-    """A server that is not running yet.
+    """Create a server that does not run yet.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
 
 
 def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
-    """Run a server that is all that its process does, until it is told to end; the server.
+    """Run a server as the only task of its process, until it is told to end; returns the server.
 
     Parameters
     ----------
@@ -171,12 +171,12 @@ def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
 
 @contextmanager
 def running_server(data: Path, **settings: Any) -> Iterator[str]:
-    """A server on a free port of this machine, in a thread, for as long as the ``with`` block lasts.
+    """A server on a free port of this machine, in a thread, for the length of the ``with`` block.
 
     Parameters
     ----------
     data : Path
-        The server's folder.
+        The server's data folder.
     **settings
         Fields of `Settings`.
 
@@ -188,7 +188,7 @@ def running_server(data: Path, **settings: Any) -> Iterator[str]:
     Raises
     ------
     LodestreamError, OSError
-        When the server does not start.
+        If the server does not start.
     """
     address: list[str] = []
     settled = threading.Event()
@@ -215,9 +215,7 @@ def running_server(data: Path, **settings: Any) -> Iterator[str]:
         if server.refusal is not None:
             raise server.refusal
         if not address:
-            raise LodestreamError(
-                f"expected a server that starts within {_START_SECONDS:g} s; its log says why it did not"
-            )
+            raise LodestreamError(f"the server did not start within {_START_SECONDS:g} s; see its log")
         yield address[0]
     finally:
         server.should_exit = True

@@ -1,4 +1,4 @@
-"""Which scope a request needs: the one that is declared at the route that will answer it."""
+"""The scope that a request needs; it is declared at the route that will answer the request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _READING = {"GET", "HEAD", "OPTIONS"}
 
 
 def needs(scope: str | None) -> Callable[[_Endpoint], _Endpoint]:
-    """Declare at a route which scope it needs; None opens it to everybody.
+    """Decorator that declares the scope of a route; None: open to everybody.
 
     Parameters
     ----------
@@ -34,28 +34,28 @@ def needs(scope: str | None) -> Callable[[_Endpoint], _Endpoint]:
 
 
 def scope_of(route: BaseRoute) -> str | None:
-    """The scope that is declared at a route; one where none is needs ``admin``, so that forgetting opens nothing."""
+    """The scope declared at a route; without a declaration ``admin``, so that a forgotten one opens nothing."""
     declared: str | None = getattr(getattr(route, "endpoint", None), _DECLARED, "admin")
     return declared
 
 
 def routes_of(app: FastAPI) -> list[BaseRoute]:
-    """The routes of an application of `create_app`, in the order in which they are asked."""
+    """The routes of an application of `create_app`, in the order in which they are matched."""
     ours = [route for routes in app.state.routes for route in routes]
     # What was added to the application itself; an included router is none that has a path.
     return ours + [route for route in app.routes if hasattr(route, "path_regex")]
 
 
 def needed_scope(scope: Scope) -> str | None:
-    """The scope that a request needs, None for what is open to everybody.
+    """The scope that a request needs; None if it is open to everybody.
 
-    The routes themselves say which of them will answer. Where none will, a token is needed all the same, to read or to
-    write as the method says, before it is told that there is nothing.
+    The routes themselves decide which of them answers. If none does, a scope for reading or writing is needed all the
+    same, depending on the method, before the answer 404.
 
     Parameters
     ----------
     scope : dict
-        What ASGI says of the request; ``app`` is an application of `create_app`.
+        The ASGI scope of the request; ``app`` is an application of `create_app`.
     """
     for route in routes_of(scope["app"]):
         if route.matches(scope)[0] is Match.FULL:

@@ -1,4 +1,4 @@
-"""The settings of a server: the table's values, checked, from the environment or from whoever makes it; its bounds."""
+"""The settings of a server: values of the table, checked, from the environment or from the caller; and its limits."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ class _Environment(EnvSettingsSource):
 
 
 class Settings(BaseSettings, Bounds):
-    """Settings of a server. Those of `lodestream_server.table` are environment variables too, with the prefix
-    ``LODESTREAM_``; the others are its `Bounds`.
+    """Settings of a server.
+
+    Those of `lodestream_server.table` can also be set by environment variables with the prefix ``LODESTREAM_``; the
+    others are its `Bounds`.
     """
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
@@ -100,18 +102,18 @@ class Settings(BaseSettings, Bounds):
 
     @property
     def tokens(self) -> Path:
-        """The file of token hashes, whether or not there is one."""
+        """Path of the file with the token hashes, whether it exists or not."""
         return self.data / "tokens.json" if self.token_file is None else self.token_file
 
     @property
     def memory_of_build(self) -> int:
-        """Bytes of memory that one build may take."""
+        """Bytes of memory that one build may use."""
         each = max(self._memory // self.workers, _LEAST_BUILD_MEMORY)
         return each if self.build_memory is None else self.build_memory
 
     @property
     def memory_of_levels(self) -> int:
-        """Bytes of memory that the process may take that makes levels."""
+        """Bytes of memory that the process that makes level files may use."""
         return max(self._memory // 2, _LEAST_LEVEL_MEMORY) if self.level_memory is None else self.level_memory
 
     @property

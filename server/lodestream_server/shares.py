@@ -1,6 +1,6 @@
-"""Work that few can do at the same time, in turns that are fair to every caller.
+"""Fair turns for work of which only a little can be done at the same time.
 
-Everything here runs in the event loop, between two awaits, so nothing needs a lock.
+Everything here runs in the event loop, between two awaits, so no lock is needed.
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ _REMEMBERED = 1000
 
 
 class Turns:
-    """Some at a time; of those who wait, the next is a caller who has the fewest turns now and has used least lately.
+    """Gives out a limited number of turns. The next turn goes to the waiting caller with the fewest current turns, and
+    among equals to the one that has used the least time recently.
 
-    So whoever comes with one thing to do waits for no more than one turn to end, however much another has to do.
+    So a caller with one task waits for at most one turn to end, however many tasks another caller has.
 
     Parameters
     ----------
     size : int
-        How many turns there are at the same time.
+        Number of turns at the same time.
     memory : float
-        Seconds after which what was used counts for 1/e of it. A caller who never rested counts for so many seconds.
+        Seconds after which used time counts for 1/e of it. A caller that never pauses counts as having used this many
+        seconds.
     clock : callable
-        Gives seconds.
+        Returns seconds.
     """
 
     def __init__(self, size: int, memory: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -46,14 +48,14 @@ class Turns:
 
     @asynccontextmanager
     async def turn(self, caller: str, rank: int = 0) -> AsyncIterator[None]:
-        """Have a turn, once it is this caller's.
+        """Have a turn for the length of the block, once it is this caller's.
 
         Parameters
         ----------
         caller : str
-            Key of whoever it is done for.
+            Key of the caller.
         rank : int
-            What the same caller wants done comes in the order of its ranks, and of equal ones as it came.
+            Tasks of the same caller run in the order of their ranks, equal ones in order of arrival.
         """
         await self._enter(caller, rank)
         began = self._clock()

@@ -1,7 +1,7 @@
-"""The surfaces of a server: what is kept of them in its folder (`folders`), and what is known of them in memory.
+"""The surfaces of a server: their files in the data folder (`folders`), and their records in memory.
 
-Whatever was acknowledged stays until somebody who may asks for its removal. What a start makes of the folder that it
-finds is told in `recovery`.
+Acknowledged data stay until somebody with the right to do so deletes them. `recovery` says what a start does with the
+folder that it finds.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _STOPPED = ("failed", "waiting", "missing")
 
 
 class Storage:
-    """Surfaces in a folder, safe to use from several threads of one process.
+    """Surfaces in a folder; safe to use from several threads of one process.
 
     Parameters
     ----------
     root : Path
-        The folder; made if there is none.
+        The folder; created if it does not exist.
 
     Raises
     ------
     LodestreamError
-        When another server works in the folder, not all of it is there, or it cannot be written.
+        If another server uses the folder, it is not complete, or it cannot be written.
     OSError
-        When it cannot be read or written.
+        If it cannot be read or written.
     """
 
     def __init__(self, root: Path) -> None:
@@ -71,7 +71,7 @@ class Storage:
             raise
 
     def close(self) -> None:
-        """Leave the folder to others."""
+        """Release the folder."""
         os.close(self._guard)
 
     def __len__(self) -> int:
@@ -99,31 +99,31 @@ class Storage:
         return self._catalog.all()
 
     def records_after(self, position: Position, most: int) -> list[Record]:
-        """At most so many records that come after a place in the order of `records`."""
+        """At most `most` records that come after a position in the order of `records`."""
         return self._catalog.after(position, most)
 
     def records_of(self, upload_sha256: str) -> Iterator[Record]:
-        """The surfaces that were made of files with this hash."""
+        """The surfaces whose uploaded files have this hash."""
         return self._catalog.of_digest(upload_sha256)
 
     def kept(self, owner: str | None) -> int:
-        """How many bytes are kept for the surfaces of an owner."""
+        """Bytes on disk of an owner's surfaces."""
         return self._catalog.kept(owner)
 
     def new_upload(self) -> Path:
-        """An empty folder for the files of an upload, called 0, 1, ..."""
+        """Create an empty folder for the files of an upload, which are named 0, 1, ..."""
         return make_folder(self._at.incoming / secrets.token_hex(8))
 
     def work_folder(self, surface: str) -> Path:
-        """The path of a folder for a build of a surface, to be made when the build begins and removed when it ends.
+        """Path of a folder for a build of a surface; the build creates it when it begins and removes it when it ends.
 
-        One that is still there at the start says that the server ended under the build.
+        A folder that still exists at the next start shows that the server ended during the build.
         """
         return self._at.work / f"{surface}.{secrets.token_hex(8)}"
 
     @property
     def levels(self) -> Path:
-        """A folder for files that can be made again; made and emptied by whoever uses it."""
+        """Path of the folder for level files; it may be removed at any start."""
         return self._at.levels
 
     def upload_files(self, record: Record) -> list[Path]:
@@ -131,14 +131,14 @@ class Storage:
         return self._at.files(record)
 
     def container(self, sha256: str) -> Path:
-        """The path of a container.
+        """Path of a container.
 
         Raises
         ------
         NotFoundError
-            When no surface has it.
+            If no surface has it.
         MissingError
-            When a surface has it, and it is not on the disk.
+            If a surface has it, but it is not on disk.
         """
         path = self._at.container(sha256)
         if not self._catalog.serves(sha256) or not is_file(path):
@@ -146,7 +146,7 @@ class Storage:
         return path
 
     def place_of(self, sha256: str) -> Path:
-        """Where a container lies, or would."""
+        """Path of a container, whether it exists or not."""
         return self._at.container(sha256)
 
     def surfaces_of(self, sha256: str) -> list[str]:
@@ -154,7 +154,7 @@ class Storage:
         return self._catalog.of_container(sha256)
 
     def container_bytes(self, sha256: str) -> int | None:
-        """How long a container was when it was kept; None where it is not known."""
+        """Size of a container when it was stored; None if unknown."""
         record = self._catalog.one_of_container(sha256)
         size = None if record is None or record.info is None else record.info.get("bytes")
         return size if isinstance(size, int) else None
@@ -164,47 +164,47 @@ class Storage:
         return sha256 is not None and self._catalog.has_container(sha256)
 
     def may_have_upload(self, size: int | None, *, form: bool) -> bool:
-        """Whether an upload of so many bytes, or a form around one, may be there already; None: of any size."""
+        """Whether an upload of this size, or a form around one, may exist; None: of any size."""
         return self._catalog.has_size(size, form=form)
 
     def gone(self, sha256: str) -> LodestreamError:
-        """Why a container that was known a moment ago cannot be read: it was deleted since, or its disk is gone."""
+        """Why a container that was known a moment ago cannot be read: it was deleted, or its disk is missing."""
         if self._catalog.has_container(sha256):
             other = other_version(self._at.container(sha256))
             if other is not None:
                 return MissingError(other)
             _log.error("the container %s is not on the disk", sha256)
-            return MissingError(f"expected the container {sha256} on the server's disk, where it is not now")
+            return MissingError(f"the container {sha256} is not on the server's disk now")
         return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
 
     def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
-        """Keep an upload; the surface's record, and whether it is to be built.
+        """Store an upload; returns the surface's record, and whether it must be built.
 
-        A surface that failed, waits or is missing is taken up again. One of the same bytes, options and name as
-        another owner's has its container at once.
+        A surface that failed, waits or is missing is queued again. If another owner has a surface of the same bytes,
+        options and name, its container is used at once.
 
         Parameters
         ----------
         record : Record
             With the hash of its upload.
         upload : Path
-            Folder of the files, as `new_upload` gave it.
+            Folder of the files, from `new_upload`.
 
         Raises
         ------
         InputError
-            When a surface of other bytes has the same id.
+            If a surface of other bytes has the same id.
         MissingError
-            When a folder is not there now.
+            If a folder is not there now.
         OSError
-            When it cannot be kept; then nothing has changed.
+            If it cannot be stored; then nothing has changed.
         """
         with self._lock:
             self._check_mounted()
             known = self._catalog.find(record.id)
             if known is not None and not _may_be(known, record):
                 raise InputError(
-                    f"expected an upload whose id no other has, got one with that of {record.id}; give it another name"
+                    f"expected an upload with a new id, got one with the id of {record.id}; give it another name"
                 )
             if known is not None and known.state not in _STOPPED and has_upload(self._at, known):
                 discard(upload)
@@ -268,21 +268,21 @@ class Storage:
                 remove(placed)
 
     def note(self, surface: str, reason: str | None) -> None:
-        """Say why a surface stays in the queue; not worth writing down."""
+        """Set the reason why a surface stays in the queue; in memory only."""
         with self._lock:
             record = self._catalog.find(surface)
             if record is not None and record.state == "queued":
                 self._catalog.put(replace(record, reason=reason))
 
     def ready(self, surface: str, built: Path, sha256: str, info: dict[str, object]) -> None:
-        """Keep the container that was built for a surface; nothing happens if the surface is gone.
+        """Store the container that was built for a surface; does nothing if the surface was deleted.
 
-        One of another version that the surface had goes then, with the last surface that has it.
+        A container of another format version that the surface had is then removed, if no other surface has it.
 
         Raises
         ------
         OSError, MissingError
-            When it cannot be kept; the surface is still to be built then.
+            If it cannot be stored; the surface is then still queued.
         """
         with self._lock:
             record = self._catalog.find(surface)
@@ -293,7 +293,7 @@ class Storage:
             before = None if record.container == sha256 else record.container
             outdated = before is not None and other_version(self._at.container(before)) is not None
             if before is not None and not outdated:
-                _log.warning("%s was built again as another container, %s, than before", surface, sha256)
+                _log.warning("building %s again gave another container than before: %s", surface, sha256)
             made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
             serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
             container = self._at.container(sha256)
@@ -311,11 +311,11 @@ class Storage:
                     sync_folder(self._at.containers)
 
     def failed(self, surface: str, reason: str) -> None:
-        """Note that a reader refused the bytes of a surface; they stay until somebody deletes it."""
+        """Record that a reader rejected the files of a surface; they stay until the surface is deleted."""
         self._stop(surface, "failed", reason)
 
     def postpone(self, surface: str, reason: str) -> None:
-        """Note that a surface could not be built here and now; it waits until somebody asks for another attempt."""
+        """Record that a surface could not be built now; it waits for a retry."""
         self._stop(surface, "waiting", reason)
 
     def _stop(self, surface: str, state: State, reason: str) -> None:
@@ -332,14 +332,15 @@ class Storage:
                 self._catalog.put(made)
 
     def retry(self, surface: str) -> Record:
-        """Take up a surface again that failed, waits or is missing; its record, queued if there is something to build.
+        """Queue a surface again that failed, waits or is missing; returns its record, queued if there is something to
+        build from.
 
         Raises
         ------
         NotFoundError
-            When there is none.
+            If there is no such surface.
         OSError
-            When it cannot be seen what is there, or cannot be written down.
+            If its files cannot be looked at, or its record cannot be written.
         """
         with self._lock:
             record = self.get(surface)
@@ -358,33 +359,33 @@ class Storage:
             return made
 
     def lose(self, surface: str) -> None:
-        """Look again what is there of a surface whose upload was not found."""
+        """Update the state of a surface whose upload was not found."""
         with self._lock:
             record = self._catalog.find(surface)
             if record is not None:
                 self._catalog.put(present(self._at, record))
 
     def has_upload(self, record: Record) -> bool:
-        """Whether every uploaded file of a surface is on the disk.
+        """Whether all uploaded files of a surface are on disk.
 
         Raises
         ------
         OSError
-            When the system cannot tell.
+            If the system cannot tell.
         """
         return has_upload(self._at, record)
 
     def delete(self, surface: str) -> None:
-        """Remove a surface, and its upload and container unless another surface has the same.
+        """Delete a surface, and its upload and container unless another surface uses them.
 
         Raises
         ------
         NotFoundError
-            When there is none.
+            If there is no such surface.
         MissingError
-            When a folder is not there now.
+            If a folder is not there now.
         OSError
-            When that could not be written down; the surface is still there.
+            If the change could not be written; the surface still exists.
         """
         with self._lock:
             record = self.get(surface)
@@ -408,7 +409,9 @@ class Storage:
                     last_container=not self.has_container(record.container) and not self._unusable,
                 )
             except OSError as error:
-                _log.warning("what is left of %s, which was deleted, goes at the next start: %s", surface, error)
+                _log.warning(
+                    "the remaining files of %s, which was deleted, are removed at the next start: %s", surface, error
+                )
 
     def _check_mounted(self) -> None:
         """Refuse to change anything while a folder is not there: what is written then would be under its mount."""
@@ -435,14 +438,14 @@ def _may_be(known: Record, record: Record) -> bool:
 
 
 def claim(root: Path) -> int:
-    """Keep other processes away from a folder until the handle is closed, or this process ends.
+    """Lock a folder against other processes until the handle is closed or this process ends.
 
     Raises
     ------
     LodestreamError
-        When another process works in the folder.
+        If another process uses the folder.
     OSError
-        When nothing can be written there.
+        If nothing can be written there.
     """
     handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o600)
     try:
@@ -450,7 +453,7 @@ def claim(root: Path) -> int:
     except BlockingIOError:
         os.close(handle)
         raise LodestreamError(
-            f"expected a folder in which no server works, got {root}, in which another works"
+            f"expected a folder that no other process uses, got {root}, which another one uses"
         ) from None
     except OSError:
         os.close(handle)

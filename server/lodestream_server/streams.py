@@ -1,7 +1,7 @@
-"""The WebSocket route: a loop that moves bytes between a socket, a file and a `Sender`.
+"""The WebSocket route: moves bytes between a socket, a file and a `Sender`.
 
-A receiving task runs beside the sending one, so that a `stop` or a lost peer is noticed at once, whatever the other is
-doing. Every wait has an end.
+A receiving task runs beside the sending one, so that a `stop` or a lost client is noticed at once. Every wait has a
+time limit.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
     try:
         first = None if opening is None else from_address(opening)
         if first is not None and _token(first) is not None:
-            raise MessageError("bad-message", "expected no token in an address, where logs keep it")
+            raise MessageError("bad-message", "expected no token in an address, because logs keep addresses")
         if caller is None:
             # Nothing is told of the surface, not even whether it exists, before the token was seen; and nobody takes a
             # stream from those who have one by showing none.
@@ -153,7 +153,7 @@ def _token(message: bytes) -> str | None:
 
 
 class _SilentError(LodestreamError):
-    """The client said nothing, or took nothing, for too long."""
+    """The client sent nothing, or did not read, for too long."""
 
 
 class _Session:
@@ -287,7 +287,7 @@ class _Session:
             message, wanted = await self._next()
             if message is not None:
                 sending = self._socket.send_bytes(message)
-                await _within(self._settings.idle_seconds, sending, "the client to take what was sent")
+                await _within(self._settings.idle_seconds, sending, "the client to read what was sent")
                 self._progress = time.monotonic()
                 if self._sender.layers and self.first_surface is None:
                     self.first_surface = time.monotonic() - self._opened

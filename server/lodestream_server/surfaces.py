@@ -1,4 +1,4 @@
-"""The routes of surfaces: upload, list, look, delete."""
+"""The routes of surfaces: upload, list, describe, retry, delete."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
     "",
     status_code=202,
     summary="Upload a surface",
-    response_description="The surface will be built; Location is where to look",
+    response_description="The surface will be built; Location is its address",
     openapi_extra=examples.UPLOAD,
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
@@ -44,14 +44,13 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
 )
 @needs("write")
 async def upload(request: Request, parts: Parts) -> Response:
-    """Take a file, raw or as parts called ``file`` of a form, and build the surface in the background.
+    """Upload a file, as a raw body or as parts called ``file`` of a form; the surface is built in the background.
 
-    What is neither precision, rms, closed, name nor filename in the query is an option of the file's format. Bytes and
-    options that the caller has uploaded already, under the same name, give the surface that is there, even where there
-    is no room for others.
+    Parameters in the query other than precision, rms, closed, name and filename are options of the file's format. If
+    the caller has already uploaded the same bytes with the same options and name, the answer is the existing surface,
+    even if the server has no room for new ones.
 
-    A container (.lode) is taken as it is: it is checked and decoded once, and kept. No option but name and filename
-    goes with it.
+    A container (.lode) is checked and decoded once, and kept unchanged. It takes no options but name and filename.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
     caller = _caller(request)
@@ -86,10 +85,10 @@ async def upload(request: Request, parts: Parts) -> Response:
 async def page(
     request: Request,
     parts: Parts,
-    limit: Annotated[int, Query(ge=1, le=1000, description="most surfaces on the page")] = 100,
-    after: Annotated[str | None, Query(pattern=_PLACE, description="as `next` of the page before says")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
+    after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
 ) -> Response:
-    """Surfaces without the figures of their layers and levels; `next` is the address of the following page, or null."""
+    """Surfaces without their layers and levels; `next` is the address of the next page, or null."""
     start = _position(after)
     following = parts.storage.records_after(start, limit + 1)
     shown = following[:limit]
@@ -103,18 +102,21 @@ async def page(
 @readable(
     router,
     "/{surface}",
-    summary="Look at a surface",
-    responses={200: examples.answer("State, and once ready the figures", examples.READY), **responses(404)},
+    summary="Describe a surface",
+    responses={
+        200: examples.answer("Its state and, once it is ready, its description", examples.READY),
+        **responses(404),
+    },
 )
 @needs("read")
 async def look(request: Request, parts: Parts, surface: str) -> Response:
-    """State, and once ready what ``lodestream info --json`` prints.
+    """The state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
-    The state is queued, building or ready; or failed (the bytes are no surface), waiting (they could not be built,
-    until somebody asks for another attempt) or missing (they are not on the server's disk now), with a reason.
+    The state is queued, building or ready; or, with a reason, failed (the file is not a surface), waiting (it could not
+    be built and needs a retry) or missing (its files are not on the server's disk now).
 
-    Of a surface that was uploaded as a container there is `errors` as well: `checked` where the errors of its layers
-    and levels were found to be right, as can be done where it is exact, else `told` by whoever uploaded it.
+    A surface that was uploaded as a container also has `errors`: `checked` if the server has measured the errors of its
+    layers and levels again, which is possible if it is exact; otherwise `told`, by whoever uploaded it.
     """
     return JSONResponse(_present(parts.storage.get(surface), parts, request, full=True))
 
@@ -122,7 +124,7 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
 @router.post(
     "/{surface}/retry",
     status_code=202,
-    summary="Try again to build a surface",
+    summary="Retry the build of a surface",
     response_description="The surface will be built",
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
@@ -132,7 +134,7 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
 )
 @needs("write")
 async def retry(request: Request, parts: Parts, surface: str) -> Response:
-    """Build a surface that waits, failed or is missing once more; nothing happens to one that is ready or queued."""
+    """Build a surface again that waits, failed or is missing; does nothing if it is ready or queued."""
     caller = _caller(request)
     if parts.storage.get(surface).state not in ("queued", "ready"):
         parts.limits.check_builds(caller)
@@ -146,15 +148,17 @@ async def retry(request: Request, parts: Parts, surface: str) -> Response:
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
 @needs("write")
 async def delete(request: Request, parts: Parts, surface: str) -> Response:
-    """Remove a surface; its build is stopped. Streams of it that are open go on to their end.
+    """Delete a surface and stop its build. Open streams of it continue to their end.
 
-    Only its owner, the token by whose name it was uploaded, and an admin may.
+    Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
     record = parts.storage.get(surface)
     caller = caller_of(request)
     if caller is None or not caller.may_delete(record.owner):
-        whose = "nobody's" if record.owner is None else "somebody else's"
-        raise NotOwnerError(f"expected the owner of {surface} or an admin, got {_called(caller)}: it is {whose}")
+        whose = "nobody" if record.owner is None else "another owner"
+        raise NotOwnerError(
+            f"expected the owner of {surface} or an admin, got {_called(caller)}: it belongs to {whose}"
+        )
     await parts.builder.delete(surface)
     if record.container is not None and not parts.storage.has_container(record.container):
         parts.levels.forget(record.container)

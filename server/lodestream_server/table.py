@@ -1,7 +1,8 @@
-"""What an operator may choose, in one table: name, default, limits and meaning.
+"""The table of settings that an operator may choose: name, default, limits and meaning of each.
 
-`settings` reads it from the environment, `command` offers it on the command line, `docs/settings.md` is written from
-it. Nothing heavy is imported here: the command line's parser is made from this table, whatever the command.
+`settings` reads their values from the environment, `command` makes options of the command line from the table, and
+`docs/settings.md` is generated from it. This module imports nothing heavy, because the command line's parser needs it
+for every command.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from typing import Any
 
 __all__ = ["FORMATS", "GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
 
-#: What the names of environment variables begin with.
+#: Prefix of the environment variables.
 PREFIX = "LODESTREAM_"
 
-#: The formats that a server can read, by the names of `lodestream.formats` (`Format.names`), and containers themselves.
+#: The formats that a server can read: names of `lodestream.formats` (`Format.names`), and `lode` for containers.
 FORMATS = (
     "npy",
     "npz",
@@ -42,7 +43,8 @@ FORMATS = (
     "lode",
 )
 
-# Rare, or so loose that almost any text is one: each reader less is one less that strangers' files can go wrong in.
+# Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can
+# attack.
 _LEFT_OUT = ("usgs-dem", "bpt", "vmec", "text")
 
 _UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
@@ -52,18 +54,18 @@ _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 
 @dataclass(frozen=True)
 class Kind:
-    """How a value is written.
+    """The type of a setting: how its values are parsed and shown.
 
     Attributes
     ----------
     expected : str
-        What it has to be, in words.
+        The values that are allowed, for error messages.
     metavar : str
-        What stands for it in a command line.
+        Placeholder for the value in the help of the command line.
     parse : callable
-        From text to the value; ValueError when the text is none.
+        Converts text to the value; raises ValueError if the text is not valid.
     show : callable
-        From the value to text that `parse` takes.
+        Converts the value to text that `parse` accepts.
     """
 
     expected: str
@@ -128,29 +130,30 @@ _SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", _size, _show_size)
 _SWITCH = Kind("yes or no", "", _switch, lambda value: "yes" if value else "no")
 _PATH = Kind("a path", "PATH", _path)
 _LIST = Kind("words separated by commas", "A,B", _list, ",".join)
-_FORMATS = Kind(f"all, or names out of {', '.join(FORMATS)} with commas between", "A,B", _formats, ",".join)
+_FORMATS = Kind(f"all, or some of {', '.join(FORMATS)}, separated by commas", "A,B", _formats, ",".join)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One thing that an operator may choose.
+    """One setting.
 
     Attributes
     ----------
     name : str
-        Field of `Settings`; upper case and with `PREFIX` a variable of the environment; with hyphens an option.
+        Name of the field of `Settings`. The environment variable is this name in upper case after `PREFIX`; the option
+        of the command line has hyphens in place of underscores.
     kind : Kind
-    default : value, or callable that gives it
+    default : value, or callable that returns it
     meaning : str
-        What it is, in a line.
+        One line for help texts and the manual.
     group : str
         Key of `GROUPS`.
     least, most : number or None
-        Limits, themselves allowed.
+        Smallest and largest value allowed.
     metavar : str
-        What stands for the value on the command line; the kind's own if empty.
+        Placeholder for the value in the help of the command line; that of the kind if empty.
     usual : str
-        What the default is, in words, where it is not the same everywhere.
+        The default in words, if it depends on the machine.
     """
 
     name: str
@@ -165,34 +168,34 @@ class Setting:
 
     @property
     def variable(self) -> str:
-        """The variable of the environment."""
+        """Name of the environment variable."""
         return PREFIX + self.name.upper()
 
     @property
     def option(self) -> str:
-        """The option of the command line."""
+        """Name of the option on the command line."""
         return "--" + self.name.replace("_", "-")
 
     @property
     def default_text(self) -> str:
-        """The default, in words."""
+        """The default, for help texts."""
         return self.usual or self.kind.show(self.default)
 
     @property
     def limits(self) -> str:
-        """The limits, in words; empty if there are none."""
+        """The limits, for help texts; empty if there are none."""
         if not self.least and self.most is None:
             return ""
         least = self.kind.show(self.least)
         return f"at least {least}" if self.most is None else f"{least} to {self.kind.show(self.most)}"
 
     def take(self, value: Any) -> Any:
-        """The value that some text stands for, or the value itself, once it is within the limits.
+        """Parse a text, or take a value as it is, and check the limits.
 
         Raises
         ------
         ValueError
-            When it is not.
+            When the text is not valid, or the value is outside the limits.
         """
         if isinstance(value, str):
             try:
@@ -213,23 +216,30 @@ def _processors() -> int:
     return max(1, (os.cpu_count() or 1) - 1)
 
 
-#: The groups of settings, and what they are about.
+#: Groups of settings, and the heading of each.
 GROUPS: Mapping[str, str] = {
-    "network": "where the server listens, and how it is reached",
-    "access": "who may do what",
-    "limits": "how much is taken",
-    "operation": "what the operator sees",
+    "network": "address, data folder, proxies",
+    "access": "who may read and write",
+    "limits": "formats, sizes, memory",
+    "operation": "log",
 }
 
 _SETTINGS = (
     Setting("host", _TEXT, "127.0.0.1", "address to listen on", "network", metavar="H"),
     Setting("port", _INTEGER, 8000, "port to listen on; 0 takes a free one", "network", 0, 65535, metavar="P"),
-    Setting("data", _PATH, Path("lodestream-data"), "folder of uploads and containers", "network", metavar="DIR"),
+    Setting(
+        "data",
+        _PATH,
+        Path("lodestream-data"),
+        "data folder, which holds uploads and containers",
+        "network",
+        metavar="DIR",
+    ),
     Setting(
         "root_path",
         _TEXT,
         "",
-        "path under which a reverse proxy shows this server, such as /maps; the proxy takes it off",
+        "path under which a reverse proxy serves this server, such as /maps; the proxy must remove it from requests",
         "network",
         metavar="PATH",
         usual="none",
@@ -238,7 +248,7 @@ _SETTINGS = (
         "trusted_proxies",
         _LIST,
         (),
-        "addresses or networks of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto are believed",
+        "addresses or networks of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto headers are trusted",
         "network",
         metavar="A,B",
         usual="none",
@@ -247,26 +257,28 @@ _SETTINGS = (
         "insecure",
         _SWITCH,
         False,
-        "serve without tokens on an address that others can reach: while there is no token, whoever reaches the port "
-        "may read, upload and delete",
+        "allow an address that others can reach although no token exists: until there is one, anyone who reaches the "
+        "port may read, upload and delete",
         "access",
     ),
     Setting(
         "token_file",
         _PATH,
         None,
-        "file of token hashes, as `lodestream token` writes it",
+        "file with the hashes of the tokens, written by `lodestream token`",
         "access",
         metavar="FILE",
         usual="tokens.json in the data folder",
     ),
-    Setting("public_reads", _SWITCH, False, "let anyone list, look at and stream surfaces without a token", "access"),
+    Setting(
+        "public_reads", _SWITCH, False, "allow anyone to list, fetch and stream surfaces without a token", "access"
+    ),
     Setting(
         "origins",
         _LIST,
         (),
-        "origins of other sites whose pages may use this server, such as https://maps.example.org; * is all of them, "
-        "which needs a token to be there",
+        "origins of other web sites whose pages may use this server, such as https://maps.example.org; * allows all "
+        "sites, and requires that a token exists",
         "access",
         metavar="A,B",
         usual="none",
@@ -275,16 +287,17 @@ _SETTINGS = (
         "formats",
         _FORMATS,
         tuple(name for name in FORMATS if name not in _LEFT_OUT),
-        f"formats of files that are read: all, or names out of {', '.join(FORMATS)} (VMEC is a kind of NetCDF)",
+        f"file formats that the server reads: all, or some of {', '.join(FORMATS)} (vmec are the NetCDF files of VMEC, "
+        "lode are containers)",
         "limits",
         usual=f"all but {', '.join(_LEFT_OUT)}",
     ),
-    Setting("upload_bytes", _SIZE, 4 << 30, "most bytes of one upload", "limits", 1),
+    Setting("upload_bytes", _SIZE, 4 << 30, "largest upload", "limits", 1),
     Setting(
         "keep_free",
         _SIZE,
         None,
-        "disk space that uploads leave free",
+        "disk space that uploads and levels as files leave free",
         "limits",
         0,
         usual="1GiB, or a twentieth of the disk if that is less",
@@ -293,29 +306,30 @@ _SETTINGS = (
         "workers",
         _INTEGER,
         _processors,
-        "builds at the same time",
+        "number of builds that run at the same time",
         "limits",
         1,
-        usual="one less than there are processors",
+        usual="the number of processors less one",
     ),
     Setting(
         "memory",
         _SIZE,
         None,
-        "most memory of all builds together; beside them, the process that makes levels as files may take half as much",
+        "memory that all running builds together may use; the process that makes levels as files may use half as much "
+        "in addition",
         "limits",
         256 << 20,
-        usual="half of the memory there is",
+        usual="half of the machine's memory",
     ),
-    Setting("log_format", _choice("text", "json"), "text", "how the log is written to standard error", "operation"),
+    Setting("log_format", _choice("text", "json"), "text", "format of the log on standard error", "operation"),
     Setting(
         "log_level",
         _choice("debug", "info", "warning", "error"),
         "info",
-        "what is worth a line in the log",
+        "least severe messages that are logged",
         "operation",
     ),
 )
 
-#: The settings by name, in the order in which they are shown.
+#: The settings by name, in the order of the manual.
 TABLE: Mapping[str, Setting] = {setting.name: setting for setting in _SETTINGS}

@@ -1,6 +1,7 @@
-"""``lodestream token``: make, list and revoke the tokens of a server, found through the entry points.
+"""The command ``lodestream token``: create, list and revoke the tokens of a server; found through the entry points.
 
-It works on the file, not on the server: whoever may write the file may do it, and a server that runs takes notice.
+It edits the token file and does not contact the server. So everybody who can write the file can use it, and a running
+server notices the change.
 """
 
 from __future__ import annotations
@@ -22,44 +23,46 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}", re.ASCII)
 
 
 def register(subparsers: Any) -> None:
-    """Add ``token`` and what can be done with one to the sub-commands of a parser."""
+    """Add ``token`` and its actions to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "token",
-        help="make, list or revoke the tokens of a server",
-        description="Make, list or revoke the tokens of a server. Only their hashes are kept, in a file; a server that "
-        "runs takes notice of a change at once.",
+        help="create, list or revoke the tokens of a server",
+        description="Create, list or revoke the tokens of a server. Only their hashes are stored, in a file. A running "
+        "server notices a change at once.",
         allow_abbrev=False,
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     make = _action(
         actions,
         "create",
-        "make a token",
-        "Make a token. It is the last line of standard output, alone, and is shown only this once.",
+        "create a token",
+        "Create a token. It is printed as the last line of standard output, and cannot be shown again.",
     )
     make.add_argument(
-        "name", metavar="NAME", nargs="?", type=_name, help="what to call it (default: token- and digits)"
+        "name", metavar="NAME", nargs="?", type=_name, help="name of the token (default: token- and random digits)"
     )
     make.add_argument(
         "--scope",
         metavar="SCOPE",
         action="append",
         type=_scopes,
-        help="read: list, look at, fetch and stream surfaces; write: upload and delete one's own too; admin: delete "
-        "everybody's and read the metrics too; may be repeated (default: read)",
+        help="read: list, fetch and stream surfaces; write: also upload, and delete own surfaces; admin: also delete "
+        "all surfaces, and read the metrics; may be repeated (default: read)",
     )
-    make.add_argument("--days", metavar="N", type=_days, help="how long it is valid (default: until it is revoked)")
+    make.add_argument(
+        "--days", metavar="N", type=_days, help="number of days for which it is valid (default: until it is revoked)"
+    )
     make.set_defaults(run=create)
     _action(
-        actions, "list", "list the tokens", "List the tokens: name, scopes, when made, when they expire."
+        actions, "list", "list the tokens", "List the tokens: name, scopes, time of creation, time of expiry."
     ).set_defaults(run=list_tokens)
     end = _action(actions, "revoke", "revoke a token", "Revoke a token.")
-    end.add_argument("name", metavar="NAME", help="what it is called")
+    end.add_argument("name", metavar="NAME", help="name of the token")
     end.set_defaults(run=revoke)
 
 
 def create(args: argparse.Namespace) -> int:
-    """Make a token and print it."""
+    """Create a token and print it."""
     file = TokenFile(chosen_settings(args).tokens)
     scopes = tuple(dict.fromkeys(scope for group in args.scope or [("read",)] for scope in group))
     text, token = file.create(args.name or f"token-{secrets.token_hex(3)}", scopes, args.days)
@@ -73,7 +76,7 @@ def create(args: argparse.Namespace) -> int:
 
 
 def list_tokens(args: argparse.Namespace) -> int:
-    """Print a line for each token."""
+    """Print one line for each token."""
     file = TokenFile(chosen_settings(args).tokens)
     tokens = file.load()
     shown = [

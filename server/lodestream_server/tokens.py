@@ -1,6 +1,6 @@
-"""Tokens: a file of their hashes, and what each of them allows.
+"""Tokens: a file with their hashes, and what each of them allows.
 
-A token is 256 random bits, so a plain SHA-256 tells nothing of it, and nobody finds it by trying. The file::
+A token is 256 random bits, so a plain SHA-256 reveals nothing about it, and it cannot be guessed. The file::
 
     {"version": 1, "tokens": [{"name": "ci", "sha256": "...", "scopes": ["write"], "created": "...", "expires": null}]}
 """
@@ -42,18 +42,18 @@ _PREFIX = "lode_"
 
 @dataclass(frozen=True)
 class Token:
-    """What is kept of a token.
+    """The stored data of a token.
 
     Attributes
     ----------
     name : str
-        What the operator calls it.
+        Name that the operator gave it.
     sha256 : str
         Hash of the token, in hexadecimal digits.
     scopes : tuple of str
-        Out of `SCOPES`, as they were given.
+        Some of `SCOPES`, as given.
     created, expires : str or None
-        Times (ISO 8601, UTC); one that does not expire has none.
+        Times (ISO 8601, UTC); None if it does not expire.
     """
 
     name: str
@@ -68,12 +68,12 @@ class Token:
 
     @property
     def expired(self) -> bool:
-        """Whether its time is over."""
+        """Whether it has expired."""
         return self.expires is not None and datetime.now(UTC) >= datetime.fromisoformat(self.expires)
 
     @classmethod
     def from_json(cls, values: Any) -> Token:
-        """Check what a file says of one token; ValueError, TypeError or KeyError when it is none."""
+        """A token from the values in a file; raises ValueError, TypeError or KeyError if they are invalid."""
         token = cls(
             str(values["name"]),
             bytes.fromhex(values["sha256"]).hex(),
@@ -89,26 +89,26 @@ class Token:
 
 
 class TokenFile:
-    """The file, as the command line reads and changes it.
+    """The token file, as the command line reads and changes it.
 
     Parameters
     ----------
     path : Path
-        There may be none yet.
+        The file need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def load(self) -> tuple[Token, ...]:
-        """All tokens; none when there is no file.
+        """All tokens; none if there is no file.
 
         Raises
         ------
         LodestreamError
-            When the file is not one of tokens.
+            If the file is not a token file.
         OSError
-            When it cannot be read.
+            If it cannot be read.
         """
         try:
             data = self.path.read_bytes()
@@ -123,15 +123,15 @@ class TokenFile:
             return tuple(Token.from_json(values) for values in document["tokens"])
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"  # its repr may hold all of the file
-            raise LodestreamError(f"expected a file of tokens, got {self.path}, which is none: {why}") from None
+            raise LodestreamError(f"expected a token file, got {self.path}: {why}") from None
 
     def create(self, name: str, scopes: tuple[str, ...], days: float | None = None) -> tuple[str, Token]:
-        """Add a token; the token itself, which is kept nowhere, and what is kept.
+        """Add a token; returns the token itself, which is stored nowhere, and its stored data.
 
         Raises
         ------
         OptionError
-            When there is one of this name.
+            If a token has this name already.
         """
         now = datetime.now(UTC)
         text = _PREFIX + secrets.token_urlsafe(32)
@@ -144,12 +144,12 @@ class TokenFile:
         return text, token
 
     def revoke(self, name: str) -> None:
-        """Remove a token; a server that runs takes notice at once.
+        """Remove a token; a running server notices at once.
 
         Raises
         ------
         NotFoundError
-            When there is none of this name.
+            If no token has this name.
         """
         with self._change() as tokens:
             kept = [token for token in tokens if token.name != name]
@@ -200,7 +200,7 @@ class TokenFile:
 
 
 class Tokens:
-    """The tokens that a server knows; it follows the file.
+    """The tokens of a running server; follows changes of the file.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ class Tokens:
     Raises
     ------
     LodestreamError, OSError
-        When there is a file that cannot be used. One that becomes so later allows nobody anything.
+        If the file exists and cannot be used. If it becomes unusable later, no token is accepted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -220,14 +220,14 @@ class Tokens:
 
     @property
     def used(self) -> bool:
-        """Whether there is a token, or ever was one while this server ran: what needs one then always does."""
+        """Whether a token exists, or has existed while this server ran; from then on requests need one."""
         self._follow()
         return self._met
 
     def find(self, text: str) -> Token | None:
-        """The token that some text is, unless it has expired.
+        """The token with this text, unless it has expired.
 
-        It is compared with every token to the end, so that the time tells nothing.
+        The text is compared with all tokens in constant time, so that timing reveals nothing.
         """
         self._follow()
         digest = _digest(text)
@@ -252,7 +252,7 @@ class Tokens:
         except (LodestreamError, OSError) as error:
             self._tokens = ()
             self._met = True
-            _log.error("no token is accepted until this is mended: %s", error)
+            _log.error("no token is accepted until the token file is repaired: %s", error)
         self._met = self._met or bool(self._tokens)
 
     def _look(self) -> tuple[int, ...] | None:

@@ -1,6 +1,6 @@
-"""Uploads: a body that is streamed to disk while it is counted and hashed.
+"""Uploads: request bodies that are written to disk while they are counted and hashed.
 
-Nothing is spooled elsewhere: a raw body is one file, a multipart body is parsed as it comes.
+There is no temporary copy: a raw body is one file, a multipart body is parsed as it arrives.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _MOST_PART_HEADERS = 16 * 1024
 
 
 class Upload:
-    """Files as they come, in a folder, called 0, 1, ...
+    """The files of an upload as they arrive, in a folder, named 0, 1, ...
 
     Parameters
     ----------
     folder : Path or None
-        None keeps nothing of them but their hash.
+        None: only their hash is computed.
     most_files : int
 
     Attributes
     ----------
     names : list of (str or None)
-        What the files are called by whoever sends them.
+        Names of the files as the client sent them.
     size : int
         Bytes of all files.
     """
@@ -62,7 +62,7 @@ class Upload:
 
     @property
     def paths(self) -> list[Path]:
-        """The files; none if they are not kept."""
+        """Paths of the files; empty if they are not stored."""
         if self._folder is None:
             return []
         return [self._folder / str(number) for number in range(len(self.names))]
@@ -85,7 +85,7 @@ class Upload:
         self.size += len(data)
 
     def end(self) -> None:
-        """Put the file on disk."""
+        """Finish the file and synchronise it to disk."""
         assert self._file is not None
         # The length keeps files apart: two files are not the same upload as both in one.
         self.digest.update(self._file.size.to_bytes(8, "big"))
@@ -95,7 +95,7 @@ class Upload:
         self._stack.close()
 
     def abort(self) -> None:
-        """Close what is open, after an error."""
+        """Close open files, after an error."""
         self._stack.close()
 
 
@@ -110,7 +110,7 @@ class _Nowhere:
 
 
 def digest_of(files: Iterable[Path]) -> str:
-    """What `Upload.digest` was when these files were taken, in hexadecimal digits."""
+    """What `Upload.digest` was when these files were uploaded, in hexadecimal digits."""
     digest = hashlib.sha256()
     for path in files:
         size = 0
@@ -123,12 +123,12 @@ def digest_of(files: Iterable[Path]) -> str:
 
 
 def check_upload(files: Sequence[Path], record: Record) -> str | None:
-    """What is wrong with the files of an upload; None where nothing is.
+    """What is wrong with the files of an upload; None if nothing is.
 
     Raises
     ------
     OSError
-        When they are there and cannot be read: what is wrong then is the disk, and perhaps for a moment only.
+        If they exist and cannot be read: the disk has a problem, which may pass.
     """
     try:
         found = sum(path.stat().st_size for path in files)
@@ -143,13 +143,13 @@ def check_upload(files: Sequence[Path], record: Record) -> str | None:
 
 
 class Body(Protocol):
-    """A body as it comes."""
+    """A request body as it arrives."""
 
     def feed(self, data: bytes) -> None:
         """Take bytes."""
 
     def finish(self) -> None:
-        """Say that no more come."""
+        """Declare the end of the body."""
 
 
 class _Raw:
@@ -239,16 +239,16 @@ class _Multipart:
 
 
 async def receive(request: Request, folder: Path | None, settings: Settings, name: str | None) -> Upload:
-    """Stream a request's body into files of a folder, or only hash it if there is none.
+    """Write the body of a request to files in a folder, or only hash it if there is no folder.
 
     Raises
     ------
     TooLargeError
-        When it is, or says it is, larger than allowed; what it says is looked at before the body is read.
+        If it is larger than allowed, or announces to be; the announcement is checked before the body is read.
     FormatError, OptionError
-        When it is empty, or a multipart body that cannot be read.
+        If it is empty, or a multipart body that cannot be parsed.
     SlowUploadError
-        When nothing came for too long.
+        If nothing arrived for too long.
     """
     _check_promised(request, settings.upload_bytes)
     upload = Upload(folder, settings.upload_files)
@@ -263,12 +263,12 @@ async def receive(request: Request, folder: Path | None, settings: Settings, nam
 
 
 def take_apart(upload: Upload, content_type: str | None, name: str | None = None) -> Body:
-    """What takes a body of this type: raw, or the parts of a form.
+    """The reader for a body of this type: raw, or the parts of a form.
 
     Raises
     ------
     FormatError
-        When a form has no boundary, or not a usable one.
+        If a form has no valid boundary.
     """
     kind, options = parse_options_header(content_type)
     if kind != b"multipart/form-data":

@@ -1,4 +1,4 @@
-"""Containers of another version of the format than this server reads: they are built again from what was uploaded."""
+"""Containers of another format version than this server reads; they are built again from their uploads."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ __all__ = ["other_version"]
 
 
 def other_version(path: Path) -> str | None:
-    """Which version a container is of, where that is another one than this server reads, and which one that is.
+    """A message that names both versions, if a container has another version than this server reads; else None.
 
-    Only its first bytes are looked at: None of a container of this version, of what is damaged there or is no
-    container, and of what is not there or cannot be read.
+    Only the first bytes are read. The result is also None if they are damaged, or if the file is not a container, does
+    not exist or cannot be read.
     """
     from lodestream.container.sections import SIGNATURE, check_signature
 

@@ -1,6 +1,6 @@
-"""What runs in the process of a build: reading strangers' files and encoding them.
+"""The code of a build process: reads an untrusted file and encodes it.
 
-The server survives what happens here, and believes nothing of it (`results`).
+The server survives whatever happens here, and does not trust the result (`results`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from lodestream.metadata import with_notes
 
 from . import finished
 from .durable import NewFile
-from .warming import warm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,8 +45,8 @@ __all__ = [
     "Job",
     "Refused",
     "build",
+    "preload",
     "read_progress",
-    "warm",
 ]
 
 _log = logging.getLogger(__name__)
@@ -62,7 +61,7 @@ ATTRIBUTE = "precision="
 UNNAMED = "upload"
 
 #: What is said to whoever brings a file of a format that is switched off.
-ALLOWED_BY = "on this server; its setting formats (LODESTREAM_FORMATS) says which are read"
+ALLOWED_BY = "on this server; its setting LODESTREAM_FORMATS lists those that are read"
 
 # Errors of the system that say nothing of what is in a file.
 _LOCAL = {
@@ -106,22 +105,22 @@ class Job:
     ----------
     files : tuple of Path
     filename : str or None
-        Name of the first file, as its owner knows it.
+        Original name of the first file.
     name : str or None
-        What the surface is to be called.
+        Name for the surface.
     precision : str or None
         As on the command line: a number, or a number and ``d``.
     rms : str or None
-        In the same words; one of the two at most.
+        In the same notation; at most one of the two.
     closed : str
         One of `CLOSED`.
     options : mapping of str to str
         Options of the format, and precisions of attributes: their keys begin with `ATTRIBUTE`.
     max_vertices : int
     folder : Path
-        Where the build may write; empty at the start.
+        Folder to write to; empty at the start.
     allowed : tuple of str or None
-        Names of the formats that may be read; None for all.
+        Names of the formats that may be read; None: all.
     """
 
     files: tuple[Path, ...]
@@ -137,19 +136,19 @@ class Job:
 
     @property
     def container(self) -> Path:
-        """Where the container is written."""
+        """Path of the container to write."""
         return self.folder / _CONTAINER
 
 
 @dataclass(frozen=True)
 class Built:
-    """A container was built and is on disk, in the folder of its job.
+    """A container was built; it is on disk, in the folder of its job.
 
     Attributes
     ----------
     sha256 : str
     errors : str or None
-        Of a container that was uploaded, whose word its errors are (`finished.ERRORS`).
+        For an uploaded container, who vouches for its errors (`finished.ERRORS`).
     """
 
     sha256: str
@@ -158,18 +157,34 @@ class Built:
 
 @dataclass(frozen=True)
 class Refused:
-    """The upload was not built, for this reason.
+    """The upload was not built.
 
     Attributes
     ----------
     reason : str
-        In one line.
+        One line.
     final : bool
-        The reader refuses the bytes, so that another attempt would end the same; otherwise the reason may pass.
+        True if the reader rejected the file, so that a retry would end the same; False if the reason may pass.
     """
 
     reason: str
     final: bool = True
+
+
+def preload() -> None:
+    """Import what builds need, so that a process that is forked for one has it at once.
+
+    Raises
+    ------
+    UnavailableError
+        When the compiled kernels cannot be loaded.
+    """
+    import lodestream.encoder
+    import lodestream.inspection
+    import lodestream.mesh.recognise  # noqa: F401
+    from lodestream.library import library
+
+    library()
 
 
 def build(job: Job) -> Built | Refused:
@@ -199,7 +214,7 @@ def _may_pass(error: LodestreamError) -> bool:
 
 
 def read_progress(folder: Path) -> float:
-    """How much of the build in a folder is done, from 0 to 1; whatever lies there."""
+    """The fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
     try:
         handle = os.open(folder / _PROGRESS, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:

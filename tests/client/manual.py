@@ -30,29 +30,43 @@ ACTIONS = {"token": ("create", "list", "revoke")}
 _INTRODUCTION = """\
 # The command line
 
-This page is `--help` of every command, written by `python -m tests.client.manual` and checked by a test.
+The command `lodestream` encodes and decodes files, and transfers surfaces to and from servers. A client that is
+installed without the server has no `serve`, `token` and `fsck`.
 
-- Results go to standard output; progress, notes and errors go to standard error. With `--json`, standard output is one
+What all commands have in common:
+
+- Results go to standard output. Progress, notes and errors go to standard error. With `--json`, standard output is one
   JSON object.
-- Notes on standard error name what is not kept: what the surface of a file cannot hold, values of attributes at holes,
-  what the format of OUT cannot hold. Notes of a server's build come back with `push` and are in the surface's `notes`.
+- Notes on standard error say what is lost: parts of a file that a surface cannot hold, values of attributes at holes,
+  and whatever the format of OUT cannot hold. Notes of a build on a server are printed by `push` and kept as the
+  surface's `notes`.
 - Exit codes: 0 success, 1 failure (one line says why), 2 wrong command line, 130 interrupted by Ctrl-C, 143 ended by
   SIGTERM.
 - The path `-` is standard input or output. Files are written under a temporary name and renamed when they are complete.
-- `decode` and `pull` with `--json` print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes`
-  (everything that was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max,
-  bytes, seconds, stopped or truncated.
-- A `pull` that is interrupted, or whose server does not come back, writes OUT from what was received. Its exit code is
-  then 130, 143 or 1, and `ended` is stopped or truncated. Before the first layer OUT is not touched. What was received
-  is kept on disk, with or without `--resume` and even if the `pull` is killed; the next `pull --resume` asks only for
-  the rest. A `pull` that succeeds deletes it,
-  with `--resume` only when it has the whole surface. If it cannot be kept, a `pull` without `--resume` goes on.
-- If a limit cannot be reached, the result is the complete surface, with a note.
-- `--roi 100:220,300:460` takes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind` takes
-  only these attributes, `--attributes none` the points alone. Both can be combined with each other and with the limits,
-  but a window not with `--level`. Only what they need is sent. `rms` and `max` of a window are null until it is
-  complete.
-- Clients take a token from `--token` or from the environment variable `LODESTREAM_TOKEN`.
+- The token for a server is taken from `--token` or from the environment variable `LODESTREAM_TOKEN`.
+
+`decode` and `pull`:
+
+- If a limit such as `--until-rms` cannot be reached, the result is the complete surface, with a note.
+- `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
+  decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
+  combined with each other and with the limits; `--roi` cannot be combined with `--level`. `rms` and `max` of a window
+  are null until it is complete.
+- With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that
+  was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max, bytes, seconds,
+  stopped or truncated.
+
+An interrupted `pull`:
+
+- If `pull` is interrupted, or the server does not come back, OUT is written from the data received so far. The exit
+  code is 130, 143 or 1, and `ended` is stopped or truncated. If not even the first layer is there, OUT is not touched.
+- The received data stay on disk, with or without `--resume`, and even after `kill -9`. The next `pull --resume`
+  requests only the rest.
+- A successful `pull` deletes these data. With `--resume` it deletes them only once it has the whole surface.
+- If the data cannot be kept on disk, a `pull` without `--resume` continues all the same.
+
+This page shows the output of `--help` of every command. It is written by `python -m tests.client.manual`; a test checks
+it.
 """
 
 

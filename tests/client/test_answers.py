@@ -61,7 +61,7 @@ def test_a_problem_is_read_as_far_as_a_problem_goes(asynchronous: bool) -> None:
 @pytest.mark.parametrize("coding", ["gzip", "br", "zstd", "deflate", "gzip, gzip"])
 def test_nothing_is_decompressed(asynchronous: bool, coding: str) -> None:
     body = gzip.compress(json.dumps({**READY, "name": "a" * 1_000_000}).encode())
-    with pytest.raises(RemoteProtocolError, match=f"got it encoded with {coding}"):
+    with pytest.raises(RemoteProtocolError, match=f"got one encoded with {coding}"):
         describe(Answer(200, body, {"Content-Encoding": coding}), asynchronous)
     with pytest.raises(ls.RemoteError, match="the server answered 500"):
         describe(Answer(500, body, {"Content-Encoding": coding}), asynchronous)

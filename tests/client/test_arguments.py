@@ -86,18 +86,18 @@ def test_how_long_is_left_is_told_in_words(seconds: float, words: str) -> None:
 
 def test_the_bar_knows_how_long_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    with output.progress_bar() as bar:
-        monkeypatch.setattr(bar, "get_time", lambda: now[0])
-        for limit, expected in ((None, "8 s left"), (5.0, "3 s left")):
-            now[0] = 0.0
-            task = bar.add_task("pulling", total=1000, figures="", limit=limit)
-            for second in (1.0, 2.0):
-                now[0] = second
-                bar.update(task, completed=int(100 * second))
-            shown = bar.columns[-1]
-            bar.tasks[-1].__dict__["_get_time"] = lambda: now[0]
-            assert not isinstance(shown, str)
-            assert str(shown(bar.tasks[-1])) == expected
+    bar = output._drawn()
+    monkeypatch.setattr(bar, "get_time", lambda: now[0])
+    for limit, expected in ((None, "8 s left"), (5.0, "3 s left")):
+        now[0] = 0.0
+        task = bar.add_task("pulling", total=1000, figures="", limit=limit)
+        for second in (1.0, 2.0):
+            now[0] = second
+            bar.update(task, completed=int(100 * second))
+        shown = bar.columns[-1]
+        bar.tasks[-1].__dict__["_get_time"] = lambda: now[0]
+        assert not isinstance(shown, str)
+        assert str(shown(bar.tasks[-1])) == expected
 
 
 @pytest.mark.parametrize(

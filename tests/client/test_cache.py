@@ -143,7 +143,11 @@ def test_the_folder_is_the_users_or_the_one_named(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("LODESTREAM_CACHE", str(tmp_path))
     assert cache.cache_folder() == tmp_path
     monkeypatch.delenv("LODESTREAM_CACHE")
-    assert cache.cache_folder().name == "lodestream"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache.cache_folder() == tmp_path / "xdg" / "lodestream"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache.cache_folder() == tmp_path / ".cache" / "lodestream"
 
 
 @pytest.mark.parametrize(
@@ -181,7 +185,7 @@ def test_no_link_is_followed(tmp_path: Path) -> None:
             Part(folder, NAME, SIZE)
         path.unlink()
     path.hardlink_to(victim)
-    with pytest.raises(OSError, match="left alone"):
+    with pytest.raises(OSError, match="it is not changed"):
         Part(folder, NAME, SIZE)
     assert victim.read_bytes() == b"of somebody else"
     assert not nowhere.exists()
@@ -195,14 +199,14 @@ def test_no_other_file_is_written(tmp_path: Path, content: bytes) -> None:
         Part(tmp_path, NAME, SIZE).close()
         assert not path.exists()
         return
-    with pytest.raises(OSError, match="left alone"):
+    with pytest.raises(OSError, match="it is not changed"):
         Part(tmp_path, NAME, SIZE)
     assert path.read_bytes() == content
 
 
 def test_what_is_no_file_is_no_wait(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / f"{NAME}.part")
-    with pytest.raises(OSError, match="left alone"):
+    with pytest.raises(OSError, match="it is not changed"):
         Part(tmp_path, NAME, SIZE)
 
 

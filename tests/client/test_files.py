@@ -224,7 +224,7 @@ def test_pull_by_either_road_writes_the_same(
 def test_a_file_has_no_stream(run: Run, url: str, tmp_path: Path) -> None:
     code, _, stderr = run("pull", url, tmp_path / "o.npy", "--transport", "ws")
     assert code == 2
-    assert "a file's address has no WebSocket" in stderr
+    assert "the URL of a file has no WebSocket" in stderr
     with pytest.raises(ls.OptionError, match="surface's address for a WebSocket"):
         sync.connect(url, transport="ws")
 

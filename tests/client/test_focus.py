@@ -164,5 +164,5 @@ def test_a_surface_of_several_blocks_has_no_regions(server: str, tmp_path: Path)
     blocks = sync.upload(server, tmp_path / "sheets.obj").url
     with sync.connect(blocks, window=500) as stream:
         next(stream)
-        with pytest.raises(OptionError, match="expected no region of a surface of 2 blocks"):
+        with pytest.raises(OptionError, match="expected a surface of one block for a region, got 2 blocks"):
             stream.focus(NEAR)

@@ -150,7 +150,7 @@ def check_resumed(source: tuple[str, ...], out: Path, folder: Path, whole: Terra
         url = link.url if source[1:] else source[0]
         code, stdout, stderr = run("pull", url, out, "--resume", "--json", *source[1:])
     assert code == 0, stderr
-    assert "are here from before" in stderr
+    assert "are here from an earlier pull" in stderr
     figures = json.loads(stdout)
     assert figures["ended"] == "complete"
     came = max(figures["wire_bytes"], link.down)
@@ -177,8 +177,8 @@ def test_after_an_interrupt_there_is_what_came(
     assert figures["ended"] == "stopped"
     assert figures["bytes"] > 30_000
     check_written(out, figures, relief)
-    assert f"what came is written to {out}; " in stderr
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert f"the data received so far are written to {out}; " in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     check_resumed(source, out, folder, relief, run)
 
 
@@ -189,12 +189,12 @@ def test_for_people_there_is_a_line_of_figures(relief_surface: str, folder: Path
         code, stdout, stderr = end(process)
     assert (code, stdout) == (130, "")
     # Somebody who interrupts is not kept waiting: on a busy machine the name may not come in time, and that is told.
-    late = "lodestream: written without its name and place, which could not be fetched: "
+    late = "lodestream: written without metadata such as name and position, which could not be fetched: "
     first, figures, last = [line for line in stderr.splitlines() if not line.startswith(late)]
     assert first == "lodestream: interrupted"
     assert figures.startswith("lodestream: stopped: level ")
     assert "maximum" in figures
-    assert last.startswith("lodestream: what came is written to ")
+    assert last.startswith("lodestream: the data received so far are written to ")
 
 
 def test_a_server_that_is_killed(relief_file: Path, folder: Path, tmp_path: Path, relief: Terrain, run: Run) -> None:
@@ -212,8 +212,8 @@ def test_a_server_that_is_killed(relief_file: Path, folder: Path, tmp_path: Path
     figures = json.loads(stdout)
     assert figures["ended"] == "truncated"
     check_written(out, figures, relief)
-    assert f"what came is written to {out}; " in stderr
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert f"the data received so far are written to {out}; " in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     again = Server(tmp_path / "data")
     try:
         place = url.removeprefix(server.url)
@@ -243,7 +243,7 @@ def test_below_the_first_layer_nothing_is_written(
         code, stdout, stderr = run("pull", link.url, out, "--json", "--retry", "0", "--transport", transport)
     assert (code, stdout) == (1, "")
     assert out.read_bytes() == b"as it was"
-    assert f"the first layer has not come, and {out} is not written" in stderr.splitlines()[-1]
+    assert f"the first layer has not arrived, and {out} is not written" in stderr.splitlines()[-1]
     with (
         linked(relief_surface, Fault(cut_down=after, vanish=True)) as link,
         command("pull", link.url, out, "--json", "--transport", transport) as process,
@@ -273,7 +273,7 @@ def test_a_second_interrupt_ends_at_once(
         code, stdout, stderr = end(process)
     assert (code, stdout) == (130, "")
     assert stderr.splitlines()[-1] == f"lodestream: interrupted: {out} is not written"
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     assert list(places.iterdir()) == [out]
     assert out.read_bytes() == b"as it was"
     check_resumed((relief_surface, "--transport", "ws"), out, folder, relief, run)
@@ -289,7 +289,7 @@ def test_an_interrupt_of_the_writing_loses_nothing(
         process.send_signal(signal.SIGINT)
         code, _, stderr = end(process)
     assert code == 130
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     assert list(places.iterdir()) == []
     check_resumed((relief_surface, "--transport", "ws"), places / "o.npy", folder, relief, run)
 
@@ -346,7 +346,7 @@ def test_a_folder_that_cannot_be_written(
     code, _, stderr = run("pull", surface, out, "--limit-rate", "1mbit")
     assert code == 0
     assert np.array_equal(np.load(out), terrain)
-    assert stderr.count("what comes is not kept for pull --resume: ") == 1
+    assert stderr.count("received data are not kept for pull --resume: ") == 1
     assert len(stderr.splitlines()) == 2
     with linked(surface, lost(9000)) as link:
         code, stdout, stderr = run("pull", link.url, out, "--retry", "0", "--transport", "ws", "--json")
@@ -380,7 +380,7 @@ def test_a_disk_that_is_full(
     code, _, stderr = run("pull", surface, out, "--limit-rate", "1mbit")
     assert code == 0
     assert np.array_equal(np.load(out), terrain)
-    assert stderr.count("no more is kept for pull --resume: ") == (when != "before")
+    assert stderr.count("no more data are kept for pull --resume: ") == (when != "before")
     assert kept(folder) == 0
 
 
@@ -411,12 +411,12 @@ def test_the_name_of_the_surface_is_fetched_where_it_can_be(
     with linked(relief_surface, lambda number: Fault(cut_down=60_000 if number == 0 else None)) as link:
         code, _, stderr = run("pull", link.url, out, "--retry", "0", "--transport", "ws")
     assert code == 1
-    assert "without its name" not in stderr
+    assert "written without metadata" not in stderr
     next(folder.glob("*.part")).unlink()
     with linked(relief_surface, lost(60_000)) as link:
         code, _, stderr = run("pull", link.url, out, "--retry", "0", "--transport", "ws")
     assert code == 1
-    assert "written without its name and place, which could not be fetched: " in stderr
+    assert "written without metadata such as name and position, which could not be fetched: " in stderr
 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])

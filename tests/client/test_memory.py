@@ -283,7 +283,7 @@ def test_info_says_whose_word_the_errors_are(run: Run, server: str, tmp_path: Pa
     (tmp_path / "near.lode").write_bytes(with_layer_errors(honest, 0, 3.0, 1))
     code, out, _ = run("push", tmp_path / "near.lode", server)
     assert code == 0
-    assert "as told by whoever uploaded them" in run("info", out.strip())[1]
+    assert "stated by the uploader, not checked" in run("info", out.strip())[1]
     shown = sync.describe(out.strip()).details["layers"][0]["max"]
     assert shown == 3 * index_of(honest).layers[0].max_error
 
@@ -304,7 +304,7 @@ def test_push_of_a_container_with_options(
 ) -> None:
     code, out, err = run("push", container_file, server, *words)
     assert (code, out) == (1, "")
-    assert err == f"lodestream: expected no {what} for a container (.lode), which says it already\n"
+    assert err == f"lodestream: expected no {what} for a container (.lode), which is encoded already\n"
 
 
 def test_push_of_a_damaged_container(run: Run, server: str, container_file: Path, tmp_path: Path) -> None:

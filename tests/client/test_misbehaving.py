@@ -142,7 +142,7 @@ def test_more_than_was_granted(asynchronous: bool) -> None:
 def test_a_message_beyond_all_bounds(asynchronous: bool) -> None:
     with (
         websocket_server(says(bytes(MAX_MESSAGE + 1))) as url,
-        pytest.raises(ProtocolError, match="no WebSocket message"),
+        pytest.raises(ProtocolError, match="an invalid WebSocket message"),
     ):
         follow(url, asynchronous)
 

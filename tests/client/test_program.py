@@ -41,7 +41,7 @@ def loaded_after(statement: str, names: Sequence[str]) -> list[str]:
     return [str(name) for name in json.loads(done.stdout.replace(b"'", b'"'))]
 
 
-HEAVY = ("numba", "fastapi", "uvicorn", "rasterio", "matplotlib")
+HEAVY = ("fastapi", "uvicorn", "rasterio", "matplotlib")
 
 
 def test_importing_the_client_is_light() -> None:
@@ -55,7 +55,17 @@ def test_importing_the_client_is_light() -> None:
 
 def test_the_command_line_is_lighter_still() -> None:
     statement = "from lodestream_client.program import build_parser\nbuild_parser()"
-    assert loaded_after(statement, (*HEAVY, "numpy", "httpx", "websockets", "rich")) == []
+    assert loaded_after(statement, (*HEAVY, "numpy", "httpx", "websockets", "rich", "asyncio")) == []
+
+
+def test_a_command_on_files_loads_no_more_than_it_uses(container_file: Path, tmp_path: Path) -> None:
+    npy, again = tmp_path / "out.npy", tmp_path / "again.lode"
+    unused = ("fastapi", "rasterio", "httpx", "websockets", "rich", "asyncio", "urllib.request", "lodestream_server")
+    for words in (["decode", str(container_file), str(npy)], ["encode", str(npy), str(again)]):
+        statement = f"from lodestream_client.__main__ import main\nassert main({words}) == 0"
+        assert loaded_after(statement, unused) == []
+    statement = "from lodestream_client.program import build_parser\nbuild_parser(['decode', 'a', 'b'])"
+    assert loaded_after(statement, (*unused, "importlib.metadata")) == []
 
 
 def test_all_names_are_there() -> None:
@@ -118,7 +128,7 @@ class Finder:
             os.write(1, b"went on\\n" if {ignored!r} else b"")
 sys.meta_path.insert(0, Finder())
 from lodestream_client.__main__ import main
-sys.exit(main(["formats"]))
+sys.exit(main(["--help"]))
 """
 
 #: What is loaded before a command begins: the first of it, what the parsers need, and the server's part.

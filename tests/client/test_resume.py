@@ -237,10 +237,10 @@ def test_a_finer_pull_goes_on_from_a_coarser_one(
 ) -> None:
     coarse, stderr = pull(run, source, tmp_path / "a.npy", "--max-bytes", "9000")
     assert coarse["ended"] == "bytes"
-    assert "from before" not in stderr
+    assert "from an earlier pull" not in stderr
     assert len(parts(folder)) == 1
     level, stderr = pull(run, source, tmp_path / "b.npy", "--level", "3")
-    assert "from before" in stderr
+    assert "from an earlier pull" in stderr
     again, _ = pull(run, source, tmp_path / "c.npy", "--max-bytes", "9000")
     assert {key: again[key] for key in ("bytes", "rms", "max")} == {key: coarse[key] for key in ("bytes", "rms", "max")}
     assert again["wire_bytes"] < 1500, "nothing but what is said"
@@ -261,7 +261,7 @@ def test_a_pull_that_breaks_is_gone_on_with_by_the_next(
     with linked(surface, lambda number: Fault() if number == 0 else Fault(cut_down=9000)) as link:
         code, _, stderr = run("pull", link.url, tmp_path / "o.npy", "--resume", "--retry", "0", "--transport", "ws")
     assert code == 1
-    assert "are kept; pull --resume goes on from there" in stderr
+    assert "are kept; pull --resume continues from there" in stderr
     assert np.load(tmp_path / "o.npy").shape == terrain.shape, "as far as it came"
     kept = parts(folder)[0].stat().st_size
     assert kept > 4000
@@ -288,7 +288,7 @@ def test_a_pull_that_is_killed_is_gone_on_with(
         process.wait()
     kept = parts(folder)[0].stat().st_size
     figures, stderr = pull(run, surface, tmp_path / "o.npy", "--transport", transport)
-    assert "from before" in stderr
+    assert "from an earlier pull" in stderr
     assert figures["wire_bytes"] < figures["bytes"] - kept + 5000
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
 
@@ -425,4 +425,4 @@ def test_a_folder_that_cannot_be_used_is_named(
     code, _, stderr = run("pull", surface, tmp_path / "o.npy", "--resume")
     assert code == 1
     assert f"LODESTREAM_CACHE), got {tmp_path / 'file'}: " in stderr
-    assert "without --resume" in stderr
+    assert "leave out --resume" in stderr

@@ -148,7 +148,7 @@ def test_infinities_are_told_and_come_back_from_a_server(run: Run, server: str, 
     code, address, _ = run("push", tmp_path / "lake.npy", server)
     assert code == 0
     _, out, _ = run("info", address.strip())
-    assert "2000, 9 of them holes, 6 of these infinite or in part NaN" in " ".join(out.split())
+    assert "2000, 9 of them holes, 6 of these infinite or partly NaN" in " ".join(out.split())
     assert "yes, bit for bit wherever there is a value" in " ".join(out.split())
     details = json.loads(run("info", address.strip(), "--json")[1])
     assert (details["holes"], details["non_finite"], details["exact"]) == (9, 6, True)

@@ -13,7 +13,7 @@ import pytest
 
 import lodestream as ls
 import lodestream_client
-from lodestream_client.commands.output import progress_bar
+from lodestream_client.commands import output
 
 from .conftest import Run
 from .scripted import document, problem, scripted
@@ -134,8 +134,24 @@ def test_warnings_and_logs_of_libraries() -> None:
 
 
 def test_a_progress_bar_takes_no_markup() -> None:
-    with progress_bar() as bar:
-        assert all(not getattr(column, "markup", False) for column in bar.columns)
+    columns = output._drawn().columns
+    assert columns
+    assert all(not getattr(column, "markup", False) for column in columns)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_bar_is_drawn_on_a_terminal_alone(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with output.progress_bar() as bar:
+        task = bar.add_task("sending", total=1.0, figures="3 kB")
+        bar.update(task, completed=0.5)
+        bar.remove_task(task)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert bool(said.err) == terminal
 
 
 def test_everything_that_is_said_goes_one_way() -> None:

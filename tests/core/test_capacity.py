@@ -84,7 +84,7 @@ def test_what_is_allowed_is_decoded() -> None:
 
 def test_the_default_fits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 30)
-    with pytest.raises(TooLargeError, match=r"at most 410 MiB to decode \(40% of the memory there is\)") as caught:
+    with pytest.raises(TooLargeError, match=r"at most 410 MiB to decode \(40% of the available memory\)") as caught:
         ls.decode(empty())
     assert "max_vertices=16000000 allows it" in str(caught.value)
     monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 31)
@@ -155,7 +155,7 @@ def test_no_more_is_read_than_such_a_surface_has() -> None:
     decoder = ls.Decoder(max_vertices=2000)
     decoder.feed(start)
     decoder.feed(b"\x02" + b"\xff" * 6 + b"\x01")  # a layer of terabytes
-    with pytest.raises(TooLargeError, match="of which at most 16 MiB are kept"):
+    with pytest.raises(TooLargeError, match="whose data take at most 16 MiB"):
         feed(decoder, [bytes(1_000_000)] * 100)
     many = promising(layer_count=60_000)
     decoder = ls.Decoder(max_vertices=2000)

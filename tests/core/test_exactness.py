@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from lodestream.errors import CorruptStreamError
+from lodestream.errors import CorruptStreamError, StreamError
 from lodestream.exactness import decode_piece, encode_piece
 from lodestream.lattice import offset_lattice
+from lodestream.reference import exactness as reference
 
 from .coding import uncompiled
 
@@ -170,6 +171,24 @@ def test_offsets_that_repeat_cost_little(step: float) -> None:
         assert decode_piece(restored, data[:cut], 0).shape == restored.shape
     with pytest.raises(CorruptStreamError, match="at most"):
         decode_piece(restored, data + bytes(9), 0)
+
+
+def test_offsets_of_damaged_pieces_are_those_of_the_reference() -> None:
+    rng, step = np.random.default_rng(3), 0.02
+    offsets = np.repeat(rng.normal(size=16) * 100 * (np.arange(16) % 4 > 0), 64)
+    original = (np.rint(9 * rng.normal(size=offsets.size)) * step + offsets).astype(np.float32)
+    restored = (np.rint(original.astype(np.float64) / step) * step).astype(np.float32)
+    piece = encode_piece(original, restored, step)
+    assert piece[0] & 3 == 3
+    assert np.count_nonzero(original == 0), "the place of 0 is sought"
+    for changed in range(9, len(piece), 3):
+        damaged = bytearray(piece)
+        damaged[changed] ^= 85
+        try:
+            values = reference.restore(bytes(damaged), restored)
+        except StreamError:
+            continue  # the damaged string ends sooner
+        assert values.tobytes() == decode_piece(restored, bytes(damaged), 0).tobytes()
 
 
 def test_a_step_without_offsets_changes_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -261,6 +262,13 @@ def test_nothing_is_hashed_or_run_where_the_package_is_installed(tmp_path: Path)
     environment = {**os.environ, "PYTHONPATH": str(KERNELS.parent)}
     done = subprocess.run([sys.executable, "-S", "-c", code], env=environment, capture_output=True, text=True)
     assert done.stdout == "set()\n", done.stderr
+
+
+def test_kernels_include_nothing_that_a_compiler_alone_does_not_have() -> None:
+    text = "".join(path.read_text() for path in KERNELS.glob("*.[ch]"))
+    included = set(re.findall(r"#include <(.*)>", text))
+    assert "stdint.h" in included
+    assert included <= {"float.h", "limits.h", "stdbool.h", "stddef.h", "stdint.h"}
 
 
 def test_tables_are_those_of_their_program() -> None:

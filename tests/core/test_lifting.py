@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 from typing import Any
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import kernels, lifting
 from lodestream.axis import AxisStep, axis_step
 from lodestream.lifting import CLAMP, TAPS, forward_step, inverse_step
 
@@ -66,6 +68,63 @@ def test_a_step_is_that_of_the_reference(ends: Ends, axis: int) -> None:
         forward_step(ours, axis, step_of(length, ends), predictor)
         expected = reference.forward(lines.astype(np.int64), ends, *predictor).astype(np.int32)
         np.testing.assert_array_equal(ours if axis == 0 else ours.T, expected)
+
+
+def stepped(lines: Ints, axis: int, step: AxisStep, predictor: tuple[int, int], inverse: bool) -> Ints:
+    """The step of lines along axis 0, made along either axis."""
+    ours = np.array(lines if axis == 0 else lines.T, order="C")
+    (inverse_step if inverse else forward_step)(ours, axis, step, predictor)
+    return ours if axis == 0 else ours.T
+
+
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize(("axis", "nodes"), [(0, range(31, 57)), (0, range(84, 87)), (1, range(2067, 2070))])
+def test_chunks_of_nodes_leave_no_trace(ends: Ends, axis: int, nodes: range) -> None:
+    """The kernel works on 32 nodes of a strip at a time, and on 2048 of a row; at the end on up to 19 more."""
+    for count, odd in itertools.product(nodes, (0, 1)):
+        length, predictor = 2 * count - odd, PREDICTORS[count % len(PREDICTORS)]
+        lines = random_grid((length, 17 if axis == 0 else 1), count)
+        coefficients = reference.forward(lines.astype(np.int64), ends, *predictor).astype(np.int32)
+        step = step_of(length, ends)
+        np.testing.assert_array_equal(stepped(lines, axis, step, predictor, False), coefficients)
+        coefficients >>= 3
+        samples = reference.inverse(coefficients.astype(np.int64), ends, *predictor)
+        np.testing.assert_array_equal(stepped(coefficients, axis, step, predictor, True), samples)
+
+
+@pytest.mark.parametrize("ends", [FREE, CLOSED])
+@pytest.mark.parametrize(("axis", "shape", "several"), [(1, (1, 4_260_004), (2, 1)), (0, (66_604, 64), (1, 2))])
+def test_long_lines_take_several_calls_and_come_out_as_in_one(
+    ends: Ends, axis: int, shape: tuple[int, int], several: tuple[int, int]
+) -> None:
+    """Lines that the kernel does not take together are done in one call."""
+    step = step_of(shape[axis], ends)
+    work = np.empty((step.midpoints + step.run + 25) * (64 if axis == 0 else 1) + 16, np.int32)
+    for inverse in (0, 1):
+        lines = random_grid(shape, inverse, 2**16)
+        whole = np.tile(lines, several)
+        fixed = step.midpoints, step.run, step.extension(10), 32, -7
+        assert kernels.lift(inverse, axis, whole, *fixed, 0, work) == step.run
+        calls, done = 0, 0
+        while done < step.run:
+            done, calls = kernels.lift(inverse, axis, lines, *fixed, done, work), calls + 1
+        assert calls > 1
+        np.testing.assert_array_equal(np.tile(lines, several), whole)
+
+
+@pytest.mark.parametrize("at_once", [1, 500, 4000])
+def test_lines_are_divided_between_calls(at_once: int) -> None:
+    for axis, width in itertools.product((0, 1), (1, 15, 64, 70, 143, 200)):
+        lines = random_grid((21, width), width)
+        expected = reference.forward(lines.astype(np.int64), FREE, 32, -7)
+        lift = Mock(wraps=kernels.lift)
+        with patch.object(lifting, "_AT_ONCE", at_once), patch.object(kernels, "lift", lift):
+            ours = stepped(lines, axis, axis_step(21), (32, -7), False)
+            np.testing.assert_array_equal(ours, expected)
+            planes = [call.args[2].size for call in lift.call_args_list]
+            np.testing.assert_array_equal(stepped(ours, axis, axis_step(21), (32, -7), True), lines)
+        assert sum(planes) == lines.size
+        assert max(planes) <= max(at_once, 21 * 64)
 
 
 def test_strips_of_columns_and_strided_windows_make_no_difference() -> None:
@@ -191,7 +250,7 @@ def test_hostile_coefficients_stay_within_the_limit_and_are_those_of_exact_integ
 def test_nodes_far_out_that_rise_slowly_or_steeply_are_those_of_exact_integers(
     ends: Ends, predictor: tuple[int, int]
 ) -> None:
-    """Whether int32 or float64 is computed with depends on the rises alone, and makes no difference."""
+    """Whether sums are taken in 32 or in 64 bits depends on the rises alone, and makes no difference."""
     extreme = 2**28 - 1
     for length, bits in itertools.product((6, 7, 12, 19), range(4, 30)):
         step, rng = step_of(length, ends), np.random.default_rng(bits)
@@ -203,6 +262,75 @@ def test_nodes_far_out_that_rise_slowly_or_steeply_are_those_of_exact_integers(
         np.testing.assert_array_equal(
             ours.astype(object), reference.inverse(lines.astype(object), ends, *predictor), f"{length}, {bits}"
         )
+
+
+@pytest.mark.parametrize("predictor", PREDICTORS)
+def test_details_at_the_limit_of_32_bits_are_those_of_exact_integers(predictor: tuple[int, int]) -> None:
+    """Sums are taken in 32 bits while no detail is beyond 2**18."""
+    for bits, length in itertools.product((2**18 - 1, 2**18, 2**18 + 1, 2**19), (9, 40, 41)):
+        lines = np.zeros((length, 24), np.int32)
+        signs = np.sign(TAPS[[*range(9, -1, -1), *range(10)]]).astype(np.int32)
+        step = axis_step(length)
+        for column in range(24):
+            place = step.coarse + np.arange(20) - column + 2
+            inside = (place >= step.coarse) & (place < length)
+            lines[place[inside], column] = (bits * signs)[inside]
+        expected = reference.inverse(lines.astype(object), FREE, *predictor)
+        np.testing.assert_array_equal(stepped(lines, 0, step, predictor, True).astype(object), expected)
+
+
+@given(
+    length=st.integers(1, 150),
+    width=st.integers(1, 80),
+    axis=st.integers(0, 1),
+    ends=st.sampled_from(ENDS),
+    predictor=st.sampled_from(PREDICTORS),
+    seed=st.integers(0, 2**32),
+)
+def test_any_int32_gives_samples_within_the_limit(
+    length: int, width: int, axis: int, ends: Ends, predictor: tuple[int, int], seed: int
+) -> None:
+    lines, step = random_grid((length, width), seed, 2**31 - 1), step_of(length, ends)
+    samples = stepped(lines, axis, step, predictor, True)
+    assert not step.midpoints or max(abs(int(samples.min())), int(samples.max())) <= CLAMP
+    stepped(lines, axis, step, predictor, False)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    step, plane = axis_step(9), np.zeros((9, 20), np.int32)
+    fitting: list[Any] = [0, 0, plane, 4, 5, step.extension(10), 16, 0, 0, np.empty(34 * 64 + 16, np.int32)]
+    assert kernels.lift(*fitting) == 5
+    far, turned = step.extension(10).copy(), step.extension(10).copy()
+    far[3, 0], turned[3, 1] = 4, 2
+    for place, value in [
+        (2, plane[:8]),
+        (2, plane[:0]),
+        (2, plane[:, :0]),
+        (3, 0),
+        (3, 3),
+        (4, 4),
+        (4, 6),
+        (5, far),
+        (5, -far),
+        (5, turned),
+        (5, far[1:]),
+        (6, 128),
+        (6, -128),
+        (7, 128),
+        (7, -128),
+        (8, -1),
+        (8, 1),
+        (8, 5),
+        (9, np.empty(34 * 64 + 15, np.int32)),
+    ]:
+        with pytest.raises(ValueError, match="do not fit"):
+            kernels.lift(*fitting[:place], value, *fitting[place + 1 :])
+    long, work = np.zeros((2, 9001), np.int32), np.empty(9100, np.int32)
+    for rows, start in ((1, 2048), (2, 0)):
+        extension = axis_step(9001).extension(10)
+        assert kernels.lift(0, 1, long[:rows], 4500, 4501, extension, 0, 0, start, work) == 4501
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.lift(0, 1, long, 4500, 4501, extension, 0, 0, 2048, work)
 
 
 def test_the_reference_in_plain_and_in_python_integers_agree() -> None:

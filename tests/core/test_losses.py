@@ -170,7 +170,7 @@ def check_losses(suffix: str, surface: Surface) -> None:
     for word in words:
         shown = {"geotransform": ("geotransform", "evenly spaced")}.get(word, (word,))
         assert any(it in note for note in notes for it in shown), (word, notes)
-    allowed = ["PNG holds shades from", "VTS is written with vtkGhostType_"]
+    allowed = ["PNG has grey levels from", "VTS is written with the attribute vtkGhostType as vtkGhostType_"]
     if not words:
         assert [note for note in notes if not any(note.startswith(it) for it in allowed)] == []
 
@@ -265,7 +265,7 @@ READ: dict[str, tuple[str, str, list[str]]] = {
         "a.vtk",
         LEGACY.format("FIELD f 1\nTIME 1 1 double\n3.5\n")
         + "CELL_DATA 1\nSCALARS area float\nLOOKUP_TABLE default\n1\n",
-        ["left out what does not belong to points: TIME, area"],
+        ["left out data that do not belong to points: TIME, area"],
     ),
     "VTK, nothing": ("a.vtk", LEGACY.format(""), []),
 }
@@ -302,7 +302,7 @@ def test_a_png_s_words_and_degrees_of_transparency_are_named(tmp_path: Path) -> 
     surface, notes = noted(lambda: formats.read(tmp_path / "a.png"))
     assert notes == [
         "left out texts of the PNG: Copyright",
-        "left out degrees of transparency, of which only 0 makes holes",
+        "left out partial transparency; only fully transparent points are holes",
     ]
     assert surface.mask is not None
     assert int((~surface.mask).sum()) == 1

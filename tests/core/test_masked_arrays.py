@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -66,3 +70,10 @@ def test_what_is_under_a_mask_is_nobodys_value() -> None:
     assert np.isnan(back.points[1, 2]).all()
     assert np.isinf(back.points[3, 3]).all()
     assert np.isinf(points.data[1, 2]).all()
+
+
+def test_a_plain_array_does_not_load_numpys_masked_ones() -> None:
+    code = "import sys, numpy; from lodestream import Surface; Surface(numpy.eye(3)); print('numpy.ma' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

@@ -221,7 +221,7 @@ def test_ply_renames_what_it_cannot_call_so_and_warns_of_rounded_integers() -> N
 
 def test_obj_has_colours_normals_and_textures(tmp_path: Path) -> None:
     surface = colored()
-    with pytest.warns(FormatWarning, match="OBJ is written without heat, flow, for which it has no place"):
+    with pytest.warns(FormatWarning, match="OBJ is written without heat, flow, which it cannot hold"):
         formats.write(surface, tmp_path / "a.obj")
     text = (tmp_path / "a.obj").read_text()
     assert text.startswith('# name a b\n# crs GEOGCS["X", 1]\nv ')
@@ -272,9 +272,7 @@ def test_glb_stores_large_coordinates_from_their_middle_and_warns(tmp_path: Path
         "gap": np.full((4, 5), np.nan),
         "normal": np.ones((4, 5, 3), np.float32),
     }
-    with pytest.warns(
-        FormatWarning, match="GLB is written with float32 in place of coordinates, time, gap, which it ro"
-    ):
+    with pytest.warns(FormatWarning, match="GLB is written with float32, to which it rounds coordinates, time, gap"):
         formats.write(Surface(points, attributes=attributes), tmp_path / "a.glb")
     mesh = trimesh.load(tmp_path / "a.glb", process=False, force="mesh")
     np.testing.assert_allclose(mesh.vertices, points.reshape(-1, 3), atol=1e-7, rtol=0)

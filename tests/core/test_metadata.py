@@ -146,7 +146,7 @@ def test_every_reader_drops_the_largest_and_says_so(tmp_path: Path, kind: str) -
     if kind not in found:
         pytest.skip("the library for it is not installed")
     path, named = found[kind]
-    with pytest.warns(FormatWarning, match="metadata may be 65,536 bytes long, hence left out: ") as caught:
+    with pytest.warns(FormatWarning, match="metadata are limited to 65,536 bytes; left out: ") as caught:
         surface = formats.read(path)
     assert len(caught) == 1
     note = str(caught[0].message)

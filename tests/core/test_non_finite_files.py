@@ -34,7 +34,7 @@ def test_formats_of_numbers_hold_infinite_heights(suffix: str, tmp_path: Path) -
     else:
         points = plane()
         points[50, 50, 0] = np.inf
-        with pytest.warns(ls.FormatWarning, match="those of holes that lie elsewhere are left out"):
+        with pytest.warns(ls.FormatWarning, match="those of holes that are off this grid are left out"):
             found = written(ls.Surface(points), suffix, tmp_path)
         points[50, 50] = np.nan
         assert np.array_equal(found.points, points[..., 2], equal_nan=True)

@@ -223,7 +223,7 @@ def test_q_and_function_files_give_attributes(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"expected one Q file, got another: g\.q"):
         formats.read(tmp_path / "g.x", tmp_path / "g.q", tmp_path / "g.q")
     (tmp_path / "again.q").write_bytes(records([*q[:4], reference * 2, q[5]]))
-    with pytest.warns(FormatWarning, match="left out the reference numbers of the blocks of a Q file after the first"):
+    with pytest.warns(FormatWarning, match="left out the reference numbers of later blocks of a Q file"):
         surface = formats.read(tmp_path / "g.x", tmp_path / "again.q")
     assert surface.metadata["scalars"]["mach"] == 0.5
     (tmp_path / "other.q").write_bytes(records([head, np.array([4, 3, 1, 2, 2, 1], np.int32), *q[2:]]))

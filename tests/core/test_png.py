@@ -89,12 +89,12 @@ def test_colours_are_what_the_option_says(tmp_path: Path, alpha: bool) -> None:
         else:
             assert surface.mask is None
     np.testing.assert_array_equal(formats.read(path, filename="tile_terrarium.png").points, terrarium.points)
-    with pytest.raises(FormatError, match="got colours: say what they stand for, encoding=terrain-rgb or encoding=ter"):
+    with pytest.raises(FormatError, match="got colours: give their meaning with encoding=terrain-rgb or encoding=ter"):
         formats.read(path)
     for wrong in ("grey", "mars"):
         with pytest.raises(OptionError, match=f"encoding=.*got '{wrong}'"):
             formats.read(path, encoding=wrong)
-    with pytest.raises(OptionError, match="expected encoding=grey for shades of grey, got 'terrarium'"):
+    with pytest.raises(OptionError, match="expected encoding=grey for grey levels, got 'terrarium'"):
         formats.read(save(tmp_path / "b.png", shades(np.uint8)), encoding="terrarium")
 
 
@@ -151,7 +151,7 @@ def test_heights_of_many_steps_are_rounded_and_that_is_said(tmp_path: Path) -> N
 
 
 def test_shifted_heights_are_announced_and_their_rule_is_a_text(tmp_path: Path) -> None:
-    with pytest.warns(FormatWarning, match="shifted and scaled to them, by a rule in its text"):
+    with pytest.warns(FormatWarning, match="shifted and scaled to them; a text chunk has the rule"):
         formats.write(Surface(np.array([[-3, 5], [7, 9]], np.int16)), tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as image:
         rule = json.loads(image.text["lodestream"])  # type: ignore[attr-defined]

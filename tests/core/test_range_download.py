@@ -333,7 +333,7 @@ def test_layers_are_shown_before_the_index_has_come_and_none_too_many(name: str,
         try:
             chosen = plan(index, target)
         except OptionError:
-            with pytest.raises(OptionError, match="first step"):
+            with pytest.raises(OptionError, match="first layer or level"):
                 File(container).serve(RangeDownload(Reception(target)))
             continue
         reception = Reception(target)

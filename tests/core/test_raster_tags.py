@@ -181,7 +181,7 @@ def test_what_a_surface_has_not_of_a_geotiff_is_named(tmp_path: Path) -> None:
             dataset.write(np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
     for name, expected in (
         ("a.tif", "^left out the colour table of band 1, 4 ground control points$"),
-        ("b.tif", "^left out degrees of transparency in band 2$"),
+        ("b.tif", "^left out partial transparency in band 2$"),
     ):
         with pytest.warns(FormatWarning, match=expected):
             formats.read(tmp_path / name)

@@ -139,7 +139,7 @@ def test_xyz_over_an_even_lattice_is_written_as_heights(tmp_path: Path) -> None:
     np.testing.assert_array_equal(surface.points, points[..., 2])
     points[2, 2, 0] += 1
     for surface, message in (
-        (Surface(points), "heights over an even lattice for GeoTIFF, got x, y, z that are not"),
+        (Surface(points), "heights on an even grid for GeoTIFF, got x, y, z that are not"),
         (Surface(points[..., :2]), "got planar points that are not"),
         (Surface(blocks=[Block(hills()), Block(hills())]), "one block for geotiff, got 2"),
     ):
@@ -149,9 +149,9 @@ def test_xyz_over_an_even_lattice_is_written_as_heights(tmp_path: Path) -> None:
 
 
 def test_what_a_geotiff_cannot_say_is_said(tmp_path: Path) -> None:
-    with pytest.warns(FormatWarning, match="GeoTIFF cannot say that a surface is closed"):
+    with pytest.warns(FormatWarning, match="GeoTIFF cannot express closed axes"):
         formats.write(Surface(hills(), (False, True)), tmp_path / "a.tif")
-    with pytest.warns(FormatWarning, match="evenly spaced, which those of this level are only nearly"):
+    with pytest.warns(FormatWarning, match="evenly spaced rows and columns; those of this level are only nearly"):
         formats.write(Surface(hills(), metadata={"nodes": [None, list(range(9))]}), tmp_path / "a.tif")
     with pytest.warns(FormatWarning, match="the CRS is left out, which GDAL does not know"):
         formats.write(Surface(hills(), metadata={"crs": "somewhere"}), tmp_path / "a.tif")
@@ -224,7 +224,7 @@ def test_an_srtm_tile_lies_where_its_name_says(tmp_path: Path) -> None:
     assert formats.read(tmp_path / "upload", filename="S07W122.SRTMGL3.hgt").metadata == surface.metadata | {
         "name": "S07W122.SRTMGL3"
     }
-    with pytest.warns(FormatWarning, match="the name of an SRTM tile tells where it lies, and this one does not"):
+    with pytest.warns(FormatWarning, match="the name of an SRTM tile gives its position, but this one does not"):
         nowhere = formats.read(tmp_path / "upload", filename="hill.hgt")
     assert not {"geotransform", "crs"} & set(nowhere.metadata)
     np.testing.assert_array_equal(nowhere.points, surface.points)

@@ -181,7 +181,7 @@ def test_the_seam_of_etopo_is_the_one_in_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made[0], np.broadcast_to(x, heights.shape))
     np.testing.assert_array_equal(made[1], np.broadcast_to(y[:, None], heights.shape))
     with pytest.warns(
-        FormatWarning, match="NPY is written without tags, unit, geotransform, axes, for which it has no"
+        FormatWarning, match="NPY is written without tags, unit, geotransform, axes, which it cannot hold"
     ):
         formats.write(surface, tmp_path / "a.npy")
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), heights)
@@ -270,5 +270,5 @@ def test_colours_ask_what_they_stand_for() -> None:
     for name in ("fuji.png", "gcanyon_color.1024.png"):
         if not (DATA / name).exists():
             pytest.skip(f"the real file {name} is not beside this project")
-        with pytest.raises(FormatError, match="say what they stand for, encoding=terrain-rgb or encoding=terrarium"):
+        with pytest.raises(FormatError, match="give their meaning with encoding=terrain-rgb or encoding=terrarium"):
             formats.read(DATA / name)

@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import kernels, transform
 from lodestream.layout import Layout
-from lodestream.lifting import CLAMP
+from lodestream.lifting import CLAMP, TAPS
 from lodestream.predictors import COEFFICIENT_BITS, default_predictors, fitted_steps
 from lodestream.transform import (
     allocate,
@@ -117,6 +120,97 @@ def test_the_fit_makes_details_smaller_than_the_fixed_rules() -> None:
     assert sizes[0] < 0.7 * sizes[1]
 
 
+Ints = NDArray[np.int32]
+
+
+def factors_of(nodes: Ints, details: Ints) -> tuple[list[Ints], int]:
+    kept = [np.empty(details.size, np.int32) for _ in range(3)]
+    return kept, kernels.predictor_factors(nodes, details, *kept)
+
+
+@given(rows=st.integers(1, 9), columns=st.integers(1, 9), bits=st.integers(1, 27), seed=st.integers(0, 2**32))
+def test_factors_are_what_the_third_step_multiplies(rows: int, columns: int, bits: int, seed: int) -> None:
+    nodes = grid((rows + 5, columns), 2**bits - 1, seed).astype(np.int32)
+    details = grid((rows, columns + 3), 2**bits - 1, seed).astype(np.int32)[:, 1:-2]
+    (first, second, kept), largest = factors_of(nodes, details)
+    inner, outer = (nodes[2:-3] + nodes[3:-2] - nodes[1:-4] - nodes[4:-1]), (nodes[2:-3] + nodes[3:-2])
+    outer = outer - nodes[:-5] - nodes[5:]
+    np.testing.assert_array_equal(first, inner.ravel())
+    np.testing.assert_array_equal(second, outer.ravel())
+    np.testing.assert_array_equal(kept, details.ravel())
+    assert max(np.abs(inner).max(), np.abs(outer).max()) <= largest <= 2**31
+
+
+@given(
+    count=st.integers(0, 1200),
+    bits=st.integers(0, 27),
+    a=st.integers(-127, 127),
+    b=st.integers(-127, 127),
+    seed=st.integers(0, 2**32),
+)
+def test_bits_and_moments_are_those_of_numpy(count: int, bits: int, a: int, b: int, seed: int) -> None:
+    first, second, details = grid((3, count), 2**bits, seed).astype(np.int32)
+    u, w, d = (x.astype(np.float64) for x in (first, second, details))
+    total = np.array([5.0])
+    kernels.predictor_bits(first, second, details, 2**bits, a, b, total)
+    e = d - np.floor((a * u + b * w + 128) / 256)
+    assert total[0] == pytest.approx(5.0 + np.log2(1 + np.abs(e)).sum(), abs=1e-9 + 3e-6 * (32 + count / 16))
+    for weighted in (0, 1):
+        moments, weight = np.full(5, 0.25), 1 / (1 + weighted * np.abs(d - (a * u + b * w) / 256))
+        kernels.predictor_moments(first, second, details, a, b, weighted, moments)
+        parts = [weight * x for x in (u * u, u * w, w * w, u * d, w * d)]
+        for moment, part in zip(moments, parts, strict=True):
+            assert moment == pytest.approx(0.25 + part.sum(), abs=1e-12 * (1 + np.abs(part).sum()))
+
+
+def test_a_sample_in_parts_is_the_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = [smooth((80, 60), 2**20), grid((300, 200), 2**10), smooth((60, 500), 2**24) + grid((60, 500), 9)]
+    fits = []
+    for at_once in (1 << 22, 1000):
+        monkeypatch.setattr(transform, "_AT_ONCE", at_once)
+        for one in values:
+            layout = Layout.single((one.shape[0], one.shape[1]), (False, True), (7, 7))
+            fits.append(forward([load(one)], layout))
+    for whole, parts in zip(fits[:3], fits[3:], strict=True):
+        np.testing.assert_array_equal(whole, parts)
+
+
+def test_samples_that_do_not_fit_are_refused() -> None:
+    nodes, details, flat = np.zeros((9, 3), np.int32), np.zeros((4, 3), np.int32), np.zeros(12, np.int32)
+    assert kernels.predictor_factors(nodes, details, flat, flat.copy(), flat.copy()) == 1
+    short = flat[1:]
+    for refused in (
+        (nodes[1:], details, flat, flat, flat),
+        (nodes[:, 1:], details, flat, flat, flat),
+        (nodes[:5], details[:0], flat, flat, flat),
+        (nodes, details, short, flat, flat),
+        (nodes, details, flat, short, flat),
+        (nodes, details, flat, flat, short),
+    ):
+        with pytest.raises(ValueError, match="do not fit"):
+            kernels.predictor_factors(*refused)
+    for arrays in ((short, flat, flat), (flat, short, flat), (flat, flat, short)):
+        with pytest.raises(ValueError, match="do not fit"):
+            kernels.predictor_moments(*arrays, 0.0, 0.0, 1, np.zeros(5))
+        with pytest.raises(ValueError, match="do not fit"):
+            kernels.predictor_bits(*arrays, 1, 0, 0, np.zeros(1))
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.predictor_moments(flat, flat, flat, 0.0, 0.0, 1, np.zeros(4))
+    for largest, a, b, count in ((-1, 0, 0, 1), (2**31 + 1, 0, 0, 1), (1, 128, 0, 1), (1, 0, -128, 1), (1, 0, 0, 2)):
+        with pytest.raises(ValueError, match="do not fit"):
+            kernels.predictor_bits(flat, flat, flat, largest, a, b, np.zeros(count))
+
+
+@given(seed=st.integers(0, 2**32))
+def test_any_int32_has_bits(seed: int) -> None:
+    nodes, details = (grid((rows, 40), 2**31 - 1, seed).astype(np.int32) for rows in (45, 40))
+    kept, largest = factors_of(nodes, details)
+    total = np.zeros(1)
+    for a, b in ((127, 127), (-127, 127), (0, 0)):
+        kernels.predictor_bits(*kept, largest, a, b, total)
+    assert 0 < total[0] < 3 * 33 * details.size
+
+
 def test_only_long_axes_have_predictors_of_their_own() -> None:
     layout = Layout.single((200, 9), (False, True), (7, 7))
     own, others = set(fitted_steps(layout)), effective(layout, default_predictors(layout))
@@ -144,6 +238,37 @@ def test_synthesis_norms_are_what_a_coefficient_adds() -> None:
             inverse([values], layout, predictors, layout.levels)
             measured = float((values.astype(np.float64) ** 2).sum()) / unit**2
             assert norms[level, kind[0], kind[1]] == pytest.approx(measured, rel=0.02)
+
+
+def step_without_rounding(nodes: list[float], surplus: list[float], a: int, b: int) -> list[float]:
+    """One inverse step of a closed line, from the formulas."""
+    n, taps = len(nodes), [float(tap) / 2**24 for tap in TAPS]
+    details = []
+    for k in range(n):
+        near = nodes[k] + nodes[(k + 1) % n]
+        inner, outer = near - nodes[(k + 2) % n] - nodes[k - 1], near - nodes[(k + 3) % n] - nodes[k - 2]
+        details.append(surplus[k] + (a * inner + b * outer) / 256)
+    even = [
+        nodes[k] - sum(h * (details[(k + j) % n] + details[k - 1 - j]) for j, h in enumerate(taps)) for k in range(n)
+    ]
+    return [x for k in range(n) for x in (even[k], details[k] + (even[k] + even[(k + 1) % n]) / 2)]
+
+
+def test_synthesis_norms_are_those_of_the_formulas() -> None:
+    layout = Layout.single((1, 1600), (True, True), (7, 7))
+    predictors = default_predictors(layout)
+    predictors[:, 1] = np.random.default_rng(1).integers(-30, 31, (layout.levels, 2))
+    norms = synthesis_norms(layout, predictors)
+    for level, kind in itertools.product(range(1, layout.levels + 1), (0, 1)):
+        line, details, grown = [0.0] * 16, [0.0] * 16, 1.0
+        (details if kind else line)[8] = 1.0
+        for finer in range(level, layout.levels + 1):
+            if len(line) == 16 * 2**6:
+                grown *= 2
+                continue
+            line = step_without_rounding(line, details, *(int(x) for x in effective(layout, predictors)[finer - 1, 1]))
+            details = [0.0] * len(line)
+        assert norms[level, 0, kind] == pytest.approx(grown * sum(x * x for x in line), rel=1e-12)
 
 
 def test_rows_do_not_lie_a_power_of_two_apart() -> None:

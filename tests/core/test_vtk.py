@@ -168,7 +168,7 @@ def test_what_is_blanked_is_a_hole(seed: int) -> None:
 def test_what_belongs_to_cells_is_left_out_with_a_warning(tmp_path: Path) -> None:
     grid = grid_of((4, 3, 1), points_of((4, 3, 1)), {"area": np.arange(6.0)})
     write(vtkXMLStructuredGridWriter(), grid, tmp_path / "g.vts")
-    with pytest.warns(FormatWarning, match="left out what does not belong to points: area"):
+    with pytest.warns(FormatWarning, match="left out data that do not belong to points: area"):
         assert formats.read(tmp_path / "g.vts").attributes == {}
 
 

@@ -106,8 +106,8 @@ class _Forked:
 class _ForkServer(processes.ForkServer):
     """Has one fork server already; when that has died, it starts another as it always does."""
 
-    def __init__(self, warm: Callable[[], object] | None, forked: _Forked) -> None:
-        super().__init__(warm)
+    def __init__(self, preload: Callable[[], object] | None, forked: _Forked) -> None:
+        super().__init__(preload)
         self._forked: Any = forked
 
     def _start(self) -> Any:
@@ -120,7 +120,7 @@ def main() -> None:
     # Now, not in each process.
     for module in _MODULES:
         import_module(module)
-    worker.warm()
+    worker.preload()
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     # A fork server that is started anew belongs to the shim, too.
@@ -165,7 +165,7 @@ def _be(arguments: list[str], log: str) -> int:
         # Forked while this process has one thread.
         forked = _Forked()
         names: Any = jobs
-        names.ForkServer = lambda warm: _ForkServer(warm, forked)
+        names.ForkServer = lambda preload: _ForkServer(preload, forked)
     return main(arguments)
 
 

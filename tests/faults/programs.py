@@ -25,7 +25,7 @@ __all__ = ["PATIENCE", "Program", "Programs", "Server"]
 PATIENCE = 60.0
 
 # A process from which others are forked has one thread.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "NUMBA", "OMP", "OPENBLAS")}
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
 
 _LISTENING = re.compile(r"Lodestream serving (http://\S+)")
 

@@ -12,18 +12,21 @@ PATH = Path(__file__).parents[2] / "docs" / "settings.md"
 _INTRODUCTION = """\
 # Settings of the server
 
-This page is `lodestream_server.table` and `lodestream_server.bounds`, written by `python -m tests.server.manual` and
-checked by a test.
+All settings of `lodestream serve`. A server for yourself needs none of them. For a server that others can reach,
+[operating.md](operating.md) says which ones to think about.
 
-- Each setting is a variable of the environment, an option of `lodestream serve`, and a field of
-  `lodestream_server.Settings`. An option wins over the variable; an empty variable counts as none.
+- Each setting is an environment variable, an option of `lodestream serve`, and a field of
+  `lodestream_server.Settings`. An option takes precedence over the variable. An empty variable counts as not set.
 - Sizes are bytes, or written like `500MB` (powers of 1000) or `4GiB` (powers of 1024). Switches are `yes` or `no`; as
   an option `--public-reads` or `--no-public-reads`. Lists are separated by commas.
-- What a limit answers: 413 what is too large in itself; 408 a client that is too slow; 429 a client that has too much
-  at the same time; 503 a server that has too much to do; 507 no room. 429, 503 and 507 carry `Retry-After`, and say
-  whose bound it is. A build beyond its limits waits, and the surface says why. In a stream the same words come as an
-  `error`, before a close code of 4000 plus the status.
-- [operating.md](operating.md) says which of them to think about before others can reach the server.
+- When a limit is reached, the answer is 413 (this request is too large), 408 (the client is too slow), 429 (the client
+  has too much in progress), 503 (the server has too much in progress) or 507 (no disk space). 429, 503 and 507 have
+  `Retry-After`, and their messages say which limit was reached. If a build exceeds a limit, its surface is `waiting`,
+  with the reason. In a stream the server sends an `error` message with the same code word, and closes with 4000 plus
+  the status.
+
+This page is written by `python -m tests.server.manual` from `lodestream_server.table` and `lodestream_server.bounds`; a
+test checks it.
 """
 
 
@@ -35,11 +38,12 @@ def _row(setting: Setting) -> str:
 
 
 _BOUNDS = """\
-## What follows from the machine and these
+## Limits that need no setting
 
-Nobody has to choose these. A program that starts a server by itself (`create_app`, `running_server`) may give others.
+These are fixed, or follow from the machine and the settings. An operator cannot change them. A program that starts a
+server by itself (`create_app`, `running_server`) can pass other values.
 
-| bound | at most, unless the text says otherwise |
+| name | limit |
 | --- | --- |
 """
 
@@ -47,7 +51,7 @@ Nobody has to choose these. A program that starts a server by itself (`create_ap
 def _bounds() -> str:
     rows = []
     for name, field in Bounds.model_fields.items():
-        value = "" if field.default is None else f"{field.default:,g}: "
+        value = "" if field.default is None else f"{field.default:,.10g}: "
         rows.append(f"| `{name}` | {value}{field.description} |\n")
     return _BOUNDS + "".join(rows)
 

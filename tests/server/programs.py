@@ -177,14 +177,12 @@ def _answer() -> None:
 
 def main() -> None:
     """Serve until told to end."""
-    from lodestream_server import Settings, worker
+    from lodestream_server import Settings
     from lodestream_server.logs import configure
     from lodestream_server.running import serve_alone
-    from tests.server import slow
 
     settings = Settings(**json.loads(sys.argv[1]))
     configure(settings.log_format, settings.log_level)
-    worker.warm = slow.warm_heights  # other kinds of surfaces do not come
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
     serve_alone(settings, lambda address: print(address, flush=True))

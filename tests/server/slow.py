@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import resource
 import signal
@@ -18,7 +17,6 @@ from lodestream_server.levels import LevelJob, MadeLevel, RefusedLevel, make_lev
 from lodestream_server.processes import Allowed
 from lodestream_server.worker import Built, Job, Refused, build
 from tests.server.disks import FullDisk
-from tests.server.helpers import hills
 
 __all__ = [
     "allow_levels_more",
@@ -47,11 +45,8 @@ __all__ = [
     "refuse",
     "sleep",
     "take",
-    "unkept",
     "use_processors",
     "wait",
-    "warm",
-    "warm_heights",
 ]
 
 
@@ -76,17 +71,10 @@ def nothing() -> None:
     """Do nothing."""
 
 
-def warm() -> str | None:
-    """What `worker.warm` does, where calls of the tests find imported what they are called from: it takes longer."""
+def preload() -> None:
+    """What `worker.preload` does, where calls of the tests find imported what they are called from."""
     import_module("tests.server.hostile")
-    return worker.warm()
-
-
-def warm_heights() -> None:
-    """Load what heights need, which is a fraction of what `worker.warm` loads for all kinds of surfaces."""
-    from lodestream import decode, encode
-
-    decode(encode(hills(64, 65)))
+    worker.preload()
 
 
 def number() -> int:
@@ -135,12 +123,6 @@ def out_of_processor_time(job: Job) -> Built | Refused:
     """End as the kernel ends a process that has used up its processor time."""
     os.kill(os.getpid(), signal.SIGXCPU)
     return Refused("survived")
-
-
-def unkept() -> str:
-    """Find no folder for the kernels; and say so as a build process would, which nobody is to hear."""
-    logging.getLogger("lodestream.numba_kernels").warning("no folder, says a build process")
-    return "no folder for the kernels"
 
 
 def wait(job: Job) -> Built | Refused:

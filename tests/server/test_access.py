@@ -256,7 +256,7 @@ def test_without_tokens_a_stream_through_a_proxy_needs_one(server: str, name: st
 def test_the_client_sends_its_token_everywhere(served: Served, tmp_path: Path) -> None:
     read, write = served.keys.tokens["read"], served.keys.tokens["write"]
     points = hills(12, 9, seed=3)
-    with pytest.raises(RemoteError, match="allows to write"):
+    with pytest.raises(RemoteError, match="the scope write"):
         sync.upload(served.url, io.BytesIO(npy(points)), token=read)
     made = sync.upload(served.url, io.BytesIO(npy(points)), token=write)
     assert sync.describe(made.url, token=read).ready

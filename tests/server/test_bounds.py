@@ -124,7 +124,7 @@ def test_an_owner_keeps_as_much_as_stays_free(
     if fits:
         asyncio.run(read(made, request(b"x", length=length)))
         return
-    with pytest.raises(FullError, match="bytes of anna on the server's disk, half of what they have there"):
+    with pytest.raises(FullError, match="bytes of anna on the server's disk, half of what they use there"):
         asyncio.run(read(made, request(b"x", length=length)))
     asyncio.run(read(made, request(b"x", length=500), BERT))
     asyncio.run(read(limits(tmp_path, kept=kept, alone=True, keep_free=0), request(b"x", length=length)))

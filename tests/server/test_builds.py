@@ -116,7 +116,7 @@ def test_a_build_that_needs_too_much_memory_waits(tmp_path: Path, monkeypatch: p
     with running(tmp_path / "data", build_memory=1 << 30) as http:
         surface = settled(http, post(http, 1))
         assert surface["state"] == "waiting"
-        assert "more memory than one may have, 1024 MiB (LODESTREAM_MEMORY), 2 times" in surface["reason"]
+        assert "more memory than its share, 1024 MiB (LODESTREAM_MEMORY), 2 times" in surface["reason"]
         monkeypatch.undo()
         assert settled(http, post(http, 1))["state"] == "ready"
 
@@ -133,7 +133,10 @@ def test_what_nobody_foresaw_does_not_tell_the_servers_inside(tmp_path: Path, mo
     monkeypatch.setattr(worker, "build", slow.explode)
     with running(tmp_path / "data") as http:
         surface = settled(http, post(http, 1))
-        assert (surface["state"], surface["reason"]) == ("waiting", "the build failed inside: ZeroDivisionError")
+        assert (surface["state"], surface["reason"]) == (
+            "waiting",
+            "the build failed with an internal error: ZeroDivisionError",
+        )
 
 
 def test_a_build_that_takes_too_long_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +302,7 @@ def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Pat
 
 def test_two_servers_never_share_a_folder(tmp_path: Path) -> None:
     storage = Storage(tmp_path)
-    with pytest.raises(LodestreamError, match="another works"):
+    with pytest.raises(LodestreamError, match="which another one uses"):
         Storage(tmp_path)
     storage.close()
     Storage(tmp_path).close()

@@ -117,7 +117,7 @@ def test_no_word_of_it_is_believed(
     containers = kept(data, "containers")
     made = build_by(http, monkeypatch, build)
     assert made["state"] == "waiting"
-    assert "gave an answer that cannot be used" in made["reason"]
+    assert "gave an invalid answer" in made["reason"]
     assert made["reason"].endswith(", 2 times")
     assert made["container"] is None
     assert kept(data, "containers") == containers
@@ -150,8 +150,8 @@ def test_a_traceback_cannot_be_taken_for_lines_of_the_log(
 ) -> None:
     with running(tmp_path / "data") as http, caplog.at_level(logging.ERROR):
         made = build_by(http, monkeypatch, hostile.forge_log)
-        assert (made["state"], made["reason"]) == ("waiting", "the build failed inside: ValueError")
-    (record,) = [record for record in caplog.records if "nobody foresaw" in record.getMessage()]
+        assert (made["state"], made["reason"]) == ("waiting", "the build failed with an internal error: ValueError")
+    (record,) = [record for record in caplog.records if "failed unexpectedly" in record.getMessage()]
     assert "\x1b" not in record.getMessage()
     assert all(line.startswith("| ") for line in record.getMessage().split("\n")[:-1] if "INFO" in line)
     assert "| 2026 INFO forged" in record.getMessage()
@@ -172,7 +172,7 @@ def test_processor_time_is_limited_too(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_no_file_is_larger_than_a_container_may_be(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     made = build_by(http, monkeypatch, hostile.write_much)
-    assert (made["state"], made["reason"]) == ("waiting", "the build failed inside: OSError")
+    assert (made["state"], made["reason"]) == ("waiting", "the build failed with an internal error: OSError")
     http.delete(made["url"])
 
 
@@ -228,7 +228,7 @@ def test_a_progress_that_is_none(tmp_path: Path, text: str) -> None:
 def test_what_a_build_leaves_behind_is_ended(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     # Only the readers of some formats may start processes.
     made = build_by(http, monkeypatch, hostile.linger)
-    assert (made["state"], made["reason"]) == ("waiting", "the build failed inside: PermissionError")
+    assert (made["state"], made["reason"]) == ("waiting", "the build failed with an internal error: PermissionError")
     http.delete(made["url"])
     made = build_by(http, monkeypatch, hostile.linger, VTK)
     assert made["state"] == "failed"

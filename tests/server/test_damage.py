@@ -76,7 +76,7 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
     lines = [record for record in caplog.records if record.levelno >= logging.ERROR]
     words = {record.getMessage() for record in lines}
     assert words == {
-        f"{path} is damaged, the container of surface {made['id']}: stop the server and run lodestream fsck --repair "
+        f"{path}, the container of surface {made['id']}, is damaged: stop the server and run lodestream fsck --repair "
         f"{tmp_path / 'data'}, which builds it again from its upload"
     }
     assert len(lines) == 3

@@ -105,7 +105,7 @@ def test_options_have_no_place_beside_a_container(
     before = stored(data)
     answer = http.post("/v1/surfaces", content=exact, params=query)
     assert problem(answer) == (422, "bad-option")
-    assert "expected no option but name and filename with a container" in answer.json()["detail"]
+    assert "expected no option other than name and filename for a container" in answer.json()["detail"]
     assert next(iter(query)) in answer.json()["detail"]
     assert stored(data) == before
 
@@ -217,7 +217,7 @@ def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp
     ):
         made = push(http, container)
         assert made["state"] == "waiting"
-        assert "more memory than one may have, 600 MiB" in made["reason"]
+        assert "more memory than its share, 600 MiB" in made["reason"]
         assert push(http, promising(64, 64))["state"] == "ready"
 
 

@@ -85,7 +85,7 @@ def test_a_repair_ends_where_the_disk_stays_full(
     assert code == 1
     finding = next(finding for finding in report["findings"] if finding["surface"] == surfaces[0]["id"])
     assert (finding["repaired"], finding["lost"]) == (False, False)
-    assert "room on the server's disk" in finding["repair"]
+    assert "space on the server's disk" in finding["repair"]
     with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
         assert settled(http, surfaces[0]["url"])["container"] == surfaces[0]["container"]
 
@@ -208,7 +208,7 @@ def test_what_is_damaged_is_set_aside_and_built_again(
     assert (code, report["clean"]) == (0, True)
     repairs = {finding["what"]: finding["repair"] for finding in report["findings"] if finding["what"] != "leftover"}
     assert repairs.keys() == {"container", "record"}
-    assert all(words.endswith("whole again") for words in repairs.values())
+    assert all(words.endswith("sound again") for words in repairs.values())
     assert all(finding["repaired"] for finding in report["findings"])
     assert (data / "damaged" / "containers" / container.name).read_bytes() == damaged
     assert (data / "damaged" / "records" / record.name).read_text() == "{"
@@ -232,8 +232,8 @@ def test_a_damaged_upload_leaves_its_surface(fsck: Fsck, data: Path, surfaces: l
     # What is not there may be elsewhere: nothing is written that says that it is gone.
     assert code == 1
     repairs = {finding["surface"]: finding for finding in report["findings"]}
-    assert "is whole and is served" in repairs[one["id"]]["repair"]
-    assert "is it elsewhere?" in repairs[two["id"]]["repair"]
+    assert "is sound and is served" in repairs[one["id"]]["repair"]
+    assert "none of its files are here" in repairs[two["id"]]["repair"]
     assert [repairs[surface["id"]]["repaired"] for surface in (one, two)] == [True, False]
     assert (data / "damaged" / "uploads" / damaged.name / "0").is_file()
     assert [state(data, surface) for surface in surfaces] == ["ready", "ready", "failed"]
@@ -314,7 +314,7 @@ def test_it_refuses_to_work_beside_a_server_or_elsewhere(data: Path, tmp_path: P
     register(parser.add_subparsers())
     storage = Storage(data)
     args = parser.parse_args(["fsck", str(data), "--repair"])
-    with pytest.raises(LodestreamError, match="another works"):
+    with pytest.raises(LodestreamError, match="which another one uses"):
         args.run(args)
     storage.close()
     (tmp_path / "empty").mkdir()

@@ -92,7 +92,7 @@ def test_keeping_what_was_built_at_every_step(tmp_path: Path, monkeypatch: pytes
         monkeypatch.setattr(durable, "disk", full)
         (data / "go").touch()
         waiting = eventually(lambda: http.get(location).json()["reason"], "the build to wait")
-        assert waiting == "waits for room on the server's disk"
+        assert waiting == "waits for space on the server's disk"
         assert http.get(location).json()["state"] == "queued"
         assert kept(data, "containers") == []
         for step in range(100):
@@ -117,7 +117,7 @@ def test_a_failure_that_cannot_be_written_down(tmp_path: Path, monkeypatch: pyte
         eventually(lambda: http.get(location).json()["progress"] == 0.5 or None, "the build to begin")
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
         (data / "go").touch()
-        assert settled(http, location)["reason"] == "the build failed inside: ZeroDivisionError"
+        assert settled(http, location)["reason"] == "the build failed with an internal error: ZeroDivisionError"
     monkeypatch.undo()
     # It is found out again.
     storage = Storage(data)

@@ -23,15 +23,12 @@ from lodestream_server.open_files import most_connections, raise_file_limit
 from lodestream_server.repeats import SECONDS, Repeats
 from tests.server.helpers import eventually, hills, npy, push
 
-# `serve` under a small limit, which warms what one kind of surface needs.
+# `serve` under a small limit.
 SCRIPT = """
 import argparse, resource, sys
-from lodestream_server import worker
 from lodestream_server.command import register
-from tests.server import slow
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[1])))
-    worker.warm = slow.warm_heights
     parser = argparse.ArgumentParser()
     register(parser.add_subparsers())
     args = parser.parse_args(sys.argv[2:])

@@ -23,24 +23,6 @@ from tests.server.programs import alive
 
 _MEMORY = 512 << 20
 
-# Prints which loops were compiled, or loaded, by what stands after the warming.
-_FIRST_MESHES = """
-from pathlib import Path
-import gc, sys
-import numba.core.dispatcher
-from lodestream_server.worker import warm
-def versions():
-    loops = [item for item in gc.get_objects() if isinstance(item, numba.core.dispatcher.Dispatcher)]
-    return {(loop.py_func.__qualname__, signature) for loop in loops for signature in loop.signatures}
-warm()
-before = versions()
-import lodestream
-for path in sys.argv[1:]:
-    surface = lodestream.read(Path(path))
-    assert surface.blocks[0].points.shape == (3, 4, 3)
-print(len(before), sorted(versions() - before))
-"""
-
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ForkServer]:
@@ -206,21 +188,6 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
         assert not gone(child)
         parent.kill()
     assert eventually(lambda: gone(child), "the process to end with its parent")
-
-
-def test_the_first_mesh_finds_its_loops_compiled(tmp_path: Path) -> None:
-    meshes = tmp_path / "quads.obj", tmp_path / "triangles.obj"
-    for mesh, faces in zip(meshes, ("{a} {b} {c} {d}", "{a} {b} {c}\nf {a} {c} {d}"), strict=True):
-        lines = [f"v {column} {row} {row * column % 3}" for row in range(3) for column in range(4)]
-        lines += ["f " + faces.format(a=a, b=a + 1, c=a + 5, d=a + 4) for a in (1, 2, 3, 5, 6, 7)]
-        mesh.write_text("\n".join(lines) + "\n")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", _FIRST_MESHES, *map(str, meshes)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    count, _, new = done.stdout.partition(" ")
-    assert int(count) >= 10
-    assert new == "[]\n"
 
 
 def test_each_call_has_its_own_processor_time(server: ForkServer) -> None:

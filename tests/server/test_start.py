@@ -18,13 +18,11 @@ import pytest
 
 from lodestream.errors import LodestreamError
 from lodestream_client.__main__ import main
-from lodestream_server import Settings, create_app, durable, jobs, running_server, worker
+from lodestream_server import Settings, create_app, durable, running_server
 from lodestream_server.durable import Disk
-from lodestream_server.processes import ForkServer
 from lodestream_server.storage import Storage
 from lodestream_server.tokens import TokenFile
-from tests.server import slow
-from tests.server.helpers import PATIENCE, Keys, eventually, hills, npy, problem, push
+from tests.server.helpers import PATIENCE, Keys, hills, npy, problem, push
 
 Refused = Callable[..., str]
 
@@ -140,7 +138,7 @@ def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         line = refused_program("serve", "--port", port, "--data", tmp_path)
-        assert line == (f"lodestream: expected an address to listen at, got 127.0.0.1 port {port}: {os.strerror(98)}")
+        assert line == (f"lodestream: cannot listen on 127.0.0.1 port {port}: {os.strerror(98)}")
         # In the same process the folder is free again.
         for _ in range(2):
             with pytest.raises(LodestreamError, match=f"port {port}"), running_server(tmp_path, port=port):
@@ -176,18 +174,6 @@ def test_pages_of_all_sites_use_a_server_with_their_token(keys: Keys) -> None:
             assert answer.headers["access-control-allow-origin"] == "*"
             assert "access-control-allow-credentials" not in answer.headers
             assert problem(httpx.get(f"{url}/v1/surfaces", headers={"origin": site}, trust_env=False))[0] == 401
-
-
-def test_that_kernels_cannot_be_kept_is_said_once_by_the_server(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(worker, "warm", slow.unkept)
-    monkeypatch.setattr(jobs, "ForkServer", ForkServer)  # one that is not warm yet
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
-        eventually(lambda: http.get("/readyz").status_code == 200, "to be ready")
-    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert [line for line in told if "confined" not in line] == ["no folder for the kernels"]
-    assert "says a build process" not in capfd.readouterr().err
 
 
 def mode(path: Path) -> int:

@@ -113,7 +113,7 @@ def test_a_file_of_something_else_allows_nobody_anything(path: Path, content: st
 def test_nothing_of_a_file_that_is_none_is_told(path: Path) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"secret \xff" * 100_000)
-    with pytest.raises(LodestreamError, match="expected a file of tokens") as caught:
+    with pytest.raises(LodestreamError, match="expected a token file") as caught:
         Tokens(path)
     assert len(str(caught.value)) < 500
     assert "secret" not in str(caught.value)

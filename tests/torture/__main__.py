@@ -11,7 +11,6 @@ import argparse
 import os
 import platform
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -56,7 +55,6 @@ def main() -> int:
     ]
     page = Page(args.page or (None if args.part else PAGE), [wish.part for wish in wishes])
     print("\n".join(page.machine), flush=True)
-    _warm()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         Lanes(page.begun, page.ended).run(wishes)
@@ -136,19 +134,11 @@ def _limit(text: str) -> tuple[str, float]:
     return name, float(seconds)
 
 
-def _warm() -> None:
-    # Compiled once, in a process of its own, so that no part waits for the compiler.
-    command = "from lodestream_server.worker import warm; from tests.torture.targets import TARGETS; warm();"
-    command += "[target.run(data) for target in TARGETS.values() for data in target.corpus()]"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    subprocess.run([sys.executable, "-c", command], env=environment, check=True)
-
-
 def _machine() -> list[str]:
     from benchmarks.__main__ import processor
 
     packages = []
-    for name in ("numpy", "numba", "fastapi", "starlette", "uvicorn", "websockets", "hypothesis", "atheris"):
+    for name in ("numpy", "fastapi", "starlette", "uvicorn", "websockets", "hypothesis", "atheris"):
         try:
             packages.append(f"{name} {version(name)}")
         except PackageNotFoundError:

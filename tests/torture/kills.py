@@ -144,7 +144,11 @@ class _Torment:
 
     def _look(self) -> None:
         found = check(self.data)
-        assert found.clean, found.to_json()
+        # An upload in its place whose record was not written yet was not acknowledged; the next start takes it up.
+        for finding in found.damage:
+            begun = finding.what == "record" and finding.problem == "expected a record, got none"
+            assert begun, found.to_json()
+            assert finding.surface not in self.ledger.stored, found.to_json()
         Storage(self.data).close()
         found = check(self.data)
         assert not found.findings, found.to_json()

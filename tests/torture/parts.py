@@ -162,7 +162,8 @@ def _kills(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[
         f"{done.servers} servers and {done.workers} build processes killed",
         f"meanwhile {done.uploads} uploads and {done.deletes} deletes acknowledged, {done.streams} streams read to "
         f"their end, {done.builds} builds seen ready",
-        "after each kill: fsck clean before and after the next start; what was acknowledged there, bit for bit",
+        "after each kill: fsck finds nothing wrong with what was acknowledged, and nothing at all after the next "
+        "start; what was acknowledged is there, bit for bit",
     )
 
 

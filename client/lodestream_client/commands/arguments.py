@@ -167,7 +167,9 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 def add_token_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--token``."""
-    parser.add_argument("--token", metavar="T", help="token for the server (default: LODESTREAM_TOKEN)")
+    parser.add_argument(
+        "--token", metavar="T", help="token for the server (default: the environment variable LODESTREAM_TOKEN)"
+    )
 
 
 def token_of(args: argparse.Namespace) -> str | None:
@@ -182,28 +184,28 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
         "--limit-rate",
         type=parse_rate,
         metavar="RATE",
-        help="limit the rate of receiving, for example 1mbit or 200kB (per second)",
+        help="receive at most this much a second, for example 1mbit or 200kB",
     )
 
 
 def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) -> None:
-    """Add ``--max-vertices``; without decoding only the container's tables count."""
+    """Add ``--max-vertices``; if nothing is decoded, only the container's tables count."""
     what = (
-        "refuse a surface of more than N vertices, or of more than 128 bytes for each of N, channels included, before "
+        "refuse a surface that has more than N vertices or needs more than about 128 N bytes of memory, before that "
         "memory is allocated"
         if decodes
-        else "refuse a container whose tables need more than 128 bytes for each of N vertices, before they are read"
+        else "refuse a container whose tables need more than about 128 N bytes of memory, before they are read"
     )
     parser.add_argument(
         "--max-vertices",
         type=_count,
         metavar="N",
-        help=f"{what} (default: as many as fit into two fifths of the memory)",
+        help=f"{what} (default: what fits into two fifths of the memory)",
     )
 
 
 def add_surface_options(parser: argparse.ArgumentParser) -> None:
-    """Add what says how a file becomes a surface."""
+    """Add the options that decide how a file becomes a surface."""
     group = parser.add_argument_group("surface options")
     group.add_argument(
         "--precision",
@@ -212,21 +214,23 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=parse_precision,
         metavar="[NAME=]P",
-        help="maximum error of the complete surface: a number in its unit, or 1e-3d for 1e-3 times its extent "
-        "(default: lossless); NAME=P is for the attribute NAME (default: lossless); may be repeated",
+        help="maximum error of the complete surface: a number in the surface's unit, or 1e-3d for 1e-3 times its "
+        "extent; NAME=P sets it for the attribute NAME; may be repeated (default: lossless)",
     )
     group.add_argument(
         "--rms",
         type=parse_tolerance,
         metavar="R",
-        help="make the shortest stream that ends at a root mean square error of at most R: a number in the surface's "
-        "unit, or 1e-3d for 1e-3 times its extent; not together with a --precision of the points",
+        help="encode for one root mean square error: a container as small as possible whose complete surface has an "
+        "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
+        "with a --precision of the points",
     )
     group.add_argument(
         "--closed",
         choices=("auto", "none", "rows", "cols", "both"),
         default="auto",
-        help="closed axes of the grid: with rows, the first row follows the last (default: auto, the file decides)",
+        help="closed axes of the grid; rows: the last row is connected to the first, as on a cylinder (default: auto, "
+        "the file decides)",
     )
     group.add_argument("--name", metavar="N", help="name of the surface")
     group.add_argument(
@@ -236,14 +240,14 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=parse_pair,
         metavar="KEY=VALUE",
-        help="option of the file's format; may be repeated",
+        help="option of the file's format, see lodestream formats; may be repeated",
     )
 
 
 def surface_options(args: argparse.Namespace) -> dict[str, str]:
-    """The ``-o`` options given.
+    """The ``-o`` options.
 
-    A key that is given twice ends the program: the command line alone shows it to be wrong.
+    Ends the program if a key is given twice.
     """
     options: dict[str, str] = {}
     for key, value in args.options:
@@ -254,10 +258,9 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
 
 
 def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
-    """The precision of the points, and those of attributes by their names.
+    """The precision of the points, and those of attributes by name.
 
-    One that is given twice, or for the points beside ``--rms``, ends the program: the command line alone shows it to be
-    wrong.
+    Ends the program if one is given twice, or one of the points together with ``--rms``.
     """
     found: dict[str | None, Tolerance] = {}
     for name, tolerance in args.precisions:
@@ -283,39 +286,45 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def add_target_options(parser: argparse.ArgumentParser) -> None:
-    """Add what says where to stop and in which order."""
+    """Add the options that decide what to decode, where to stop, and in which order."""
     group = parser.add_argument_group(
         "target",
-        "Where to stop: at the first limit that is met. E is a number in the surface's unit, or 1e-3d for 1e-3 times "
-        "its extent.",
+        "What to decode and where to stop. The first limit that is met ends it. E is a number in the surface's unit, "
+        "or 1e-3d for 1e-3 times its extent.",
     )
-    group.add_argument("--level", type=_level, metavar="K", help="only levels 0 to K; OUT is the grid of level K")
-    group.add_argument("--until-rms", type=parse_tolerance, metavar="E", help="stop at a root mean square error of E")
-    group.add_argument("--until-max", type=parse_tolerance, metavar="E", help="stop at a maximum error of E")
-    group.add_argument("--max-bytes", type=parse_size, metavar="N", help="stop before more than N bytes of the surface")
+    group.add_argument("--level", type=_level, metavar="K", help="levels 0 to K only; OUT is the grid of level K")
+    group.add_argument(
+        "--until-rms", type=parse_tolerance, metavar="E", help="stop when the root mean square error is at most E"
+    )
+    group.add_argument(
+        "--until-max", type=parse_tolerance, metavar="E", help="stop when the maximum error is at most E"
+    )
+    group.add_argument(
+        "--max-bytes", type=parse_size, metavar="N", help="stop at the last layer that ends within N bytes"
+    )
     group.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds")
     group.add_argument(
         "--roi",
         type=_region,
         metavar="R0:R1,C0:C1",
-        help="only this window: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid; OUT is the window",
+        help="this window only: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid; OUT is the window",
     )
     group.add_argument(
         "--attributes",
         type=_names,
         metavar="NAMES",
-        help="only these attributes beside the points: names separated by commas, or none (default: all)",
+        help="these attributes only: names separated by commas, or none (default: all)",
     )
     group.add_argument(
         "--order",
         choices=("quality", "level"),
         default="quality",
-        help="quality: whatever reduces the error most comes first; level: level by level (default: quality)",
+        help="quality: the data that reduce the error most come first; level: level by level (default: quality)",
     )
 
 
 def target_of(args: argparse.Namespace) -> Target:
-    """The target given; ends the program when its limits exclude each other."""
+    """The target of the command line; ends the program if its limits exclude each other."""
     try:
         target = Target(
             level=args.level,

@@ -1,4 +1,4 @@
-"""``lodestream decode``: a container, or as much of it as is wanted, into a file."""
+"""``lodestream decode``: a container, or the requested part of it, into a file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def register(subparsers: Subparsers) -> None:
         "decode",
         run,
         "decode a container into a file, completely or up to a limit",
-        "The suffix of OUT decides its format; standard output gets NPY.",
+        "The suffix of OUT decides its format. Standard output is NPY.",
     )
     parser.add_argument("container", metavar="IN.lode", help="container to read; - for standard input")
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
@@ -49,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--partial",
         action="store_true",
-        help="accept a truncated or damaged container: write its last complete layer",
+        help="accept a truncated or damaged container, and write its last complete layer",
     )
     add_json_option(parser)
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         except StreamError as error:
             if not args.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
                 raise named(error, args.container, _advice(args.partial, job, error)) from None
-            note(f"{named(error, args.container)}; this is the last whole layer before that")
+            note(f"{named(error, args.container)}; the last complete layer before that is written")
             job.ended = "truncated"
         except TooLargeError as error:
             raise named(error, args.container) from None
@@ -93,10 +93,10 @@ def run(args: argparse.Namespace) -> int:
 def _advice(partial: bool, job: _Job, error: StreamError) -> str:
     """How more can be had of a container that is cut or damaged, if it can."""
     if job.decoder.layers:
-        return "--partial writes the last whole layer before that"
+        return "--partial writes the last complete layer before that"
     if job.by_level and isinstance(error, TruncatedStreamError):
         also = "" if partial else " with --partial"
-        return f"without --level and --order level,{also} the last whole layer is written, if there is one"
+        return f"without --level and --order level,{also} the last complete layer is written, if there is one"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""``lodestream demo``: everything once, on this machine."""
+"""``lodestream demo``: all of Lodestream once, on this machine."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "demo",
         run,
-        "stream a surface of 1.3 million points over a slow link, stop early, and show what came",
-        "Starts a server of its own, generates mountains, uploads them, and stops at an RMS error of 10 m.\n"
-        "Prints the errors told beside the errors found, and what plain files of as many bytes show.\n"
-        "Writes terrain.npy and, if matplotlib is installed, demo.png. Takes half a minute.",
+        "stream a surface of 1.3 million points over a slow link, stop early, and show the result",
+        "Starts its own server, generates mountains, uploads them, and stops at an RMS error of 10 m.\n"
+        "Prints the errors that the stream states and the errors that are measured, and compares with plain files\n"
+        "of the same size. Writes terrain.npy and, if matplotlib is installed, demo.png. Takes half a minute.",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("lodestream-demo"), metavar="DIR", help="where to write (default: %(default)s)"
+        "--out", type=Path, default=Path("lodestream-demo"), metavar="DIR", help="output folder (default: %(default)s)"
     )
     add_json_option(parser)
 

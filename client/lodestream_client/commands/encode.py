@@ -25,10 +25,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "encode",
         run,
-        "encode a surface into a container, from one file or several",
+        "encode one or several files into a container",
         "The content of a file decides its format. Without --precision and --rms the container is lossless.",
     )
-    parser.add_argument("files", nargs="+", metavar="FILE", help="what to read; - for standard input")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")
     add_surface_options(parser)
     add_json_option(parser)
@@ -40,7 +40,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     if args.out == "-" and args.json:
-        args.parser.error("argument --json: standard output is taken by the container")
+        args.parser.error("argument --json: standard output is used for the container")
+    from lodestream.library import require
+
+    require("encoding")
     options = surface_options(args)
     precision, attribute_precision = precisions(args)
     if args.out != "-":

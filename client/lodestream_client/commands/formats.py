@@ -18,8 +18,8 @@ def register(subparsers: Subparsers) -> None:
         "formats",
         run,
         "list the file formats that can be read and written, and their -o options",
-        "The content of a file decides its format, or its suffix where the content fits any (text, .hgt).\n"
-        "Written files follow the suffix of OUT. More in docs/formats.md.",
+        "The first bytes of a file decide its format; the suffix counts only where they fit several (text, .hgt).\n"
+        "The format of a written file follows from the suffix of OUT. See docs/formats.md.",
     )
     add_json_option(parser)
 

@@ -1,4 +1,4 @@
-"""``lodestream info``: what a container, or a surface on a server, says of itself."""
+"""``lodestream info``: the description of a container, or of a surface on a server."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .output import cell, console, human_size, point_words, print_json
 __all__ = ["register", "run"]
 
 # Of a surface that was uploaded as a container.
-_ERRORS = {"checked": "checked by the server", "told": "as told by whoever uploaded them"}
+_ERRORS = {"checked": "checked by the server", "told": "stated by the uploader, not checked"}
 
 _MOST_KINDS = 12  # sizes of blocks that are named
 
@@ -28,14 +28,14 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "info",
         run,
-        "show size, levels, layers and errors of a container or of a surface on a server",
-        "Levels: bytes of each level and all coarser ones, and the error that they leave.\n"
-        "Layers: bytes of the stream up to the end of each layer, and the error there.",
+        "show the size, levels, layers and errors of a container or of a surface on a server",
+        "Levels: the bytes of each level with all coarser ones, and the error of the surface at that level.\n"
+        "Layers: the bytes of the stream up to the end of each layer, and the error of the surface there.",
     )
     parser.add_argument(
         "what",
         metavar="FILE|URL",
-        help="container, - for standard input, or the address of a surface or of a container on any web server",
+        help="a container; - for standard input; or the URL of a surface, or of a container on any web server",
     )
     add_size_option(parser, decodes=False)
     add_token_option(parser)
@@ -78,7 +78,7 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
         except (StreamError, TooLargeError) as error:
             cut = isinstance(error, TruncatedStreamError)
             raise named(
-                error, args.what, "lodestream decode --partial writes what is whole of it" if cut else ""
+                error, args.what, "lodestream decode --partial writes its last complete layer" if cut else ""
             ) from None
 
 
@@ -118,7 +118,7 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     if details.get("exact") is not None:
         lost = (details.get("holes") or 0) - (details.get("non_finite") or 0)
         exact = "yes, bit for bit" + (" wherever there is a value" if lost else "")
-        facts.append(("exact", exact if details["exact"] else "no, within the error asked for"))
+        facts.append(("exact", exact if details["exact"] else "no, within the error that was asked for"))
     if errors := _ERRORS.get(str(details.get("errors"))):
         facts.append(("errors", errors))
     if details.get("sha256"):

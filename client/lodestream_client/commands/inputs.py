@@ -20,7 +20,7 @@ _STANDARD_INPUT = "standard input"
 
 @dataclass(frozen=True)
 class Inputs:
-    """Files to read; `filename` stands for what has no name of its own."""
+    """Files to read; `filename` is used in messages for input without a name."""
 
     paths: tuple[Path, ...]
     filename: str | None
@@ -28,9 +28,9 @@ class Inputs:
 
 @contextmanager
 def input_files(parser: argparse.ArgumentParser, names: Sequence[str]) -> Iterator[Inputs]:
-    """The files of these names; standard input, where named ``-``, as a temporary file.
+    """The files with these names; standard input (``-``) is copied to a temporary file.
 
-    Readers and uploads want to know the length before they begin, and the end of a container before its middle.
+    Readers and uploads need to know the length first, and the end of a container before its middle.
     """
     if names.count("-") > 1:
         parser.error("standard input (-) is named twice")
@@ -44,7 +44,7 @@ def input_files(parser: argparse.ArgumentParser, names: Sequence[str]) -> Iterat
 
 
 def named(error: LodestreamError, name: str, advice: str = "") -> LodestreamError:
-    """The same error, whose message begins with the file that it is about and ends with what to do."""
+    """The same error, with the file's name before its message and advice after it."""
     words = f"{_STANDARD_INPUT if name == '-' else name}: {error}" + (f"; {advice}" if advice else "")
     error.args = (words, *error.args[1:])
     return error

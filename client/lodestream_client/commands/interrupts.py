@@ -13,17 +13,17 @@ __all__ = ["Terminated", "exit_code", "interruptible", "raising", "unwrapping"]
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came: the program is to end, as after Ctrl-C."""
+    """SIGTERM was received: the program must end, as after Ctrl-C."""
 
 
 def exit_code(interrupt: KeyboardInterrupt) -> int:
-    """128 and the number of the signal, as a shell has it: 130 after SIGINT, 143 after SIGTERM."""
+    """128 plus the number of the signal, as shells do it: 130 after SIGINT, 143 after SIGTERM."""
     return 128 + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
 
 
 @contextmanager
 def raising() -> Iterator[None]:
-    """Let SIGTERM raise `Terminated` within the block: without unwinding, temporary files and processes would stay."""
+    """Raise `Terminated` on SIGTERM within the block, so that temporary files and processes are cleaned up."""
 
     def leave(number: int, frame: FrameType | None) -> None:
         raise Terminated("terminated")
@@ -41,7 +41,7 @@ def raising() -> Iterator[None]:
 
 @contextmanager
 def unwrapping() -> Iterator[None]:
-    """Raise an interrupt as such where something on its way has made another error of it, as a class body does."""
+    """Raise a KeyboardInterrupt itself if it was turned into another exception, as class bodies do."""
     try:
         yield
     except Exception as error:
@@ -55,7 +55,7 @@ def unwrapping() -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let SIGTERM end the block as SIGINT does, with a line that says so."""
+    """End the block on SIGTERM as on SIGINT, with a line that says so."""
     with raising():
         try:
             with unwrapping():

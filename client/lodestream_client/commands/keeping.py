@@ -1,4 +1,4 @@
-"""What ``pull`` keeps on disk of what comes, so that ``pull --resume`` goes on from there."""
+"""Data that ``pull`` keeps on disk, so that ``pull --resume`` can continue."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ _SHARE = 0.25
 
 
 class Kept:
-    """What is kept of one container while it comes; a context manager, which says so when it is left with an error.
+    """Stored data of one container during a pull; a context manager that reports them if it is left with an error.
 
-    With `asked`, what is there from before is used, and everything stays until the whole surface has been written.
-    Without, what comes is written as it comes, and removed when the command has done what it was to do: it stays when
-    the command is interrupted, loses its server or is killed. That it cannot be kept is then no error.
+    With `asked`, stored data of an earlier pull are used, and all data stay until the whole surface has been written.
+    Without, data are stored as they arrive and removed when the command has succeeded; they stay if the command is
+    interrupted, loses its server or is killed. Then it is not an error if they cannot be stored.
 
     Parameters
     ----------
     asked : bool
-        Whether the command line says ``--resume``.
+        Whether ``--resume`` was given.
 
     Attributes
     ----------
     store : Part or None
-        What a stream is to use and to write, if that was asked for.
+        Storage for the stream to use, if ``--resume`` was given.
     identity : Identity or None
-        Of the container in `store`.
+        Identity of the container in `store`.
     """
 
     def __init__(self, asked: bool) -> None:
@@ -78,47 +78,47 @@ class Kept:
 
     @property
     def _total(self) -> int:
-        """Bytes that will be there when this is left."""
+        """Bytes that will stay on disk."""
         return self._part.ranges.total if self._part is not None and not self._part.discarded else 0
 
     @property
     def words(self) -> str:
-        """How much is kept and what for, or why nothing is; for the user."""
+        """A message for the user: how much is kept, or why nothing is."""
         if self._total:
-            return f"{human_size(self._total)} are kept; pull --resume goes on from there"
+            return f"{human_size(self._total)} are kept; pull --resume continues from there"
         return f"nothing is kept: {self._why_not}" if self._why_not else ""
 
     def use(self, identity: Identity) -> None:
-        """Go on from what is kept of this container.
+        """Continue with the stored data of this container.
 
         Raises
         ------
         LodestreamError
-            When another program has it open, or the folder cannot be written.
+            If another program has them open, or the folder cannot be written.
         """
         if identity.name is None or identity.size is None:
-            self._why_not = "the server does not tell one version of the file from another"
+            self._why_not = "the server does not identify versions of the file"
             note(self.words)
             return
         try:
             self.store = self._part = _opened(identity.name, identity.size)
         except LodestreamError as error:
-            raise LodestreamError(f"{error}; wait for it, or do without --resume") from None
+            raise LodestreamError(f"{error}; wait for it, or leave out --resume") from None
         except OSError as error:
             raise LodestreamError(
-                f"expected a folder for what comes (LODESTREAM_CACHE), got {_reason(error)}; "
-                "choose another, or do without --resume"
+                f"expected a folder for received data (LODESTREAM_CACHE), got {_reason(error)}; "
+                "choose another, or leave out --resume"
             ) from None
         self.identity = identity
         if self._total:
-            note(f"{human_size(self._total)} are here from before")
+            note(f"{human_size(self._total)} are here from an earlier pull")
 
     def follow(self, stream: Stream) -> None:
-        """Take what `write` gets for the container of this stream."""
+        """Set the stream whose data `write` receives."""
         self._stream = stream
 
     def write(self, offset: int, data: bytes) -> None:
-        """Keep bytes of the container, as far as that is possible."""
+        """Store bytes of the container, if possible."""
         if self._part is None and not self._why_not:
             self._begin()
         if self._part is None or self._full:
@@ -128,16 +128,16 @@ class Kept:
                 self._part.write(start, data[start - offset : start - offset + length])
         except OSError as error:
             self._full = True
-            note(f"no more is kept for pull --resume: {_reason(error)}")
+            note(f"no more data are kept for pull --resume: {_reason(error)}")
 
     def read(self, offset: int, length: int) -> bytes | None:
-        """Bytes of the container; None where they are not kept."""
+        """Stored bytes of the container; None if they are not stored."""
         if self._part is None or not self._part.ranges.covers(offset, length):
             return None
         return self._part.read(offset, length)
 
     def failed(self, error: BaseException) -> None:
-        """Tell why the command does not do what it was to do; what can be of no use after that is not kept."""
+        """Declare why the command failed; data that cannot be of use after this error are not kept."""
         if self._part is None:
             return
         changed = isinstance(error, RemoteError) and error.code == "other-container"
@@ -146,10 +146,10 @@ class Kept:
         self._part.discarded |= changed or refused or isinstance(error, CorruptStreamError)
 
     def done(self, whole: bool) -> None:
-        """Tell that OUT has been written, and whether it has the whole surface.
+        """Declare that OUT has been written, and whether it has the whole surface.
 
-        What is kept then stays where more of it may be asked for: by whoever said ``--resume`` and took a part, and by
-        another command that left it here.
+        The stored data then stay if more of the surface may be requested: with ``--resume`` and only a part received,
+        or if an earlier command left data here.
         """
         if self._part is not None:
             self._part.discarded |= whole if self._asked else self._fresh
@@ -157,7 +157,7 @@ class Kept:
     def _begin(self) -> None:
         identity = self._stream.identity if self._stream is not None else None
         if identity is None or identity.name is None or identity.size is None:
-            self._why_not = "the server does not tell one version of the file from another"
+            self._why_not = "the server does not identify versions of the file"
             return
         try:
             part = _opened(identity.name, identity.size)
@@ -167,7 +167,7 @@ class Kept:
             return
         except OSError as error:
             self._why_not = _reason(error)
-            note(f"what comes is not kept for pull --resume: {self._why_not}")
+            note(f"received data are not kept for pull --resume: {self._why_not}")
             return
         self._part, self._fresh = part, not part.ranges.total
         folder = part.folder

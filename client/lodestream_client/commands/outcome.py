@@ -1,4 +1,4 @@
-"""What ``decode`` and ``pull`` end with: a surface at some state, written and reported."""
+"""The end of ``decode`` and ``pull``: a surface in some state, written and reported."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ __all__ = ["Outcome", "check_grid", "check_out", "note_unmet"]
 
 
 def check_out(args: argparse.Namespace) -> None:
-    """Refuse early what cannot be written; ends the program where the command line alone shows it.
+    """Check early that OUT can be written; ends the program if the command line is wrong.
 
     Raises
     ------
     InputError
-        When the folder is not there or no format has this suffix.
+        If the folder does not exist, or no format has this suffix.
     """
     if args.out == "-":
         if args.json:
-            args.parser.error("argument --json: standard output is taken by the surface")
+            args.parser.error("argument --json: standard output is used for the surface")
         return
     path = Path(args.out)
     require_folder(path)
@@ -42,12 +42,12 @@ def check_out(args: argparse.Namespace) -> None:
 
 
 def check_grid(out: str, header: Header) -> None:
-    """Refuse, before the rest comes, what a format cannot hold.
+    """Check before the data arrive that the format of OUT can hold the surface.
 
     Raises
     ------
     FormatError
-        When there are several blocks, and the format of OUT has one.
+        If there are several blocks and the format holds only one.
     """
     from lodestream.formats import check_blocks, for_writing, formats
 
@@ -60,17 +60,17 @@ def check_grid(out: str, header: Header) -> None:
 
 
 def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent: float) -> None:
-    """Say that a limit was out of reach, when the whole surface came and is not as near as was asked for."""
+    """Report a limit that could not be reached although the whole surface arrived."""
     if ended != "complete":
         return
     for limit, found, name in ((target.until_rms, rms, "RMS"), (target.until_max, max_error, "maximum")):
         if limit is not None and found > limit.absolute(extent):
-            note(f"the {name} error asked for is out of reach: this is the complete surface, with {found:.6g}")
+            note(f"the requested {name} error cannot be reached: the complete surface has {found:.6g}")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A surface at the state where receiving it ended, with the figures of that state."""
+    """A surface in the state in which receiving it ended, with the figures of that state."""
 
     surface: Surface
     bytes: int
@@ -82,7 +82,7 @@ class Outcome:
     ended: str
 
     def write(self, out: str) -> None:
-        """Write the surface, to standard output as NPY."""
+        """Write the surface; to standard output as NPY."""
         from lodestream import formats
 
         if out == "-":
@@ -91,7 +91,7 @@ class Outcome:
             formats.write(self.surface, out)
 
     def report(self, as_json: bool) -> None:
-        """Print the figures: for programs on standard output, for people on standard error."""
+        """Print the figures: with ``--json`` on standard output, otherwise as a note on standard error."""
         if as_json:
             print_json(
                 {

@@ -1,8 +1,8 @@
-"""What a command says and writes: results to standard output, everything else to standard error, files by rename.
+"""Output of the commands: results to standard output, everything else to standard error, files by renaming.
 
-Nothing else of the client writes to a terminal. What is said comes in part from files and servers, so it passes
-`printable` here: in a line by `note` and `say`, in a table by `cell`, which also keeps brackets from being taken for
-markup. JSON is written in ASCII, with escapes of its own, and is exact.
+No other module of the client writes to a terminal. Messages contain text from files and servers, so all text passes
+`printable` here: lines in `note` and `say`, table cells in `cell`, which also keeps brackets from being taken for
+markup. JSON is ASCII with JSON's own escapes, and exact.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from lodestream.errors import FormatWarning, InputError
 from lodestream.text import printable
 
 if TYPE_CHECKING:
+    import rich.progress
     from rich.console import Console
-    from rich.progress import Progress
     from rich.text import Text
 
 __all__ = [
     "Parser",
+    "Progress",
     "cell",
     "clean_warnings",
     "console",
@@ -49,24 +50,24 @@ __all__ = [
 
 
 def note(text: str) -> None:
-    """Say something that is not the result, in a line."""
+    """Print one line that is not part of the result."""
     print(f"lodestream: {printable(' '.join(text.split()))}", file=sys.stderr)
 
 
 def say(text: str) -> None:
-    """Print a line of the result."""
+    """Print one line of the result."""
     print(printable(text))
 
 
 def cell(*lines: object) -> Text:
-    """What stands in a table, or is printed beside one, as it is."""
+    """The contents of a table cell, printed literally."""
     from rich.text import Text
 
     return Text("\n".join(printable(str(line)) for line in lines))
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of the command line whose errors name what was given as it is."""
+    """An argument parser whose error messages are safe to print."""
 
     def error(self, message: str) -> NoReturn:
         """Print usage and message, and end the program with 2."""
@@ -75,7 +76,7 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def clean_warnings() -> Iterator[None]:
-    """Show what warnings and the logs of libraries say, of files for the most part, as `note` does."""
+    """Print warnings and log lines of libraries as `note` does."""
     handler = logging.lastResort  # what is used where nobody has set anything up, as here
     formatter = handler.formatter if handler is not None else None
     with warnings.catch_warnings():
@@ -106,9 +107,9 @@ def _show_warning(
 
 
 def point_words(details: Mapping[str, Any]) -> str:
-    """How many points a surface has, and how many of them are holes, from the keys of ``info``."""
+    """The number of points and holes of a surface, from the keys of ``info``."""
     total, holes, kept = _points(details), details.get("holes") or 0, details.get("non_finite") or 0
-    words = f", {kept} of these infinite or in part NaN, which come back" if kept else ""
+    words = f", {kept} of these infinite or partly NaN, whose values are kept" if kept else ""
     return f"{total}, {holes} of them holes{words}" if holes else str(total)
 
 
@@ -117,13 +118,13 @@ def _points(details: Mapping[str, Any]) -> int:
 
 
 def note_holes(holes: int, total: int) -> None:
-    """Say how many points have no value, if any."""
+    """Report how many points are holes, if any are."""
     if holes:
         note(f"{holes} of {total} points are holes")
 
 
 def note_details(details: Mapping[str, Any]) -> None:
-    """Say what a server noted when it read a surface: what it left out or chose, and holes."""
+    """Report the notes of a server's build: what was left out or chosen, and holes."""
     notes = (details.get("metadata") or {}).get("notes")
     for text in notes if isinstance(notes, list) else ():  # in a container somebody may have put anything there
         note(str(text))
@@ -137,7 +138,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 
 def human_size(size: float) -> str:
-    """A number of bytes with a unit, for reading."""
+    """A number of bytes with a unit."""
     for unit in ("B", "kB", "MB"):
         if size < 1000:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
@@ -146,7 +147,7 @@ def human_size(size: float) -> str:
 
 
 def human_time(seconds: float) -> str:
-    """How long is left, for reading."""
+    """Remaining time as text."""
     whole = math.ceil(seconds)
     if whole < 60:
         return f"{whole} s left"
@@ -155,48 +156,77 @@ def human_time(seconds: float) -> str:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A console for tables; wide where no terminal limits it, so that nothing wraps in a file or pipe."""
+    """A console for tables; wide if the output is not a terminal, so that lines in a file or pipe do not wrap."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
     return Console(file=stream, width=None if stream.isatty() else 200, soft_wrap=not stream.isatty(), highlight=False)
 
 
+class Progress(Protocol):
+    """A bar for each task that is under way, as rich has them."""
+
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
+        """Begin one; what `update` and `remove_task` know it by."""
+
+    def update(self, task_id: Any, **changes: Any) -> None:
+        """Change what is given: ``completed``, ``total``, ``description``, fields."""
+
+    def remove_task(self, task_id: Any) -> None:
+        """Show it no longer."""
+
+
+class _Unseen:
+    """Bars where there is no terminal."""
+
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
+        return None
+
+    def update(self, task_id: Any, **changes: Any) -> None:
+        pass
+
+    def remove_task(self, task_id: Any) -> None:
+        pass
+
+
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error; nothing at all when that is not a terminal.
+    """A progress bar on standard error; not shown if that is not a terminal.
 
-    A task's field ``limit``, if it has one, is the most seconds that it may last.
+    If a task has a field ``limit``, it is the maximum number of seconds that it may take.
     """
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    if sys.stderr.isatty():
+        with _drawn() as bar:
+            yield bar
+    else:
+        yield _Unseen()
+
+
+def _drawn() -> rich.progress.Progress:
+    from rich import progress
     from rich.text import Text
 
-    class TimeLeft(ProgressColumn):
+    class TimeLeft(progress.ProgressColumn):
         max_refresh = 0.5
 
-        def render(self, task: Task) -> Text:
+        def render(self, task: progress.Task) -> Text:
             left = [] if task.time_remaining is None else [task.time_remaining]
             if task.fields.get("limit") is not None and task.elapsed is not None:
                 left.append(max(task.fields["limit"] - task.elapsed, 0.0))
             return Text(human_time(min(left)) if left else "", style="progress.remaining")
 
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[figures]}", markup=False),
+    return progress.Progress(
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.TextColumn("{task.fields[figures]}", markup=False),
         TimeLeft(),
         console=console(stderr=True),
         transient=True,
     )
-    if not sys.stderr.isatty():
-        yield bar  # never started: it counts and shows nothing
-        return
-    with bar:
-        yield bar
 
 
 def require_folder(path: Path) -> None:
-    """Refuse early a file whose folder is not there.
+    """Check early that the folder of a file exists.
 
     Raises
     ------
@@ -211,7 +241,7 @@ def require_folder(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write beside `path`, with its suffix, that takes its place when the block ends well."""
+    """A temporary file beside `path`, with the same suffix, that replaces it if the block succeeds."""
     require_folder(path)
     temporary = path.with_name(f".{path.stem[:100]}-{secrets.token_hex(6)}{path.suffix}")
     try:

@@ -55,12 +55,12 @@ def register(subparsers: Subparsers) -> None:
         "pull",
         run,
         "stream a surface from a server into a file, completely or up to a limit",
-        "The suffix of OUT decides its format; standard output gets NPY. A broken connection is opened again and\n"
-        "continues where it broke. After Ctrl-C, or if the server does not come back, OUT is written from what was\n"
-        "received, which is also kept for --resume.",
+        "The suffix of OUT decides its format. Standard output is NPY. If the connection breaks, pull reconnects\n"
+        "and continues where it was. After Ctrl-C, or if the server does not come back, OUT is written from the\n"
+        "data received so far, which are also kept for --resume.",
     )
     parser.add_argument(
-        "url", type=parse_source, metavar="URL", help="the surface's address, or that of a container on any web server"
+        "url", type=parse_source, metavar="URL", help="URL of the surface, or of a container on any web server"
     )
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
     add_target_options(parser)
@@ -69,14 +69,14 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="continue an earlier pull: ask only for what is missing in the folder LODESTREAM_CACHE (default: the "
-        "user's cache folder), and keep what comes there until the whole surface has been written",
+        help="continue an earlier pull: request only the data that are missing in the folder LODESTREAM_CACHE "
+        "(default: the user's cache folder), and keep new data there until the whole surface has been written",
     )
     parser.add_argument(
         "--transport",
         choices=("auto", "ws", "http"),
         default="auto",
-        help="ws: WebSocket; http: HTTP Range requests; auto: WebSocket, or HTTP where that is not possible "
+        help="ws: WebSocket; http: HTTP Range requests; auto: WebSocket, or HTTP if WebSocket is not possible "
         "(default: auto)",
     )
     parser.add_argument(
@@ -84,7 +84,7 @@ def register(subparsers: Subparsers) -> None:
         type=parse_seconds,
         default=60.0,
         metavar="S",
-        help="reconnect when a connection is lost or silent, and give up after S seconds without a byte; 0: never "
+        help="reconnect when the connection is lost or silent, and give up after S seconds without data; 0: never "
         "reconnect (default: 60)",
     )
     add_token_option(parser)
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     """Stream, write, report; of what came before an interruption too."""
     target = target_of(args)
     if args.transport == "ws" and not addresses.is_surface(args.url):
-        args.parser.error("argument --transport: a file's address has no WebSocket")
+        args.parser.error("argument --transport: the URL of a file has no WebSocket")
     check_out(args)
     with interruptible(), Kept(args.resume) as kept:
         return _pull(args, target, kept)
@@ -113,7 +113,7 @@ def _pull(args: argparse.Namespace, target: Target, kept: Kept) -> int:
         kept.done(outcome.ended == "complete" and not part)
     if broke is None:
         return 0
-    note("; ".join(filter(None, (f"what came is written to {name}", kept.words))))
+    note("; ".join(filter(None, (f"the data received so far are written to {name}", kept.words))))
     return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
 
 
@@ -132,7 +132,7 @@ def _written(
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
-                broke.args = (f"{_words(broke)}: the first layer has not come, and {name} is not written",)
+                broke.args = (f"{_words(broke)}: the first layer has not arrived, and {name} is not written",)
             raise broke
         note(_words(broke))
         kept.failed(broke)
@@ -238,7 +238,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
 
     place = stream.metadata_place
     if place is None:  # over HTTP layers may come before it is known
-        note("written without its name and place, which have not come")
+        note("written without metadata such as name and position, which have not arrived")
         return {}, 0
     if (data := kept.read(*place)) is not None:
         return read_metadata(data, ByteRange(*place)), 0
@@ -247,7 +247,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     except LodestreamError as error:
         if isinstance(error, NotFoundError) and not hurried:
             raise
-        note(f"written without its name and place, which could not be fetched: {error}")
+        note(f"written without metadata such as name and position, which could not be fetched: {error}")
         return {}, 0
     kept.write(place[0], data)
     return read_metadata(data, ByteRange(*place)), len(data)

@@ -33,15 +33,15 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "push",
         run,
-        "upload a surface to a server, from one file or several",
-        "Waits until the surface is ready. The last line of standard output is its address.\n"
-        "A container (.lode) is kept unchanged; of the surface options it takes only --name.\n"
-        "If the server cannot build the surface now, push fails; the server keeps the upload for retry.",
+        "upload one or several files to a server as a surface",
+        "Waits until the server has built the surface. The last line of standard output is its URL.\n"
+        "A container (.lode) is kept unchanged; --name is the only surface option it takes.\n"
+        "If the server cannot build the surface now, push fails, and the server keeps the upload (lodestream retry).",
     )
-    parser.add_argument("files", nargs="+", metavar="FILE", help="what to upload; - for standard input")
-    parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="file to upload; - for standard input")
+    parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     add_surface_options(parser)
-    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has the bytes")
+    parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has stored the upload")
     add_token_option(parser)
     add_json_option(parser)
 

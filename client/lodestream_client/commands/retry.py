@@ -1,4 +1,4 @@
-"""``lodestream retry``: have a surface built that waits."""
+"""``lodestream retry``: have a server build a waiting surface again."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "retry",
         run,
-        "let a server build a surface again that is waiting, failed or missing",
-        "Waits until the surface is ready. The last line of standard output is its address.",
+        "ask a server to build a surface again that is waiting, failed or missing",
+        "Use it when the cause of the failure is removed. Waits until the surface is ready. The last line of\n"
+        "standard output is its URL.",
     )
-    parser.add_argument("url", type=parse_surface, metavar="URL", help="the surface's address")
+    parser.add_argument("url", type=parse_surface, metavar="URL", help="URL of the surface")
     parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has accepted the request")
     add_token_option(parser)
     add_json_option(parser)

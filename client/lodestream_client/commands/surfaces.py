@@ -24,11 +24,11 @@ _WIDTH = 1 << 20
 def register(subparsers: Subparsers) -> None:
     """Add the sub-commands."""
     parser = add_command(subparsers, "list", run_list, "list the surfaces of a server")
-    parser.add_argument("url", type=parse_server, metavar="URL", help="the server's address")
+    parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     add_token_option(parser)
     add_json_option(parser)
-    parser = add_command(subparsers, "rm", run_rm, "remove a surface from a server")
-    parser.add_argument("url", type=parse_surface, metavar="URL", help="the surface's address")
+    parser = add_command(subparsers, "rm", run_rm, "delete a surface from a server")
+    parser.add_argument("url", type=parse_surface, metavar="URL", help="URL of the surface")
     add_token_option(parser)
     add_json_option(parser)
 

@@ -1,4 +1,4 @@
-"""The demo: a server, a million points, a slow link, an early stop, and what as many bytes of plain files show."""
+"""The demo: a server, a million points, a slow link, an early stop, and a comparison with plain files."""
 
 from __future__ import annotations
 

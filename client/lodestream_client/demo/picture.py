@@ -1,4 +1,4 @@
-"""The demo's picture: what as many bytes show, side by side, whole and enlarged. The README shows one of these."""
+"""The demo's picture: what the same number of bytes shows, side by side, whole and enlarged. The README shows one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _COLOURS = 256
 
 @dataclass(frozen=True)
 class Panel:
-    """Heights in metres, NaN where there are none yet, and what stands above them."""
+    """Heights in metres (NaN where none have arrived), and the texts above them."""
 
     heights: NDArray[Any]
     title: str
@@ -40,9 +40,9 @@ class Panel:
 
 
 def draw(panels: Sequence[Panel], window: tuple[slice, slice], path: Path) -> None:
-    """Write a PNG: a column for each panel, above the whole surface, below the window of it.
+    """Write a PNG with a column for each panel: the whole surface above, a window of it below.
 
-    All have the colours, the scale and the light of the last panel. Needs matplotlib.
+    All panels have the colours, the scale and the light of the last panel. Needs matplotlib.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

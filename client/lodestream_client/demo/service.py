@@ -1,4 +1,4 @@
-"""A server of one's own, in a process of its own, on a free port, with a folder that goes with it."""
+"""A temporary server in a process of its own, on a free port, with a temporary data folder."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _LOG_TAIL = 2000
 
 @contextmanager
 def own_server() -> Iterator[str]:
-    """The address of a server that is ready; it ends with the block, however that ends.
+    """A server that is ready; yields its URL. It ends with the block.
 
     Raises
     ------
     LodestreamError
-        When it does not start; with the last lines that it said.
+        If it does not start; with the last lines of its log.
     """
     with tempfile.TemporaryDirectory(prefix="lodestream-demo-", ignore_cleanup_errors=True) as folder, raising():
         log = Path(folder) / "server.log"

@@ -24,11 +24,11 @@ from .terrain import terrain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     from lodestream.decoder import View
 
+    from ..commands.output import Progress
     from ..requests import Description
 
 __all__ = ["show"]
@@ -116,7 +116,7 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
             }
         )
     if not all(moment.agrees for moment in moments):
-        raise LodestreamError("an error told is not the error found: this is a bug, please report it")
+        raise LodestreamError("a stated error differs from the measured one: this is a bug, please report it")
     return 0
 
 
@@ -185,11 +185,11 @@ def _table(moments: Sequence[_Moment], whole: int, shape: tuple[int, int]) -> Ta
     for name in (
         "bytes",
         "of the\nstream",
-        "RMS error\ntold [m]",
-        "\nfound [m]",
-        "maximum\ntold [m]",
-        "\nfound [m]",
-        "plain file:\nrows come",
+        "RMS error\nstated [m]",
+        "\nmeasured [m]",
+        "maximum\nstated [m]",
+        "\nmeasured [m]",
+        "plain file:\nrows received",
         "overview: factor,\nRMS error [m]",
     ):
         table.add_column(name.replace("[", "\\["), justify="right")  # the brackets of a unit are no markup
@@ -218,7 +218,7 @@ def _conclude(last: _Moment, whole: int, plain_bytes: int, out: Console) -> None
     )
     out.print(
         "Plain file: the first bytes of terrain.npy. Overview: the finest grid of means that fits into as many bytes, "
-        "deflated as in a GeoTIFF, bilinear between them."
+        "compressed as in a GeoTIFF (deflate), and interpolated bilinearly."
     )
 
 
@@ -233,13 +233,13 @@ def _draw(view: View, last: _Moment, heights: NDArray[np.int16], plain_bytes: in
         ),
         picture.Panel(
             plain.overview(heights, last.bytes)[0],
-            f"overview 1:{last.overview_factor}, deflated",
+            f"overview 1:{last.overview_factor}, compressed",
             (size, f"RMS error {last.overview_rms:.1f} m"),
         ),
         picture.Panel(
             view.points,
             "Lodestream",
-            (size, f"RMS error {last.rms:.1f} m, told and found"),
+            (size, f"RMS error {last.rms:.1f} m"),
         ),
         picture.Panel(
             heights,

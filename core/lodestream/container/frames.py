@@ -149,7 +149,8 @@ def checked(frame: bytes, kind: int, offset: int, start: int) -> Frame:
         raise CorruptStreamError(f"expected a section of kind {kind} to match its CRC, got other bytes", offset)
     if kind not in _KNOWN and kind < sections.OPTIONAL:
         raise UnsupportedVersionError(
-            f"expected sections of version {sections.VERSION}, got one of kind {kind} that must be understood"
+            f"expected sections of version {sections.VERSION}, got an unknown one of kind {kind} that must not be "
+            "skipped"
         )
     return Frame(kind, offset, offset + start, payload, offset + len(frame))
 

@@ -1,8 +1,8 @@
-"""Files in and out: one table of formats, chosen by content.
+"""Reading and writing files: one table of formats, selected by content.
 
-The first bytes of a file decide what it is; its suffix only helps where the content is text. No reader follows a
-reference to another file, and every reader checks what a header promises before it takes memory. The readers' libraries
-are imported when a file needs them, not before.
+The first bytes of a file decide its format; the suffix only helps with text. No reader opens another file that the
+first one names. Every reader checks what a header announces before it allocates memory. Libraries are imported when a
+file needs them.
 """
 
 from __future__ import annotations
@@ -71,31 +71,31 @@ class Format:
     Attributes
     ----------
     name : str
-        As in ``?format=`` and in messages.
+        Name in ``?format=`` and in messages.
     suffixes : tuple of str
-        Endings of file names, in lower case with their dot; the first is the usual one.
+        File name suffixes, in lower case with their dot; the usual one first.
     sniff : callable
-        ``sniff(head, suffix)`` says whether a file that begins with the bytes `head` is of this format. The suffix is
-        that of some format, or empty.
+        ``sniff(head, suffix)`` tells whether a file that begins with the bytes `head` has this format. The suffix is
+        that of a known format, or empty.
     read : callable or None
-        Takes a `Source`, gives a `Surface`; None where the format is only written.
+        Takes a `Source`, returns a `Surface`; None if the format is only written.
     write : callable or None
-        Takes a `Surface` and a binary file that need not be seekable; None where the format is only read.
+        Takes a `Surface` and a binary file that need not be seekable; None if the format is only read.
     blocks : bool
         Whether several blocks can be written.
     options : mapping of str to str
         Options for reading, each with a line of help.
     kinds : tuple of str
-        Names of what looks like this format and is read by other rules; each may be allowed or not by itself.
+        Names of variants of this format that are read by other rules. Each can be switched off by itself.
     more : str
-        What further files of the same surface are, in words; empty where it takes one file.
+        Description of further files of the same surface; empty if the format takes one file only.
     named : callable or None
-        What the name of a file says: options (such as the place of an .hgt) that hold unless they are given. Whoever
-        tells surfaces apart by their bytes and options counts these as options.
+        Returns the options that a file's name implies (such as the position of an .hgt); explicit options take
+        precedence. Code that identifies surfaces by bytes and options must include these.
     media_type : str
-        For answers over HTTP.
+        Media type for HTTP.
     process : bool
-        Whether reading starts a process, which is to be allowed and takes memory of its own.
+        Whether reading starts a separate process, which must be allowed and needs its own memory.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Format:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Its own name and those of its kinds."""
+        """The names of this format and of its variants."""
         return self.name, *self.kinds
 
 
@@ -178,7 +178,7 @@ _FORMATS = (
 
 
 def formats() -> tuple[Format, ...]:
-    """Every format that is read or written."""
+    """All formats that can be read or written."""
     return _FORMATS
 
 
@@ -190,12 +190,12 @@ def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Forma
     path : str or path-like
         An existing file.
     filename : str, optional
-        The name that its owner gave it, where `path` has another one; only its suffix counts, and only for text.
+        The file's original name, if `path` has another; only its suffix matters, and only for text.
 
     Raises
     ------
     FormatError
-        When the file is empty, is no regular file, or is of no known format.
+        If the file is empty, not a regular file, or of no known format.
     """
     path = Path(path)
     label = filename or os.fspath(path)
@@ -214,51 +214,51 @@ def read(
     allowed: Collection[str] | None = None,
     **options: Any,
 ) -> Surface:
-    """Read a surface from a file, whose content decides about its format.
+    """Read a surface from a file; the file's content decides its format.
 
     Parameters
     ----------
     path : str or path-like
         A file of one of the `formats`.
     *more : str or path-like
-        Further files of the same surface, for the formats that take them (`Format.more`).
+        Further files of the same surface, for formats that take them (`Format.more`).
     closed : {"auto", "none", "rows", "cols", "both"} or (bool, bool)
-        Which axes wrap. "auto": those of which the format says so, or whose last row or column repeats the first bit
-        for bit, which is then merged with it (``seam`` in the metadata) and written again by `write`.
+        Which axes are closed. "auto": those that the format declares closed, and those whose last row or column repeats
+        the first bit for bit. The repeated one is merged (``seam`` in the metadata) and written again by `write`.
     max_vertices : int
-        Larger surfaces are refused before memory is taken for them.
+        Larger surfaces are refused before memory is allocated for them.
     filename : str, optional
-        The name that its owner gave the file, where `path` has another one, as an upload does: it stands in messages
-        and in the metadata's ``name``, and its suffix helps where the content is text.
+        The file's original name, if `path` has another, as with uploads. It is used in messages and as ``name`` in the
+        metadata; its suffix helps with text.
     allowed : collection of str, optional
-        Names (`Format.names`) of the formats that may be read; all of them unless given.
+        Names (`Format.names`) of the formats that may be read; by default all.
     **options
-        What `Format.options` lists: ``array`` of NPZ, ``band`` of GeoTIFF.
+        Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
     Returns
     -------
     Surface
-        With its own copy of the values, in the file's type (float64 for text). Its metadata are ``name``, ``format``
-        and, where the file tells them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a
-        number, or the text of one that is not finite), ``unit``, ``scale`` and ``offset`` (of values kept as they are
-        stored), ``scalars`` (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that
-        docs/formats.md lists. What the file has and the surface has not is told by a `FormatWarning`; so are the
-        largest entries of metadata beyond `lodestream.metadata.MAX_BYTES`, which are dropped.
+        With its own copy of the values, in the file's type (float64 for text). Its metadata have ``name``, ``format``
+        and, if the file has them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a number,
+        or text if it is not finite), ``unit``, ``scale`` and ``offset`` (for values kept as stored), ``scalars``
+        (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that docs/formats.md lists. A
+        `FormatWarning` tells what was left out; so also if metadata exceed `lodestream.metadata.MAX_BYTES` and their
+        largest entries are dropped.
 
     Raises
     ------
     FormatError
-        When the file is not what it says, is cut short, or holds no structured surface.
+        If the file is invalid, cut short, or not a structured surface.
     SwitchedOffError
-        When its format may not be read.
+        If its format may not be read.
     TooLargeError
-        When it promises more vertices than allowed or expands implausibly.
+        If it announces more vertices than allowed, or expands implausibly.
     OptionError
-        When an option does not exist or does not take its value.
+        If an option does not exist, or its value is not valid.
     InputError
-        When the values cannot be a surface: not one of them is valid.
+        If the values cannot be a surface because none is valid.
     OSError
-        When the file cannot be opened.
+        If the file cannot be opened.
     """
     path = Path(path)
     label = filename or os.fspath(path)
@@ -286,7 +286,7 @@ def read(
         surface.metadata, dropped = metadata.fitted(surface.metadata)
         if dropped:
             words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
-            notes.warn(f"metadata may be {metadata.MAX_BYTES:,} bytes long, hence left out: {words}")
+            notes.warn(f"metadata are limited to {metadata.MAX_BYTES:,} bytes; left out: {words}")
         return surface if chosen is None else _closed(surface, chosen)
     except InputError as error:
         raise _named(error, label) from None
@@ -302,7 +302,7 @@ def _closed(surface: Surface, closed: Closed) -> Surface:
 
 
 def check_blocks(format_: Format, count: int) -> None:
-    """Refuse to write so many blocks where the format holds but one.
+    """Refuse to write several blocks in a format that holds only one.
 
     Raises
     ------
@@ -316,12 +316,12 @@ def check_blocks(format_: Format, count: int) -> None:
 
 
 def for_writing(path: str | os.PathLike[str]) -> Format:
-    """The format that a file of this name is written in.
+    """The format in which a file of this name is written.
 
     Raises
     ------
     OptionError
-        When no format that is written has this suffix; those that exist are named.
+        If no format that can be written has this suffix; the message names those that exist.
     """
     path = Path(path)
     format_ = next((it for it in _FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
@@ -332,17 +332,17 @@ def for_writing(path: str | os.PathLike[str]) -> Format:
 
 
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
-    """Write a surface to a file, whose suffix names the format.
+    """Write a surface to a file; the suffix decides the format.
 
-    The file appears whole or not at all: a temporary file beside it takes its name at the end. What the format cannot
-    hold is told by a `FormatWarning`.
+    The file is written under a temporary name and renamed at the end, so it is complete or absent. A `FormatWarning`
+    tells what the format cannot hold.
 
     Raises
     ------
     OptionError
-        When no format that is written has this suffix; those that exist are named.
+        If no format that can be written has this suffix; the message names those that exist.
     FormatError
-        When the format cannot hold this surface.
+        If the format cannot hold this surface.
     """
     path, format_ = Path(path), for_writing(path)
     if path.exists() and not path.is_file():
@@ -371,16 +371,16 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     ----------
     surface : Surface
     format_name : str
-        Name of a format that is written, as in `formats`.
+        Name of a format that can be written, as in `formats`.
     file : binary file
         Only its ``write`` is used.
 
     Raises
     ------
     OptionError
-        When there is no such format; those that exist are named.
+        If there is no such format; the message names those that exist.
     FormatError
-        When the format cannot hold this surface. Nothing has been written then.
+        If the format cannot hold this surface. Nothing has been written then.
     """
     written = {it.name: it for it in _FORMATS if it.write}
     if format_name not in written:

@@ -17,7 +17,7 @@ from .source import Source, number
 __all__ = ["OPTIONS", "SUFFIX", "read", "sniff"]
 
 SUFFIX = ".bpt"
-OPTIONS = {"density": "intervals that each patch is sampled at, along both axes; 16 unless given"}
+OPTIONS = {"density": "number of intervals along each side of a patch (default: 16)"}
 
 _DENSITY = 16
 _MAX_DENSITY = 1 << 14

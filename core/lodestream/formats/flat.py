@@ -23,13 +23,13 @@ def even_heights(surface: Surface, title: str) -> Surface:
     if surface.points.ndim == 3:
         heights = to_heights(surface)
         if heights is None and (heights := to_heights(surface, exactly=False)) is not None:
-            warn(f"{title} takes x and y from an even lattice: those of holes that lie elsewhere are left out")
+            warn(f"{title} takes x and y from an even grid: those of holes that are off this grid are left out")
         if heights is None:
             kind = "planar points" if surface.points.shape[2] == 2 else "x, y, z"
-            raise FormatError(f"expected heights over an even lattice for {title}, got {kind} that are not")
+            raise FormatError(f"expected heights on an even grid for {title}, got {kind} that are not")
         surface = heights
     if "nodes" in surface.metadata:
-        warn(f"{title} takes rows and columns for evenly spaced, which those of this level are only nearly")
+        warn(f"{title} assumes evenly spaced rows and columns; those of this level are only nearly so")
     return surface
 
 

@@ -60,7 +60,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     rasterio = raster.require_rasterio(_TITLE)
     surface = even_heights(surface, _TITLE)
     if any(surface.closed):
-        warn("GeoTIFF cannot say that a surface is closed")
+        warn("GeoTIFF cannot express closed axes")
     warn_left_out(_TITLE, metadata_left_out(surface, _HELD))
     names, bands = _bands(surface)
     nodata = _nodata(surface, bands[0])
@@ -163,4 +163,4 @@ def _warn_off(surface: Surface, transform: Sequence[float]) -> None:
     for name, is_, was, steps in zip("xy", affine, exact, (transform[1:3], transform[4:6]), strict=True):
         off = float(np.abs(is_ - was).max())
         if off > _OFF * max(map(abs, steps)):
-            warn(f"GeoTIFF takes rows and columns for evenly spaced: {name} is up to {off:.3g} from what it was")
+            warn(f"GeoTIFF assumes evenly spaced rows and columns: {name} changes by up to {off:.3g}")

@@ -64,7 +64,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     if translation is not None:
         rounded.insert(0, "coordinates")
     if rounded:
-        warn(f"GLB is written with float32 in place of {listing(rounded)}, which it rounds")
+        warn(f"GLB is written with float32, to which it rounds {listing(rounded)}")
     node = {"mesh": 0} | ({"translation": translation} if translation is not None else {})
     extras = words_of("GLB", surface)
     scene = {

@@ -27,13 +27,13 @@ __all__ = ["KINDS", "READ_OPTIONS", "read", "sniff"]
 KINDS = ("vmec",)
 
 READ_OPTIONS = {
-    "variable": "name of the variable whose values are the heights (default: the only one there is)",
-    "x": "name of the variable of x (default: what the variable or the conventions name)",
+    "variable": "name of the variable with the heights (default: the only one)",
+    "x": "name of the variable of x (default: by the CF conventions)",
     "y": "name of the variable of y; with x but without variable, the surface is planar",
-    "time": "number of a time, from 0, or its date as far as needed, such as 2001-02",
-    "at": "numbers along other dimensions, such as depth:0 or depth:3,member:1",
-    "attributes": "names of variables of the same shape that become attributes, with commas between",
-    "resolution": "of a VMEC file: points the short and the long way around, such as 64x256",
+    "time": "index of a time, from 0, or the beginning of its date, such as 2001-02",
+    "at": "indices along other dimensions, such as depth:0 or depth:3,member:1",
+    "attributes": "names of variables of the same shape that become attributes, separated by commas",
+    "resolution": "VMEC: number of points the short and the long way around, such as 64x256",
 }
 
 #: Attributes that say how values are stored, or which variables belong to them.

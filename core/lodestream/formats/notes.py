@@ -1,4 +1,4 @@
-"""What readers and writers say of what did not come in or go out: one line for each loss."""
+"""Notes of readers and writers about what they leave out: one line for each loss."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ _CUT = ("diagonal", "crossed", "left_out")
 
 
 def warn(text: str) -> None:
-    """Give a note, of one line whatever names it holds."""
+    """Issue a note as a `FormatWarning`, in one line."""
     line = "".join(character if character.isprintable() else " " for character in text)
     warnings.warn(" ".join(line.split()), FormatWarning, stacklevel=3)
 
 
 def listing(names: Iterable[Any]) -> str:
-    """Some names, shortened, and how many more there are."""
+    """The first names, shortened, and how many more there are."""
     texts = [str(name) for name in names]
     shown = [text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..." for text in texts[:_MOST_NAMES]]
     return ", ".join(shown) + (f" and {number(len(texts) - _MOST_NAMES)} more" if len(texts) > _MOST_NAMES else "")
 
 
-def warn_left_out(kind: str, names: Collection[str], why: str = "for which it has no place") -> None:
-    """Say what a file does not have, if there is anything."""
+def warn_left_out(kind: str, names: Collection[str], why: str = "which it cannot hold") -> None:
+    """Issue a note about what a file cannot hold, if there is anything."""
     if names:
         warn(f"{kind} is written without {listing(names)}, {why}")
 

@@ -122,7 +122,7 @@ def _with_holes(surface: Surface) -> NDArray[Any]:
     if mask is None:
         return points
     if points.dtype.kind != "f":
-        warn(f"NPY has whole numbers at all points, also at the {number(surface.blocks[0].holes)} that are holes")
+        warn(f"NPY has integers at all points, including the {number(surface.blocks[0].holes)} holes")
         return points
     coordinates = points if points.ndim == 2 else points[..., :3]
     known = np.isfinite(coordinates) if points.ndim == 2 else np.isfinite(coordinates).all(axis=2)

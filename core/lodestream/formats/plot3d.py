@@ -30,8 +30,8 @@ SUFFIXES = (".p3d", ".xyz", ".fmt", ".bin", ".x", ".g", ".grd", ".ufmt", ".unf",
 MORE = "Q files and function files of the same grid"
 READ_OPTIONS: Mapping[str, str] = {
     "plane": planes.HELP,
-    "block": "number of one block of a file of several, from 1",
-    "dimensions": "2 or 3, where a PLOT3D file fits both",
+    "block": "number of the block to read, from 1 (default: all)",
+    "dimensions": "2 or 3, if a PLOT3D file fits both",
 }
 
 #: What the first two integers of a file may be, to be taken for PLOT3D.
@@ -133,7 +133,7 @@ class _Fields:
         places = self._layout.places()[1 + self._layout.multi :: 2]
         values = [self._numbers.array(place, len(_REFERENCES), self._layout, "f") for place, _ in places]
         if any(other.tobytes() != values[0].tobytes() for other in values[1:]):
-            warn("left out the reference numbers of the blocks of a Q file after the first, which are others")
+            warn("left out the reference numbers of later blocks of a Q file, which differ from those of the first")
         return {name: float(value) for name, value in zip(_REFERENCES, values[0], strict=True)}
 
     def read(self, index: int, cut: Cut) -> dict[str, NDArray[Any]]:

@@ -26,8 +26,8 @@ from .source import Source, number
 __all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
 
 READ_OPTIONS = {
-    "encoding": "grey, terrain-rgb or terrarium: what pixels stand for (default: grey for shades of grey; for colours "
-    "what the file's name says)"
+    "encoding": "meaning of the pixels: grey, terrain-rgb or terrarium (default: grey for grey levels; for colours "
+    "as the file's name says)"
 }
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -113,7 +113,7 @@ def read(source: Source) -> Surface:
 
 def _warn_of_transparency(pixels: NDArray[Any], kind: int) -> None:
     if kind in (_GREY_ALPHA, _RGBA) and not np.isin(pixels[..., -1], (0, 255)).all():
-        warn("left out degrees of transparency, of which only 0 makes holes")
+        warn("left out partial transparency; only fully transparent points are holes")
 
 
 def _header(source: Source) -> tuple[int, int]:
@@ -167,11 +167,11 @@ def _encoding(source: Source, kind: int, text: Mapping[str, Any]) -> str:
     grey = kind in (_GREY, _GREY_ALPHA)
     if grey:
         if chosen not in (None, "grey") and "encoding" in source.options:
-            raise OptionError(f"expected encoding=grey for shades of grey, got {chosen!r}")
+            raise OptionError(f"expected encoding=grey for grey levels, got {chosen!r}")
         return "grey"
     if chosen is None:
         raise FormatError(
-            "expected shades of grey, got colours: say what they stand for, encoding=terrain-rgb or encoding=terrarium"
+            "expected grey levels, got colours: give their meaning with encoding=terrain-rgb or encoding=terrarium"
         )
     if chosen == "grey":
         raise OptionError("expected encoding=terrain-rgb or encoding=terrarium for colours, got 'grey'")
@@ -260,9 +260,12 @@ def _shades(surface: Surface) -> tuple[NDArray[np.uint16], dict[str, Any], int |
             lattice = Lattice("affine", float(low), step)
             rule |= {"first": 0, "origin": float(low), "step": step, "scale": 1}
             whole = lattice.coordinates(filled)
-            warn(f"PNG holds 65,536 shades: heights are rounded to steps of {step:.6g}")
+            warn(f"PNG has 65,536 grey levels: heights are rounded to steps of {step:.6g}")
         else:
-            warn("PNG holds shades from 0 to 65,535: heights are shifted and scaled to them, by a rule in its text")
+            warn(
+                "PNG has grey levels from 0 to 65,535: heights are shifted and scaled to them; a text chunk has the "
+                "rule"
+            )
         shades = (whole - rule["first"]).astype(np.uint16)
     if mask is None:
         return shades, rule, None

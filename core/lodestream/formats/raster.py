@@ -155,7 +155,7 @@ def _warn_left_out(dataset: Any) -> None:
     left_out += [f"{len(dataset.gcps[0])} ground control points"] * bool(dataset.gcps[0])
     for band in _alphas(dataset):
         if not np.isin(dataset.read(band), (0, 255)).all():
-            left_out.append(f"degrees of transparency in band {band}")
+            left_out.append(f"partial transparency in band {band}")
     if left_out:
         warn(f"left out {listing(left_out)}")
 

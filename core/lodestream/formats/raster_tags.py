@@ -113,7 +113,7 @@ def _tags(dataset: Any, band: int) -> Tags:
             values = dataset.tags(band, ns=namespace or None)
         except ValueError:  # bytes that are no UTF-8, or an entry without a name
             of = f" of {namespace}" * bool(namespace) + f" of band {band}" * (band > 0)
-            warn(f"tags{of} left out, which are no text")
+            warn(f"tags{of} left out, which are not text")
             continue
         if namespace.startswith(_XML):
             # rasterio takes the whole text for one name and value, with its own name in front where it wrote that
@@ -147,7 +147,7 @@ def describe(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str], ba
             dataset.set_band_description(number, found["description"])
         tags, stale = _fresh(_written(found.get("tags")), bands[number - 1])
         if stale:
-            warn(f"GeoTIFF is written without {listing(stale)} of band {number}, which are of other values")
+            warn(f"GeoTIFF is written without {listing(stale)} of band {number}, which describe other values")
         _set_tags(dataset, number, tags)
     dataset.units = tuple(found["unit"] for found in described)
     dataset.scales = tuple(found["scale"] for found in described)

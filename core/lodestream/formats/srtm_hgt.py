@@ -44,5 +44,5 @@ def read(source: Source) -> Surface:
     surface = raster.read(source, "SRTMHGT", "srtm-hgt", "SRTM tile", f"{tile}.hgt")
     if "tile" not in source.options:
         del surface.metadata["geotransform"], surface.metadata["crs"]
-        warn("the name of an SRTM tile tells where it lies, and this one does not: say tile=N37W122 or so")
+        warn("the name of an SRTM tile gives its position, but this one does not: use an option such as tile=N37W122")
     return surface

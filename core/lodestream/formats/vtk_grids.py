@@ -122,7 +122,7 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
                 for key, text in grid["words"].items():
                     keep_words(words, key, text)
     if left_out:
-        warn(f"left out what does not belong to points: {listing(dict.fromkeys(left_out))}")
+        warn(f"left out data that do not belong to points: {listing(dict.fromkeys(left_out))}")
     if any(faces):
         metadata["faces"] = faces if len(faces) > 1 else faces[0]
     metadata = source.metadata(format_name) | words | metadata

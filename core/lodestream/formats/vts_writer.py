@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,14 +123,14 @@ def _warn_of_faces(surface: Surface) -> None:
     faces = surface.metadata.get("faces")
     maps = [it for it in (faces if isinstance(faces, list) else [faces]) if isinstance(it, dict)]
     if any("diagonal" in it for it in maps):
-        warn("VTS is written with whole cells in place of the triangles that they were made of")
+        warn("VTS is written with quads in place of the triangles that they were joined from")
     closed = [
         block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < _MIN_CLOSED
     ]
     if closed:
-        warn(f"VTS is written without closure of axes of fewer than {_MIN_CLOSED} points")
+        warn(f"VTS is written with open axes in place of closed ones of fewer than {_MIN_CLOSED} points")
     if _GHOSTS in surface.blocks[0].attributes:
-        warn(f"VTS is written with {_GHOSTS}_ in place of {_GHOSTS}, which says there what is hidden")
+        warn(f"VTS is written with the attribute {_GHOSTS} as {_GHOSTS}_, because VTS uses that name for hidden points")
 
 
 def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
@@ -173,6 +172,8 @@ def _padded(values: NDArray[Any], ends: Sequence[tuple[int, int]], mode: Any) ->
 
 
 def _array(name: str, values: NDArray[Any], offset: int) -> str:
+    from xml.sax.saxutils import quoteattr  # it loads urllib, which writers of other formats need not wait for
+
     kind = f"{_TYPES[values.dtype.kind]}{8 * values.dtype.itemsize}"
     components = values.shape[2] if values.ndim == 3 else 1
     return (

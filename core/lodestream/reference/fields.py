@@ -1,25 +1,25 @@
-"""Section 1 of the page: numbers and bytes, one after another."""
+"""Section 1 of docs/format.md: numbers and bytes, one after another."""
 
 from __future__ import annotations
 
 import struct
 
+from ..errors import StreamError
 
-class DamagedError(ValueError):
-    """The bytes are not those of a container, or not of one that this reader knows."""
+__all__ = ["Fields"]
 
 
 class Fields:
-    """Reads one field after another."""
+    """Reads one field after another, from a position of the bytes on."""
 
     def __init__(self, data: bytes, position: int = 0) -> None:
         self.data = data
         self.position = position
 
     def take(self, count: int) -> bytes:
-        """The next bytes as they are."""
-        if count > len(self.data) - self.position:
-            raise DamagedError("the bytes end within a field")
+        """The next bytes as they are; StreamError where there are fewer, as of everything here."""
+        if not 0 <= count <= len(self.data) - self.position:
+            raise StreamError(f"expected {count} bytes, got {len(self.data) - self.position}")
         self.position += count
         return self.data[self.position - count : self.position]
 
@@ -28,7 +28,7 @@ class Fields:
         return self.take(len(self.data) - self.position)
 
     def number(self, layout: str) -> int:
-        """A whole number of fixed size."""
+        """An integer of fixed size, by its letter of `struct`."""
         (value,) = struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
         return int(value)
 
@@ -45,9 +45,9 @@ class Fields:
             value |= (byte & 127) << 7 * place
             if byte < 128:
                 return value
-        raise DamagedError("a varint of more than nine bytes")
+        raise StreamError("expected a varint of at most nine bytes, got more")
 
     def finish(self) -> None:
         """Nothing may be left."""
         if self.position != len(self.data):
-            raise DamagedError("bytes are left over")
+            raise StreamError(f"expected the end, got {len(self.data) - self.position} bytes more")

@@ -1,37 +1,31 @@
-"""Section 3 of the page: what the header says of a surface, before anything is decoded."""
+"""Sections 3, 3.1 and 3.2 of docs/format.md: what the header says of a surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 
-from tests.stranger.fields import DamagedError, Fields
+from ..errors import StreamError
+from .fields import Fields
+
+__all__ = ["Block", "Grid", "Header", "Lattice", "read_header"]
 
 TYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
 
+Bits = tuple[bool, ...]
 
-@dataclass(frozen=True)
-class Block:
+
+class Block(NamedTuple):
     """A grid of points, and which of its axes wrap."""
 
     rows: int
     columns: int
-    closed: tuple[bool, bool]
+    closed: Bits
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A side of parts that is coded by itself."""
-
-    length: int
-    stops: bool
-    closed: bool
-
-
-@dataclass(frozen=True)
-class Side:
+class Side(NamedTuple):
     """The curve from which a part takes a side."""
 
     curve: int
@@ -39,21 +33,28 @@ class Side:
 
 
 @dataclass(frozen=True)
-class Part:
-    """A window of a block. Sides are the first row, the last row, the first column, the last column."""
+class Grid:
+    """What is coded as a grid: a curve, or a part, which is a window of a block.
 
-    block: int
-    first: tuple[int, int]
+    Sides are the first row, the last row, the first column, the last column.
+    """
+
+    block: int  # -1: it is a curve
     shape: tuple[int, int]
-    closed: tuple[bool, bool] = (False, False)
-    backwards: tuple[bool, bool] = (False, False)
-    stops: tuple[bool, bool] = (False, False)
-    clamped: tuple[bool, ...] = (False,) * 4
+    first: tuple[int, int] = (0, 0)
+    closed: Bits = (False, False)
+    backwards: Bits = (False, False)
+    stops: Bits = (False, False)
+    clamped: Bits = (False,) * 4
     sides: tuple[Side | None, ...] = (None,) * 4
 
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is a curve."""
+        return self.block < 0
 
-@dataclass(frozen=True)
-class Attribute:
+
+class Attribute(NamedTuple):
     """An array beside the points."""
 
     name: str
@@ -66,9 +67,8 @@ class Attribute:
         return max(self.components, 1)
 
 
-@dataclass(frozen=True)
-class Lattice:
-    """The rule that makes values of a channel's whole numbers."""
+class Lattice(NamedTuple):
+    """The rule that turns the integers of a channel into values."""
 
     decimal: bool
     origin: float
@@ -77,7 +77,7 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Header:
-    """Section 3; `predictors` are the pairs in the order of the file, which section 4 says how to hand out."""
+    """Section 3, in the words of the page; `predictors` are the pairs in the order of the file."""
 
     flat: bool
     exact: bool
@@ -88,10 +88,8 @@ class Header:
     layers: int
     tile: tuple[int, int]
     base: int  # 0 where coordinates are not quantised
-    extent: float
     blocks: list[Block]
-    curves: list[Curve]
-    parts: list[Part]
+    grids: list[Grid]  # curves first
     attributes: list[Attribute]
     plane: dict[str, Any] | None
     lattices: list[Lattice]
@@ -114,53 +112,42 @@ class Header:
         return [self.type] * self.points_channels + [a.type for a in self.attributes for _ in range(a.channels)]
 
 
-def _bits(number: int, first: int, count: int) -> tuple[bool, ...]:
+def _bits(number: int, first: int, count: int) -> Bits:
     return tuple(bool(number >> bit & 1) for bit in range(first, first + count))
 
 
-def _pair(number: int, first: int) -> tuple[bool, bool]:
-    return bool(number >> first & 1), bool(number >> first + 1 & 1)
+def _read_curve(fields: Fields) -> Grid:
+    number = fields.varint()
+    closed, stops = bool(number & 1), bool(number & 2)
+    open_ends = not closed, not closed, False, False
+    return Grid(-1, (number >> 2, 1), closed=(closed, False), stops=(stops, False), clamped=open_ends)
 
 
-def _read_part(fields: Fields, blocks: list[Block]) -> Part:
+def _read_part(fields: Fields, blocks: list[Block]) -> Grid:
     block = fields.varint()
     flags, ends = fields.number("B"), fields.number("B")
-    if flags >> 7:
-        raise DamagedError("unknown flags of a part")
-    first, shape = (0, 0), (blocks[block].rows, blocks[block].columns)
+    row, rows, column, columns = 0, blocks[block].rows, 0, blocks[block].columns
     if flags & 64:
         row, rows, column, columns = (fields.varint() for _ in range(4))
-        first, shape = (row, column), (rows, columns)
-    sides: list[Side | None] = []
-    for has_curve in _bits(ends, 4, 4):
-        number = fields.varint() if has_curve else None
-        sides.append(None if number is None else Side(number >> 1, bool(number & 1)))
-    return Part(
+    numbers = [fields.varint() if has_curve else None for has_curve in _bits(ends, 4, 4)]
+    return Grid(
         block=block,
-        first=first,
-        shape=shape,
-        closed=_pair(flags, 0),
-        backwards=_pair(flags, 2),
-        stops=_pair(flags, 4),
+        shape=(rows, columns),
+        first=(row, column),
+        closed=_bits(flags, 0, 2),
+        backwards=_bits(flags, 2, 2),
+        stops=_bits(flags, 4, 2),
         clamped=_bits(ends, 0, 4),
-        sides=tuple(sides),
+        sides=tuple(None if number is None else Side(number >> 1, bool(number & 1)) for number in numbers),
     )
 
 
-def _read_arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
-    blocks = []
-    for _ in range(fields.varint()):
-        rows, columns, wraps = fields.varint(), fields.varint(), fields.number("B")
-        blocks.append(Block(rows, columns, _pair(wraps, 0)))
-    curves = []
-    for _ in range(fields.varint()):
-        number = fields.varint()
-        curves.append(Curve(number >> 2, bool(number & 2), bool(number & 1)))
-    return blocks, curves, [_read_part(fields, blocks) for _ in range(fields.varint())]
+def _read_block(fields: Fields) -> Block:
+    return Block(fields.varint(), fields.varint(), _bits(fields.number("B"), 0, 2))
 
 
 def read_header(payload: bytes) -> Header:
-    """The header of the file."""
+    """The header, from the payload of its section; StreamError where its bytes end early."""
     fields = Fields(payload)
     flags = fields.number("B")
     kind = TYPES[fields.number("B")]
@@ -168,14 +155,15 @@ def read_header(payload: bytes) -> Header:
     tile = fields.number("B")
     base = fields.varint()
     if base >= 2**24:
-        raise DamagedError("a base that no step has")
-    extent = fields.f64()
+        raise StreamError(f"expected a base below 2^24, got {base}")
+    fields.f64()  # the extent, which decoding does not use
     if flags & 64:
-        blocks, curves, parts = _read_arrangement(fields)
+        blocks = [_read_block(fields) for _ in range(fields.varint())]
+        grids = [_read_curve(fields) for _ in range(fields.varint())]
+        grids += [_read_part(fields, blocks) for _ in range(fields.varint())]
     else:
-        block = Block(fields.varint(), fields.varint(), _pair(flags, 0))
-        blocks, curves = [block], []
-        parts = [Part(0, (0, 0), (block.rows, block.columns), block.closed)]
+        blocks = [Block(fields.varint(), fields.varint(), _bits(flags, 0, 2))]
+        grids = [Grid(0, blocks[0][:2], closed=blocks[0].closed)]
     extras = msgpack.unpackb(fields.take(fields.varint())) if flags & 128 else {}
     attributes = [Attribute(name, TYPES[number], count) for name, number, count in extras.get("attributes", [])]
     channels = range(points_channels + sum(attribute.channels for attribute in attributes))
@@ -194,10 +182,8 @@ def read_header(payload: bytes) -> Header:
         layers=layers,
         tile=(tile & 15, tile >> 4),
         base=base,
-        extent=extent,
         blocks=blocks,
-        curves=curves,
-        parts=parts,
+        grids=grids,
         attributes=attributes,
         plane=extras.get("plane"),
         lattices=lattices,

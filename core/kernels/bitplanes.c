@@ -1,0 +1,214 @@
+/* The embedded coder: tiles, bit-plane by bit-plane (docs/format.md, "Passes").
+ *
+ * A plane takes two passes over a tile's bands, each over the blocks of 8 x 8 coefficients in raster order. The first
+ * visits insignificant coefficients with a significant neighbour, the second all others.
+ */
+#include "band_fields.h"
+#include "block_coder.h"
+#include "logarithm.h"
+
+_Static_assert(LODE_MODEL == TRELLIS_ACROSS && LODE_TRELLIS_MODEL == TRELLIS_END, "models as lodestream.h has them");
+
+/* Code the blocks of a band, from number `first` on, until all are done or so many coefficients were looked at as
+ * `budget` says, which becomes less; the first block that is not done. */
+LODE_INLINE int64_t code_blocks(bool reads, enum pass pass, struct coder *kept, const struct tiles *tiles,
+                                const struct band *band, int64_t first, int plane, int *state, int64_t *budget) {
+    struct coder coder = *kept;
+    int32_t *model_weights = tiles->model + (pass == LOWEST ? TRELLIS_WEIGHTS : WEIGHTS), weights[8];
+    int count = pass == LOWEST ? 8 : 4, own_state = *state;
+    for (int i = 0; i < count; i++)
+        weights[i] = clamped(model_weights[i], -HEAVIEST, HEAVIEST);
+    int64_t down = (band->rows + BLOCK - 1) / BLOCK, number = first, spent = 0;
+    for (; number < down * band->across && spent < *budget; number++) {
+        int64_t row = number / band->across, top = row * BLOCK, left = (number - row * band->across) * BLOCK;
+        int64_t rows = band->rows - top, columns = band->columns - left;
+        struct block block = {top, left, rows < BLOCK ? rows : BLOCK, columns < BLOCK ? columns : BLOCK,
+                              band->flags + number + row};
+        code_block(reads, pass, &coder, tiles, band, &block, plane, weights, &own_state);
+        spent += tiles->flags[block.flag] == SOME_FOUND ? BLOCK * BLOCK : BLOCK;
+    }
+    for (int i = 0; i < count; i++)
+        model_weights[i] = weights[i];
+    *kept = coder;
+    *state = own_state;
+    *budget -= spent;
+    return number;
+}
+
+/* Each kind of pass is compiled for itself. */
+#define COMPILED(name, reads, pass)                                                                                    \
+    static int64_t name(struct coder *coder, const struct tiles *tiles, const struct band *band, int64_t first,        \
+                        int plane, int *state, int64_t *budget) {                                                      \
+        return code_blocks(reads, pass, coder, tiles, band, first, plane, state, budget);                              \
+    }
+
+COMPILED(read_first, true, FIRST)
+COMPILED(read_second, true, SECOND)
+COMPILED(read_lowest, true, LOWEST)
+COMPILED(write_first, false, FIRST)
+COMPILED(write_second, false, SECOND)
+COMPILED(write_lowest, false, LOWEST)
+
+typedef int64_t (*blocks_t)(struct coder *, const struct tiles *, const struct band *, int64_t, int, int *, int64_t *);
+
+static const blocks_t BLOCKS_OF[2][3] = {{write_first, write_second, write_lowest},
+                                         {read_first, read_second, read_lowest}};
+
+static struct band band_of(const int64_t *fields) {
+    return (struct band){
+        .offset = fields[BAND_OFFSET],
+        .stride = fields[BAND_STRIDE],
+        .rows = fields[BAND_ROWS],
+        .columns = fields[BAND_COLUMNS],
+        .flags = fields[BAND_FLAGS],
+        .across = (fields[BAND_COLUMNS] + BLOCK - 1) / BLOCK,
+        .parent = fields[BAND_PARENT],
+        .parent_stride = fields[BAND_PARENT_STRIDE],
+        .row_shift = (int)fields[BAND_ROW_SHIFT],
+        .column_shift = (int)fields[BAND_COLUMN_SHIFT],
+        .kind = (int)fields[BAND_KIND],
+    };
+}
+
+static bool is_shift(int64_t shift) {
+    return shift == 0 || shift == 1 || shift == NO_PARENT;
+}
+
+/* Whether all that is looked at of a band, its flags and its parents lies in arrays of these lengths. */
+static bool band_fits(const int64_t *fields, int64_t size, int64_t flags) {
+    for (int i = 0; i < BAND_FIELDS; i++)
+        if (fields[i] < 0 || fields[i] > INT64_C(1)
+                                             << (i == BAND_OFFSET || i == BAND_FLAGS || i == BAND_PARENT ? 40 : 31))
+            return false;
+    struct band band = band_of(fields);
+    if (!is_shift(fields[BAND_ROW_SHIFT]) || !is_shift(fields[BAND_COLUMN_SHIFT]) || fields[BAND_KIND] >= KINDS)
+        return false;
+    if (band.rows == 0 || band.columns == 0)
+        return true;
+    int64_t down = (band.rows + BLOCK - 1) / BLOCK, left = BLOCK * (band.across - 1);
+    int64_t parent_row = ((band.rows - 1) >> band.row_shift) + 1, parent_column = (left >> band.column_shift) - 1;
+    return band.offset - MARGIN * band.stride - MARGIN >= 0 &&
+           band.offset + (band.rows + 1) * band.stride + left - MARGIN + WIDE <= size &&
+           band.flags - band.across - 1 >= 0 && band.flags + down * (band.across + 1) + band.across <= flags &&
+           band.parent - band.parent_stride - 1 >= 0 &&
+           band.parent + parent_row * band.parent_stride + parent_column + WIDE <= size;
+}
+
+/* Passes of one tile: a row of the table of runs. */
+struct run {
+    int64_t band, bands, model, first, last, start, length;
+};
+
+static struct run run_of(const int64_t *fields) {
+    return (struct run){
+        fields[0], fields[1], fields[2], fields[3], fields[4], fields[LODE_RUN_START], fields[LODE_RUN_LENGTH]};
+}
+
+static bool run_fits(const struct run *run, int64_t bands, int64_t models, int64_t data, int64_t costs) {
+    return run->band >= 0 && run->bands >= 0 && run->band <= bands && run->bands <= bands - run->band &&
+           run->model >= 0 && run->model < models && run->last >= 0 && run->last < MOST_PASSES && run->first >= -1 &&
+           run->first < MOST_PASSES && (costs == 0 || run->first < costs) && run->start >= 0 && run->length >= 0 &&
+           run->start <= data && run->length <= data - run->start;
+}
+
+/* Where the walk stands: the run, and in it passes that are done, band, block, state of the trellis. */
+struct position {
+    int64_t run, passes, band, block;
+    int trellis;
+};
+
+enum { AT_RUN, AT_PASSES, AT_BAND, AT_BLOCK, AT_TRELLIS, AT_LOW, AT_WIDTH, AT_PLACE, AT_END };
+
+_Static_assert(AT_END == LODE_PASSES_STATE && sizeof(struct run) == sizeof(int64_t) * LODE_RUN_FIELDS,
+               "as lodestream.h has them");
+
+/* Go on with a run until it is done or the budget is spent; whether it is done. */
+static bool code_run(bool reads, bool trellis, struct coder *coder, const struct tiles *tiles, const int64_t *bands,
+                     const struct run *run, struct position *at, double *costs, int64_t *budget) {
+    for (; at->passes <= run->first - run->last; at->passes++, at->band = 0) {
+        int64_t number = run->first - at->passes;
+        int plane = (int)(number >> 1);
+        enum pass pass = number & 1 ? FIRST : trellis && plane == 0 ? LOWEST : SECOND;
+        bool skipped = trellis && number == 1;
+        for (; at->band < run->bands && !skipped; at->band++, at->block = 0, at->trellis = 0) {
+            struct band band = band_of(bands + (run->band + at->band) * BAND_FIELDS);
+            at->block = BLOCKS_OF[reads][pass](coder, tiles, &band, at->block, plane, &at->trellis, budget);
+            if (at->block < (band.rows + BLOCK - 1) / BLOCK * band.across)
+                return false;
+        }
+        if (costs)
+            costs[number] = 8.0 * (double)coder->place + 32.0 - log2_of((double)coder->width);
+    }
+    return true;
+}
+
+/* The coder of a run: a new one, or as it was kept. */
+static bool go_on(bool reads, const struct run *run, const struct position *at, const int64_t *state, uint8_t *data,
+                  struct coder *coder) {
+    *coder = coder_start(reads, data + run->start, run->length);
+    if (!(at->passes || at->band || at->block))
+        return true;
+    coder->low = (uint64_t)state[AT_LOW];
+    coder->width = (uint32_t)state[AT_WIDTH];
+    coder->place = state[AT_PLACE];
+    return at->passes >= 0 && at->band >= 0 && at->block >= 0 && (uint64_t)state[AT_WIDTH] <= WIDEST &&
+           coder_can_go_on(reads, coder, 0, 0);
+}
+
+int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
+                    int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
+                    uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count, const int32_t *truth,
+                    int64_t truth_count, int32_t *models, int64_t models_count, uint8_t *data, int64_t data_count,
+                    double *costs, int64_t costs_count, int64_t *state, int64_t state_count, int64_t budget) {
+    int64_t model = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL, all = runs_count / LODE_RUN_FIELDS;
+    if (bands_count % BAND_FIELDS || runs_count % LODE_RUN_FIELDS || sign_count != known_count ||
+        early_count != known_count || (!reads && truth_count != known_count) || models_count % model ||
+        state_count != LODE_PASSES_STATE || state[AT_RUN] < 0 || state[AT_RUN] > all || budget < 1)
+        return LODE_REFUSED;
+    for (int64_t number = state[AT_RUN]; number < all; number++) {
+        struct run run = run_of(runs + number * LODE_RUN_FIELDS);
+        if (!run_fits(&run, bands_count / BAND_FIELDS, models_count / model, data_count, costs_count))
+            return LODE_REFUSED;
+        for (int64_t band = run.band; band < run.band + run.bands; band++)
+            if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
+                return LODE_REFUSED;
+    }
+    struct position at = {state[AT_RUN], state[AT_PASSES], state[AT_BAND], state[AT_BLOCK],
+                          (int)(state[AT_TRELLIS] & (TRELLIS_STATES - 1))};
+    for (; at.run < all && budget > 0; at = (struct position){at.run + 1, 0, 0, 0, 0}) {
+        int64_t *fields = runs + at.run * LODE_RUN_FIELDS;
+        struct run run = run_of(fields);
+        struct tiles tiles = {(uint32_t *)known, sign, flags, early, truth, models + run.model * model};
+        struct coder coder;
+        if (!go_on(reads, &run, &at, state, data, &coder))
+            return LODE_REFUSED;
+        if (!code_run(reads, trellis, &coder, &tiles, bands, &run, &at, costs_count ? costs : 0, &budget)) {
+            state[AT_LOW] = (int64_t)coder.low;
+            state[AT_WIDTH] = coder.width;
+            state[AT_PLACE] = coder.place;
+            break;
+        }
+        if (!reads)
+            fields[LODE_RUN_LENGTH] = coder_finish(&coder);
+        if (fields[LODE_RUN_LENGTH] < 0)
+            return LODE_REFUSED;
+    }
+    state[AT_RUN] = at.run;
+    state[AT_PASSES] = at.passes;
+    state[AT_BAND] = at.band;
+    state[AT_BLOCK] = at.block;
+    state[AT_TRELLIS] = at.trellis;
+    return at.run;
+}
+
+int64_t lode_new_models(int64_t trellis, int32_t *models, int64_t models_count) {
+    int64_t size = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL;
+    if (models_count % size)
+        return LODE_REFUSED;
+    for (int64_t i = 0; i < models_count; i++) {
+        int64_t slot = i % size;
+        bool weight = (slot >= WEIGHTS && slot < TRELLIS_ACROSS) || slot >= TRELLIS_WEIGHTS;
+        models[i] = weight ? FIRST_WEIGHT : UNKNOWN_CONTEXT;
+    }
+    return 0;
+}

@@ -1,0 +1,175 @@
+/* Coefficients from what is known of their bits, for the inverse transform (docs/format.md, section 8, and 8.1 for
+ * indices of a quantiser).
+ *
+ * When n passes of a tile remain, the planes below p = (n + 1) >> 1 are unknown; if n is odd, the first pass of plane
+ * p - 1 is known. Unknown bits of a significant coefficient are replaced by a point below the middle of what they may
+ * be.
+ */
+#include <stdbool.h>
+
+#include "band_fields.h"
+#include "lodestream.h"
+#include "trellis.h"
+
+#define LODE_INLINE static inline __attribute__((always_inline))
+
+enum {
+    BLOCK = 8,
+    FRACTION_BITS = 3,
+    LARGEST = 1 << 28, /* magnitude of a coefficient */
+    WIDEST_STEP = 1 << 26,
+    WINDOW_FIELDS = 3, /* tile, first row, first column */
+};
+
+/* How the magnitudes of a band become coefficients when some passes remain. Products stay below 2^31: what would lead
+ * beyond the largest coefficient is cut off before it is multiplied. */
+struct rule {
+    int32_t mask;  /* of the bits that are known of a magnitude */
+    int32_t most;  /* the largest known part that matters */
+    int32_t step;  /* of the quantiser */
+    int32_t above; /* added to the known part, if it is not 0, times the step */
+    bool half;     /* the first pass of one plane more is known: */
+    uint8_t mark;  /* coefficients coded there have this mark, */
+    int begun;     /* are significant if bits from this plane on are not 0, */
+    int32_t found; /* and then have this magnitude */
+    int32_t limit; /* for magnitudes, before they are multiplied by the unit */
+    int32_t unit;
+};
+
+/* Some rows of a band, where they are known and where they go. */
+struct places {
+    const int32_t *magnitudes;
+    const int8_t *signs;
+    const uint8_t *early;
+    int64_t stride;
+    int32_t *out;
+    int64_t pitch;
+    int64_t rows, columns;
+};
+
+LODE_INLINE int32_t plus(int32_t a, int32_t b) {
+    return (int32_t)((uint32_t)a + (uint32_t)b);
+}
+
+LODE_INLINE int32_t times(int32_t a, int32_t b) {
+    return (int32_t)((uint32_t)a * (uint32_t)b);
+}
+
+LODE_INLINE int32_t least(int32_t a, int32_t b) {
+    return a < b ? a : b;
+}
+
+/* A magnitude from its index in sixteenths. */
+static int32_t from_sixteenths(int64_t sixteenths, int64_t step) {
+    int64_t magnitude = sixteenths * step >> 4;
+    return magnitude < LARGEST ? (int32_t)magnitude : LARGEST;
+}
+
+/* Bits that are unknown are replaced so that a magnitude lies below the middle of what is possible; `step` 0 is that of
+ * no quantiser. */
+static struct rule rule_of(int remaining, int64_t step, bool finer) {
+    int begun = remaining >> 1, plane = begun + (remaining & 1);
+    int64_t unknown = INT64_C(1) << plane, unit = INT64_C(1) << begun;
+    struct rule rule = {
+        .mask = (int32_t)-unknown,
+        .most = step == 0 ? LARGEST : LARGEST / (int32_t)step + 2,
+        .step = step == 0 ? 1 : (int32_t)step,
+        .half = plane != begun,
+        .mark = (uint8_t)(begun + 1),
+        .begun = begun,
+        .limit = finer ? LARGEST >> FRACTION_BITS : LARGEST,
+        .unit = finer ? 1 << FRACTION_BITS : 1,
+    };
+    if (step == 0) {
+        rule.above = (int32_t)(7 * unknown >> 4);
+        rule.found = (int32_t)(unit + (7 * unit >> 4));
+    } else if (remaining > 0) {
+        rule.above = from_sixteenths(7 * (unknown - 1) - 4, step);
+        rule.found = from_sixteenths(16 * unit + 7 * (unit - 1) - 4, step);
+    }
+    return rule;
+}
+
+LODE_INLINE void spread_row(const int32_t *restrict magnitudes, const int8_t *restrict signs,
+                            const uint8_t *restrict early, int32_t *restrict out, int64_t count, struct rule rule,
+                            bool half, bool stepped) {
+    for (int64_t j = 0; j < count; j++) {
+        int32_t magnitude = magnitudes[j], high = magnitude & rule.mask;
+        int32_t above = plus(stepped ? times(least(high, rule.most), rule.step) : high, rule.above);
+        int32_t below = half && early[j] == rule.mark ? magnitude >> rule.begun : 0; /* 1 or 0 where high is 0 */
+        int32_t value = least(high != 0 ? above : -below & rule.found, rule.limit);
+        out[j] = times(times(signs[j], value), rule.unit);
+    }
+}
+
+static void spread_band(struct places at, struct rule rule) {
+    for (int64_t i = 0; i < at.rows; i++) {
+        if (rule.half && rule.step > 1)
+            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, true, true);
+        else if (rule.half)
+            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, true, false);
+        else if (rule.step > 1)
+            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, false, true);
+        else
+            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, false, false);
+        at.magnitudes += at.stride, at.signs += at.stride, at.early += at.stride, at.out += at.pitch;
+    }
+}
+
+/* A band of indices that are known: the trellis follows them in raster order of blocks, as they were coded. */
+static void spread_trellis(struct places at, struct rule rule) {
+    int32_t less = (rule.step + 1) / 2;
+    unsigned state = 0;
+    for (int64_t top = 0; top < at.rows; top += BLOCK)
+        for (int64_t left = 0; left < at.columns; left += BLOCK)
+            for (int64_t i = top; i < top + BLOCK && i < at.rows; i++)
+                for (int64_t j = left; j < left + BLOCK && j < at.columns; j++) {
+                    int32_t magnitude = at.magnitudes[i * at.stride + j];
+                    int32_t value = plus(times(least(magnitude, rule.most), rule.step), -less * ODD[state]);
+                    value = least(magnitude != 0 ? value : 0, rule.limit);
+                    at.out[i * at.pitch + j] = times(times(at.signs[i * at.stride + j], value), rule.unit);
+                    state = TRANSITIONS[state][magnitude & 1];
+                }
+}
+
+static void clear(struct places at) {
+    for (int64_t i = 0; i < at.rows; i++)
+        for (int64_t j = 0; j < at.columns; j++)
+            at.out[i * at.pitch + j] = 0;
+}
+
+int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
+                    const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
+                    const int64_t *windows, int64_t windows_count, const int64_t *steps, int64_t steps_count,
+                    const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
+                    int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch, int64_t first_row,
+                    int64_t first_column) {
+    if (sign_count != known_count || early_count != known_count || bands_count != steps_count * BAND_FIELDS ||
+        windows_count != steps_count * WINDOW_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
+        first_column < 0)
+        return LODE_REFUSED;
+    for (int64_t i = 0; i < numbers_count; i++) {
+        if (numbers[i] < 0 || numbers[i] >= steps_count)
+            return LODE_REFUSED;
+        const int64_t *band = bands + numbers[i] * BAND_FIELDS, *window = windows + numbers[i] * WINDOW_FIELDS;
+        int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = window[0];
+        int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
+        if (window[1] < first_row || window[2] < first_column || height < 0 || width < 0 || height > INT32_MAX ||
+            stride < width || stride > INT32_MAX || offset < 0 || offset > known_count - width ||
+            (height - 1) * stride > known_count - width - offset || tile < 0 || tile >= state_count ||
+            state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
+            return LODE_REFUSED;
+        int64_t top = window[1] - first_row, left = window[2] - first_column;
+        if (top > rows - height || left > columns - width)
+            return LODE_REFUSED;
+        struct places at = {known + offset,           sign + offset, early + offset, stride,
+                            out + top * pitch + left, pitch,         height,         width};
+        if (state[tile] >= LODE_UNANNOUNCED)
+            clear(at);
+        else if (step > 0 && state[tile] == 0)
+            spread_trellis(at, rule_of(0, step, tile >= finer));
+        else
+            spread_band(at, rule_of(state[tile], step, tile >= finer));
+    }
+    return 0;
+}

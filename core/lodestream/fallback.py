@@ -1,0 +1,89 @@
+"""Decoding where the compiled kernels are missing: `lodestream.reference` in their place, slow and right everywhere."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import reference
+from .container.headers import serialize_header
+from .container.model import Header
+from .container.sections import SIGNATURE
+from .errors import CorruptStreamError, StreamError
+from .library import why_missing
+from .reconstruction import Reconstruction, Values
+from .spreading import UNANNOUNCED
+from .target import Region
+
+__all__ = ["PlainReconstruction"]
+
+_log = logging.getLogger(__name__)
+
+
+@functools.cache
+def _say_so() -> None:
+    _log.warning(
+        "Lodestream decodes in plain Python, about a hundred times slower than with its kernels: %s", why_missing()
+    )
+
+
+class PlainReconstruction(Reconstruction):
+    """A `Reconstruction` by the reference.
+
+    It is given what the decoder has read and checked: the header, and segments one after another. Windows are cut out
+    of the whole surface.
+    """
+
+    def __init__(self, header: Header) -> None:
+        super().__init__(header)
+        section = reference.read_section(serialize_header(header), len(SIGNATURE))
+        self._decoder = reference.Decoder(reference.read_header(section.payload))
+
+    def _whole(
+        self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
+    ) -> list[Values]:
+        header, channels = self.header, []
+        with self._lock:
+            self._decode(length)
+            remaining = np.where(state == UNANNOUNCED, -1, state).ravel().tolist()
+            for number in range(header.channels):
+                wanted = chosen is None or chosen[number]
+                channels.append(self._decoder.channel(number, level, remaining) if wanted else None)
+        assert channels[0] is not None  # of the points, which are wanted in any case
+        blocks = []
+        for block, first in enumerate(channels[0]):
+            arrays, channel = [], 0
+            for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
+                array = np.zeros((*first.shape, count), header.dtypes[channel])
+                for component in range(count):
+                    if (made := channels[channel]) is not None:
+                        array[..., component] = made[block]
+                    channel += 1
+                arrays.append(array)
+            blocks.append(Values(arrays))
+        return blocks
+
+    def _part(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
+        rows, columns = (slice(*span) for span in region)
+        whole = self._whole(length, state, self.header.levels, chosen)[0]
+        return Values([np.ascontiguousarray(array[rows, columns]) for array in whole.arrays])
+
+    def _restored(self, known: NDArray[Any], piece: bytes, offset: int) -> NDArray[Any]:
+        try:
+            return reference.restore(piece, known)
+        except StreamError as error:
+            raise CorruptStreamError(str(error), offset) from None
+
+    def _decode(self, length: int) -> None:
+        _say_so()
+        for segment in self._queue[: length - self._taken]:
+            number = segment.tile * self.header.channels + segment.channel
+            begins = self._decoder.units[number].remaining < 0
+            top = segment.first // 2 + 1 if begins else None
+            self._decoder.take([reference.Segment(number, segment.passes, top, segment.data)])
+        del self._queue[: length - self._taken]
+        self._taken = max(self._taken, length)

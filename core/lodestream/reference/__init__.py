@@ -1,0 +1,30 @@
+"""A decoder in plain Python and numpy, written from docs/format.md alone: the page as a program.
+
+Slow, and correct on every machine. It shares nothing with the rest of the package but the classes of errors, so that
+tests can hold the compiled decoder to it; where that cannot be loaded, it decodes in its place, see
+`lodestream.fallback`. Sections of the page and modules: 1 `fields`; 2, 6 and 9 to 12 `container`; 3 to 3.2 `header`;
+3.3 and 7.5 `masks`; 4 `levels`; 5 `tiles`; 7.1 and 7.2 `range_coder`; 7.3 and 7.4 `passes`; 8 `coefficients`,
+`lifting`, `reconstruction` and `decoder`; 9.1 and 9.2 `exactness`; 9.3 `offsets`.
+"""
+
+from .container import Container, Index, Segment, read_container, read_index, read_section
+from .decoder import Decoder, Shown, decode
+from .exactness import restore
+from .header import Header, read_header
+from .masks import decode_mask
+
+__all__ = [
+    "Container",
+    "Decoder",
+    "Header",
+    "Index",
+    "Segment",
+    "Shown",
+    "decode",
+    "decode_mask",
+    "read_container",
+    "read_header",
+    "read_index",
+    "read_section",
+    "restore",
+]

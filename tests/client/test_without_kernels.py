@@ -1,0 +1,127 @@
+"""Lodestream as it is where its compiled kernels cannot be loaded: a copy of the package without them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.library import library_name
+from lodestream_client import sync
+
+from .conftest import Run
+
+ROOT = Path(__file__).parents[2]
+GOLDEN = ROOT / "tests" / "golden"
+
+SLOW = "Lodestream decodes in plain Python"
+
+
+class Bare:
+    """Runs programs with that copy."""
+
+    def __init__(self, folder: Path) -> None:
+        package = folder / "lodestream"
+        shutil.copytree(ROOT / "core" / "lodestream", package, ignore=shutil.ignore_patterns("native", "__pycache__"))
+        paths = [str(folder), *(str(ROOT / name) for name in ("server", "client"))]
+        self._environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "100"}
+
+    def run(self, *arguments: object) -> subprocess.CompletedProcess[str]:
+        """Python, with these arguments."""
+        command = [sys.executable, *map(str, arguments)]
+        return subprocess.run(command, env=self._environment, capture_output=True, text=True, timeout=200, check=False)
+
+    def done(self, *arguments: object) -> str:
+        """What a command that ends well says to standard error."""
+        done = self.run("-m", "lodestream_client", *arguments)
+        assert done.returncode == 0, done.stderr
+        return done.stderr
+
+    def refused(self, *arguments: object) -> str:
+        """What a command that does not says, which names what is missing and a way out."""
+        done = self.run("-m", "lodestream_client", *arguments)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert library_name() in done.stderr
+        assert "install the package again" in done.stderr
+        assert done.stderr.count("\n") == 1
+        return done.stderr
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Bare:
+    return Bare(tmp_path_factory.mktemp("bare"))
+
+
+@pytest.mark.parametrize("name", ["holes-float32.npy", "cube-sphere-even.obj", "sphere-closed.vts"])
+def test_decode_writes_what_it_writes_with_them_and_says_once_that_it_is_slow(
+    bare: Bare, run: Run, tmp_path: Path, name: str
+) -> None:
+    container, out, wanted = GOLDEN / Path(name).with_suffix(".lode"), tmp_path / name, tmp_path / f"wanted-{name}"
+    told = bare.done("decode", container, out)
+    assert told.count(SLOW) == told.count(library_name()) == 1
+    assert run("decode", container, wanted)[0] == 0
+    assert out.read_bytes() == wanted.read_bytes()
+
+
+def test_decode_takes_every_limit(bare: Bare, run: Run, container_file: Path, tmp_path: Path) -> None:
+    for limit in (("--level", "3"), ("--roi", "5:40,7:30"), ("--until-rms", "9"), ("--max-bytes", "3000")):
+        found, wanted = tmp_path / "found.npy", tmp_path / "wanted.npy"
+        bare.done("decode", container_file, found, *limit)
+        assert run("decode", container_file, wanted, *limit)[0] == 0
+        assert found.read_bytes() == wanted.read_bytes()
+
+
+def test_what_decodes_nothing_says_nothing(bare: Bare, container_file: Path) -> None:
+    assert bare.done("info", container_file) == ""
+    code = "import numpy, lodestream.paper; lodestream.coarsen(numpy.ones((9, 9)))"
+    assert bare.run("-W", "error", "-c", code).stderr == ""
+
+
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_pull_ends_with_the_surface(
+    bare: Bare, surface: str, terrain: NDArray[np.float32], tmp_path: Path, transport: str
+) -> None:
+    out = tmp_path / "out.npy"
+    told = bare.done("pull", surface, out, "--transport", transport)
+    assert told.count(SLOW) == 1
+    assert np.array_equal(np.load(out), terrain)
+    bare.done("pull", surface, out, "--until-rms", "5", "--transport", transport)
+    assert 0 < np.sqrt(np.mean((np.load(out) - terrain) ** 2)) <= 5
+
+
+def test_encode_is_refused_before_the_file_is_opened(bare: Bare, tmp_path: Path) -> None:
+    assert "encoding is not possible here" in bare.refused("encode", tmp_path / "nowhere.npy", tmp_path / "out.lode")
+
+
+def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(
+    bare: Bare, server: str, terrain_file: Path, tmp_path: Path
+) -> None:
+    assert bare.done("push", terrain_file, server, "--name", "uploaded without kernels") == ""
+    code = f"import numpy; from lodestream_client import sync; sync.upload({server!r}, numpy.ones((9, 9)))"
+    told = bare.run("-c", code).stderr
+    assert "UnavailableError: encoding is not possible here" in told
+    assert [each.details["name"] for each in sync.list(server)].count("uploaded without kernels") == 1
+
+
+def test_a_server_does_not_start(bare: Bare, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    assert "serving surfaces is not possible here" in bare.refused("serve", "--data", data, "--port", "0")
+    assert not data.exists()
+    assert "serving surfaces is not possible here" in bare.refused("demo", "--out", tmp_path / "demo")
+    (data / "records").mkdir(parents=True)
+    for change in ("--repair", "--adopt", "--retry"):
+        bare.refused("fsck", data, change)
+    assert [path.name for path in data.rglob("*")] == ["records"]
+
+
+def test_the_copy_has_no_kernels_and_this_package_has(bare: Bare) -> None:
+    code = "from lodestream.library import why_missing; print(why_missing())"
+    assert library_name() in bare.run("-c", code).stdout
+    assert ls.encode(np.ones((9, 9)))

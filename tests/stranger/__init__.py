@@ -1,1 +1,0 @@
-"""A decoder of containers written from docs/format.md alone: plain Python, clarity over speed."""
