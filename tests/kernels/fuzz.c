@@ -130,15 +130,31 @@ static void write_fault(void) {
     close(to);
 }
 
-static void say(const char *text) {
-    if (write(2, text, strlen(text)) < 0)
-        _exit(3);
+/* The case in a line: integers, reals, and the shapes of arrays. */
+static void say_case(void) {
+    fprintf(stderr, "%s(", kernel->name);
+    for (int i = 0; i < kernel->arguments; i++) {
+        const struct value *value = &current->values[i];
+        const char *comma = i ? ", " : "";
+        if (kernel->declared[i].kind == INTEGER)
+            fprintf(stderr, "%s%lld", comma, (long long)value->integer);
+        else if (kernel->declared[i].kind == REAL)
+            fprintf(stderr, "%s%g", comma, value->real);
+        else if (kernel->declared[i].kind == PLANE)
+            fprintf(stderr, "%s[%lld x %lld of %lld]", comma, (long long)value->rows, (long long)value->columns,
+                    (long long)value->pitch);
+        else
+            fprintf(stderr, "%s[%lld]", comma, (long long)value->count);
+    }
+    fprintf(stderr, ")\n");
 }
 
 static void on_fault(int signal_number) {
     (void)signal_number;
-    if (current)
+    if (current) {
+        say_case();
         write_fault();
+    }
     _exit(1);
 }
 
@@ -149,7 +165,7 @@ static void on_tick(int signal_number) {
     ticks = last_case == case_count ? ticks + 1 : 0;
     last_case = case_count;
     if (ticks >= TICKS && current) {
-        say("a case takes longer than two seconds\n");
+        fprintf(stderr, "a case takes longer than two seconds\n");
         on_fault(signal_number);
     }
 }
