@@ -117,7 +117,7 @@ def _poles_and_pairs(
     """Which umbrellas are poles; a half-edge on the diagonal of each pair of triangles; choices in words."""
     corners, twins = polygons.corners, polygons.twins
     piece = np.empty(len(corners), np.int32)
-    pieces = find_pieces(corners, twins, piece)
+    pieces = find_pieces(twins, piece)
     check_pieces(pieces, len(corners))
     triangle = corners[:, 3] < 0
     has_triangles = np.bincount(piece[triangle], minlength=pieces) > 0
