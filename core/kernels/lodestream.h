@@ -108,11 +108,11 @@ LODE_API int64_t lode_mesh_rows(const int32_t *corners, int64_t corners_count, c
 /* Number faces by the connected piece that they belong to, in the order of the pieces' first faces.
  *
  * piece: one for each face, -1 at first.
- * stack: as many.
- * state: three numbers, the last of which is that of pieces.
+ * queue: as many.
+ * state: four numbers, the last of which is that of pieces.
  */
 LODE_API int64_t lode_mesh_pieces(const int32_t *twins, int64_t twins_count, int32_t *piece, int64_t piece_count,
-                                  int32_t *stack, int64_t stack_count, int64_t *state, int64_t state_count,
+                                  int32_t *queue, int64_t queue_count, int64_t *state, int64_t state_count,
                                   int64_t steps);
 
 /* Find the faces to turn round so that all of a piece go round alike: the fewer of the two possible sets.
@@ -130,7 +130,7 @@ LODE_API int64_t lode_mesh_orient(const int32_t *corners, int64_t corners_count,
  *
  * umbrella: -1 at first.
  * valence:  of any length; as many as corners suffice.
- * state:    five numbers, the second of which is that of umbrellas.
+ * state:    six numbers, the second of which is that of umbrellas.
  */
 LODE_API int64_t lode_mesh_umbrellas(const int32_t *corners, int64_t corners_count, const int32_t *twins,
                                      int64_t twins_count, int32_t *umbrella, int64_t umbrella_count, int32_t *valence,

@@ -125,43 +125,47 @@ int64_t lode_mesh_rows(const int32_t *corners, int64_t corners_count, const int3
 
 /* Pieces ---------------------------------------------------------------------------------------------------------- */
 
-int64_t lode_mesh_pieces(const int32_t *twins, int64_t twins_count, int32_t *piece, int64_t piece_count, int32_t *stack,
-                         int64_t stack_count, int64_t *state, int64_t state_count, int64_t steps) {
-    if (!is_faces(twins_count) || piece_count != twins_count / 4 || stack_count != piece_count || state_count != 3)
+int64_t lode_mesh_pieces(const int32_t *twins, int64_t twins_count, int32_t *piece, int64_t piece_count, int32_t *queue,
+                         int64_t queue_count, int64_t *state, int64_t state_count, int64_t steps) {
+    if (!is_faces(twins_count) || piece_count != twins_count / 4 || queue_count != piece_count || state_count != 4)
         return LODE_REFUSED;
-    int64_t seed = state[0], top = state[1], count = state[2];
-    if (seed < 0 || !within(top, stack_count + 1) || !within(count, piece_count + 1) || (top && !count))
+    int64_t seed = state[0], place = state[1], end = state[2], count = state[3];
+    if (seed < 0 || place < 0 || end < place || end > piece_count || !within(count, piece_count + 1) ||
+        (place < end && !count))
         return LODE_REFUSED;
     for (; steps > 0; steps--) {
-        if (top == 0) {
+        if (place == end) {
             while (seed < piece_count && piece[seed] >= 0)
                 seed++;
             if (seed >= piece_count)
                 break;
+            if (end == queue_count)
+                return LODE_REFUSED;
             piece[seed] = (int32_t)count++;
-            stack[top++] = (int32_t)seed;
+            queue[end++] = (int32_t)seed;
         }
-        int64_t face = stack[--top];
+        int64_t face = queue[place++];
         if (!within(face, piece_count))
             return LODE_REFUSED;
         for (int64_t half = 4 * face; half < 4 * face + 4; half++) {
-            int32_t twin = twins[half];
+            int32_t twin = twins[half], other = twin >> 2;
             if (twin < 0)
                 continue;
-            if (twin >= twins_count)
+            if (other >= piece_count)
                 return LODE_REFUSED;
-            int32_t other = twin >> 2;
-            if (piece[other] < 0) {
-                if (top == stack_count)
-                    return LODE_REFUSED;
-                piece[other] = (int32_t)(count - 1);
-                stack[top++] = other;
-            }
+            if (piece[other] >= 0)
+                continue;
+            if (end == queue_count)
+                return LODE_REFUSED;
+            piece[other] = (int32_t)(count - 1);
+            queue[end++] = other;
+            fetch(&twins[4 * (int64_t)other]);
         }
     }
     state[0] = seed;
-    state[1] = top;
-    state[2] = count;
+    state[1] = place;
+    state[2] = end;
+    state[3] = count;
     return steps > 0;
 }
 
@@ -181,6 +185,8 @@ static inline int orient_face(const struct mesh *mesh, int64_t face, uint8_t *tu
                 return -1;
             turned[other] = side;
             queue[(*end)++] = (int32_t)other;
+            fetch(&mesh->twins[twin]);
+            fetch(&mesh->corners[twin]);
         } else if (turned[other] != side) {
             return 0;
         }
@@ -240,50 +246,50 @@ int64_t lode_mesh_orient(const int32_t *corners, int64_t corners_count, const in
 int64_t lode_mesh_umbrellas(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
                             int32_t *umbrella, int64_t umbrella_count, int32_t *valence, int64_t valence_count,
                             int64_t *state, int64_t state_count, int64_t steps) {
-    if (!is_mesh(corners_count, twins_count) || umbrella_count != twins_count || state_count != 5)
+    const int64_t ahead = 16; /* corners further on that are soon begun with */
+    if (!is_mesh(corners_count, twins_count) || umbrella_count != twins_count || state_count != 6)
         return LODE_REFUSED;
-    /* From the seed on to the faces before it, round to the seed or to a border; from there the other way. */
-    int64_t seed = state[0], count = state[1], half = state[2], faces = state[3], back = state[4];
-    if (!within(seed, twins_count + 1) || !within(count, valence_count + 1) || faces < 0 || faces > twins_count)
+    int64_t seed = state[0], count = state[1], half = state[2], faces = state[3], back = state[4], total = state[5];
+    if (seed < 0 || count < 0 || faces < 0 || total < faces || (faces && seed >= twins_count))
         return LODE_REFUSED;
     for (; steps > 0; steps--) {
         if (faces == 0) {
             while (seed < twins_count && (umbrella[seed] >= 0 || corners[seed] < 0))
                 seed++;
-            if (seed == twins_count)
+            if (seed >= twins_count)
                 break;
             half = seed;
             back = 0;
-        }
-        if (!is_half_edge(corners, twins_count, half) || umbrella[half] >= 0 || count == valence_count)
-            return LODE_REFUSED;
-        umbrella[half] = (int32_t)count;
-        faces++;
-        int64_t next = back ? -1 : twins[previous_half_edge(corners, half)];
-        if (next == seed) {
-            valence[count++] = (int32_t)faces;
-            faces = 0;
-            continue;
-        }
-        if (next < 0) {
-            next = twins[back ? half : seed];
-            if (next < 0) {
-                valence[count++] = (int32_t)-faces;
-                faces = 0;
-                continue;
+            int64_t beside = seed + ahead < twins_count ? twins[seed + ahead] : -1;
+            if (within(beside, twins_count)) {
+                fetch(&corners[beside]);
+                fetch(&twins[beside]);
             }
-            if (!is_half_edge(corners, twins_count, next))
-                return LODE_REFUSED;
-            next = next_half_edge(corners, next);
+        }
+        if (!within(half, twins_count) || total >= twins_count || count >= valence_count)
+            return LODE_REFUSED;
+        /* From the seed to the faces before it, round to the seed or to a border; from there the other way. */
+        if (back)
+            half = next_half_edge(corners, half);
+        umbrella[half] = (int32_t)count;
+        half = back ? twins[half] : twin_before(corners, twins, half);
+        if (half < 0 && !back) {
+            half = twins[seed];
             back = 1;
         }
-        half = next;
+        faces++;
+        total++;
+        if (half < 0 || half == seed) {
+            valence[count++] = (int32_t)(back ? -faces : faces);
+            faces = 0;
+        }
     }
     state[0] = seed;
     state[1] = count;
     state[2] = half;
     state[3] = faces;
     state[4] = back;
+    state[5] = total;
     return steps > 0;
 }
 
@@ -392,7 +398,7 @@ int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, const int
         int fits = taking ? take_triangle(&fan, half, first) : look_at_triangle(&fan, half, first, last);
         if (fits < 0)
             return LODE_REFUSED;
-        half = twins[previous_half_edge(corners, half)];
+        half = twin_before(corners, twins, half);
         turn++;
         if (fits && turn < faces)
             continue;
@@ -443,7 +449,7 @@ int64_t lode_mesh_unfold(const int32_t *corners, int64_t corners_count, const in
         if (!within(start, twins_count) || !is_half_edge(corners, twins_count, half) || !is_triangle(corners, half) ||
             count == pole_of_count)
             return LODE_REFUSED;
-        int64_t face = half >> 2, tip = half & 3, following = twins[previous_half_edge(corners, half)];
+        int64_t face = half >> 2, tip = half & 3, following = twin_before(corners, twins, half);
         bool closed = twins[start] >= 0, last = following < 0 || following == start;
         if (following >= twins_count || (following < 0 && closed) || (following >= 0 && (following & 3) == 3))
             return LODE_REFUSED;

@@ -56,4 +56,17 @@ static inline int64_t previous_half_edge(const int32_t *corners, int64_t half) {
     return half + (is_triangle(corners, half) ? 2 : 3);
 }
 
+/* The twin of the half-edge before this one. In the first place it is that of one of two, both of which are read before
+ * it is known which, as it takes long where faces lie far apart. */
+static inline int32_t twin_before(const int32_t *corners, const int32_t *twins, int64_t half) {
+    bool first = (half & 3) == 0;
+    int32_t of_triangle = twins[first ? half + 2 : half - 1], of_quad = twins[first ? half + 3 : half - 1];
+    return is_triangle(corners, half) ? of_triangle : of_quad;
+}
+
+/* Have what is soon read brought nearer. */
+static inline void fetch(const int32_t *place) {
+    __builtin_prefetch(place);
+}
+
 #endif

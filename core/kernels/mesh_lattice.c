@@ -70,6 +70,7 @@ static inline bool place_face(struct development *laid, int64_t face, int64_t nu
         first[0] = (int32_t)x;
         first[1] = (int32_t)y;
         laid->stack[laid->top++] = (int32_t)face;
+        fetch(&laid->twins[4 * face]);
     } else if (laid->heading[face] != heading) {
         laid->turns[number] = 1;
     } else if (first[0] != x || first[1] != y) {

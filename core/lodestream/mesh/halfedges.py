@@ -65,9 +65,9 @@ def find_pieces(twins: NDArray[np.int32], piece: NDArray[np.int32]) -> int:
     Fills `piece`, int32 of shape (F,), and gives the number of pieces.
     """
     piece[:] = -1
-    state = np.zeros(3, np.int64)
+    state = np.zeros(4, np.int64)
     walk(kernels.mesh_pieces, twins, piece, np.empty_like(piece), state)
-    return int(state[2])
+    return int(state[3])
 
 
 def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertices: int) -> NDArray[np.int64]:
@@ -141,6 +141,6 @@ def find_umbrellas(
         How many there are.
     """
     umbrella[:] = -1
-    state = np.zeros(5, np.int64)
+    state = np.zeros(6, np.int64)
     walk(kernels.mesh_umbrellas, corners, twins, umbrella, valence, state)
     return int(state[1])
