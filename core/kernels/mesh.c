@@ -392,7 +392,7 @@ int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, const int
         }
         if (turn == 0)
             half = leaving[vertex];
-        if (!is_half_edge(corners, twins_count, half) || turn >= faces)
+        if (!is_half_edge(corners, twins_count, half) || turn >= faces || faces > twins_count)
             return LODE_REFUSED;
         bool first = open && turn == 0, last = open && turn == faces - 1;
         int fits = taking ? take_triangle(&fan, half, first) : look_at_triangle(&fan, half, first, last);

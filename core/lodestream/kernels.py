@@ -163,10 +163,10 @@ mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), wr
 
 # mesh.c
 _MESH = [reads(_I32), reads(_I32)]
-_WALK = [writes(_I64), INTEGER]
+_WALK: list[_Argument] = [writes(_I64), INTEGER]
 mesh_count_edges = Kernel("mesh_count_edges", reads(_I32), writes(_I32))
 mesh_sort_edges = Kernel("mesh_sort_edges", reads(_I32), INTEGER, INTEGER, writes(_I32), writes(_I32))
-mesh_match_edges = Kernel("mesh_match_edges", *[reads(_I32)] * 2, *[writes(_I32)] * 2, writes(_I64))
+mesh_match_edges = Kernel("mesh_match_edges", reads(_I32), reads(_I32), writes(_I32), writes(_I32), writes(_I64))
 mesh_tear = Kernel("mesh_tear", reads(_I32), INTEGER, INTEGER, writes(_I32), writes(_I64))
 mesh_rows = Kernel("mesh_rows", reads(_I32), reads(_I32), writes(_I32))
 mesh_pieces = Kernel("mesh_pieces", reads(_I32), writes(_I32), writes(_I32), *_WALK)
@@ -178,17 +178,9 @@ mesh_unfold = Kernel("mesh_unfold", *_MESH, reads(_I32), reads(_U8), reads(_I32)
 
 # mesh_lattice.c
 _LAID_OUT = [reads(_I32), reads(_I8)]
-mesh_develop = Kernel(
-    "mesh_develop",
-    *(INTEGER, reads(_I32), writes(_I32), writes(_I32), writes(_I8), writes(_U8), writes(_I64), writes(_I32)),
-    *_WALK,
-)
+mesh_develop = Kernel("mesh_develop", INTEGER, reads(_I32), *map(writes, (_I32, _I32, _I8, _U8, _I64, _I32)), *_WALK)
 mesh_survey = Kernel(
-    "mesh_survey",
-    *(*_MESH, reads_plane(_F64), reads(_I32), *_LAID_OUT, writes(_I64), writes(_I64), writes(_U8), writes(_F64)),
+    "mesh_survey", *_MESH, reads_plane(_F64), reads(_I32), *_LAID_OUT, *map(writes, (_I64, _I64, _U8, _F64))
 )
 mesh_bounds = Kernel("mesh_bounds", reads(_I64), *_LAID_OUT, writes(_I64))
-mesh_fill = Kernel(
-    "mesh_fill",
-    *(reads(_I64), *_LAID_OUT, reads(_I32), *[INTEGER] * 4, writes_plane(_I32), writes_plane(_I32)),
-)
+mesh_fill = Kernel("mesh_fill", reads(_I64), *_LAID_OUT, reads(_I32), *[INTEGER] * 4, *[writes_plane(_I32)] * 2)

@@ -159,5 +159,5 @@ def _start(lines: NDArray[np.int32]) -> int:
     begin[gaps] -= (before >= 0).argmax(axis=1)
     votes = np.bincount(begin % length, minlength=length + 1) - np.bincount(place + 1, minlength=length + 1)
     votes[0] += np.count_nonzero(begin < 0)
-    total = np.cumsum(votes[:length])
-    return length - 1 - int(total[::-1].argmax())
+    total = np.cumsum(votes[:length])[::-1]
+    return int(length - 1 - total.argmax())

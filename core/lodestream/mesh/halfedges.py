@@ -50,7 +50,6 @@ def find_twins(corners: Corners, vertices: int) -> tuple[NDArray[np.int32], int,
     order = np.empty(start[-1], np.int32)
     for part in parts(len(corners)):
         kernels.mesh_sort_edges(corners, part.start, part.stop, start[:-1], order)
-    del start
     # Half-edges of one vertex meet at the other one, whose number is higher.
     met = np.full((vertices, 2), -1, np.int32)
     twins = np.full(4 * len(corners), -1, np.int32)

@@ -9,7 +9,7 @@ from .. import kernels
 from .halfedges import Corners
 from .walks import walk
 
-__all__ = ["find_fans", "find_poles", "unfold"]
+__all__ = ["find_fans", "find_poles", "leaving_half_edges", "unfold"]
 
 #: Fewer triangles round an inner vertex would share two edges each.
 _MIN_FAN = 3
@@ -45,6 +45,18 @@ def find_fans(
     return pole, misfits
 
 
+def leaving_half_edges(
+    twins: NDArray[np.int32], umbrella: NDArray[np.int32], valence: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open."""
+    halves = np.flatnonzero(umbrella >= 0).astype(np.int32)
+    leaving = np.empty(len(valence), np.int32)
+    leaving[umbrella[halves]] = halves
+    borders = halves[twins[halves] < 0]
+    leaving[umbrella[borders]] = borders
+    return leaving
+
+
 def find_poles(
     corners: Corners,
     twins: NDArray[np.int32],
@@ -65,7 +77,7 @@ def find_poles(
     corners, twins, umbrella, valence
         See `find_umbrellas`.
     corner_of : int32 array of shape (U,)
-        A half-edge that leaves each umbrella; with no face before it where the umbrella is open.
+        See `leaving_half_edges`.
     order : int32 array
         The umbrellas that may be poles.
     together : bool

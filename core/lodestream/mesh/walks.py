@@ -10,7 +10,7 @@ from ..kernels import Kernel
 __all__ = ["parts", "walk"]
 
 #: Faces or steps of one call: some hundredths of a second where memory is read at random.
-_AT_ONCE = 1 << 17
+_AT_ONCE = 1 << 16
 
 
 def parts(count: int) -> Iterator[slice]:
