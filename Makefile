@@ -5,9 +5,6 @@ PEERS := .venv-peers
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Compiled kernels are kept beside the environment, under a name that changes with the sources: numba itself looks only
-# at the file of a kernel, not at the files of the kernels that it calls.
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/*.py core/lodestream/*/*.py 2>/dev/null | cksum | cut -d ' ' -f 1)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
@@ -22,7 +19,6 @@ demo: kernels ## stream a million points over a slow link, stop early, and show 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Three
 # of pytest's share two processors, since some of the tests wait for a clock.
 test: kernels ## run the tests; ARGS="-k name" for some of them
-	@$(BIN)/python -m tests.warming # compile once, not in every process at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 3 --dist loadfile $(ARGS)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
