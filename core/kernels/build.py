@@ -24,7 +24,7 @@ except ImportError:  # run by hand, where hatchling need not be
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 try:
-    from lodestream.library import KERNELS, NATIVE, fingerprint, library_name
+    from lodestream.library import KERNELS, NATIVE, fingerprint, library_name, wide_name
 finally:
     del sys.path[0]
 
@@ -39,6 +39,8 @@ FLAGS = [
 
 #: The processor that x86-64-v2 names, in words that compilers knew before that name.
 _X86_64_V2 = ["-msse4.2", "-mpopcnt", "-mcx16", "-msahf"]
+#: And what x86-64-v3 has beyond it, for the second library.
+_X86_64_V3 = ["-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovbe"]
 
 #: The machines for which one wheel serves every Linux.
 PORTABLE = ("x86_64", "aarch64")
@@ -58,7 +60,7 @@ def zig() -> list[str]:
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
-def machine_flags(command: list[str], machine: str | None = None) -> list[str]:
+def machine_flags(command: list[str], machine: str | None = None, *, v3: bool = False) -> list[str]:
     """What a compiler is told of the machine: the least processor that is served, and to leave out what none needs.
 
     Parameters
@@ -67,14 +69,16 @@ def machine_flags(command: list[str], machine: str | None = None) -> list[str]:
         The compiler. zig takes the processor that it runs on and links a libc unless it is told not to.
     machine : str or None
         One of `PORTABLE`, for Linux; None: this one.
+    v3 : bool
+        For x86-64-v3.
     """
     wide = (machine or platform.machine()) in ("x86_64", "AMD64")
     strip = ["-s"] if machine or sys.platform == "linux" else []
     if not _is_zig(command):
-        return (_X86_64_V2 if wide else []) + strip
+        return (_X86_64_V2 if wide else []) + (_X86_64_V3 if v3 else []) + strip
     target = ["-target", f"{machine}-linux-gnu.2.17"] if machine else []
     alone = ["-nostdlib", "-rtlib=compiler-rt"] if machine or sys.platform == "linux" else []
-    return [*target, "-mcpu=x86_64_v2" if wide else "-mcpu=baseline", *alone, *strip]
+    return [*target, f"-mcpu=x86_64_v{3 if v3 else 2}" if wide else "-mcpu=baseline", *alone, *strip]
 
 
 def _run(command: list[str], flags: list[str], files: list[Path], target: Path) -> str:
@@ -150,6 +154,36 @@ def compile_library(target: Path, command: list[str] | None = None, flags: list[
         raise RuntimeError(f"the kernels of Lodestream could not be compiled: {wrong}")
 
 
+def compile_all(folder: Path, command: list[str] | None = None, machine: str | None = None) -> list[Path]:
+    """Compile the library into a folder, and on x86-64 the second one, for v3.
+
+    Parameters
+    ----------
+    folder : Path
+    command : list of str or None
+        The compiler; None: `compiler`.
+    machine : str or None
+        One of `PORTABLE`, for Linux; None: this one.
+
+    Raises
+    ------
+    RuntimeError
+        As `compile_library`.
+    """
+    command = command or compiler()
+    made = libraries(folder, machine)
+    for number, target in enumerate(made):
+        compile_library(target, command, machine_flags(command, machine, v3=number > 0))
+    return made
+
+
+def libraries(folder: Path, machine: str | None = None) -> list[Path]:
+    """Where the libraries of a machine stand in a folder: of this one, or of one of `PORTABLE`, for Linux."""
+    system = "linux" if machine else sys.platform
+    names = library_name(system, machine), wide_name(system, machine)
+    return [folder / name for name in names if name]
+
+
 def is_current(target: Path) -> bool:
     """Whether a library was made from these sources."""
     return target.exists() and str(fingerprint()).encode() in target.read_bytes()
@@ -183,10 +217,10 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
         self._folder = tempfile.TemporaryDirectory()
         try:
             if version == "editable":
-                compile_library(NATIVE / library_name())
+                compile_all(NATIVE)
             else:
-                made = _compile_for_wheel(Path(self._folder.name), machine)
-                build_data["force_include"][str(made)] = f"lodestream/native/{made.name}"
+                for made in _compile_for_wheel(Path(self._folder.name), machine):
+                    build_data["force_include"][str(made)] = f"lodestream/native/{made.name}"
         except (RuntimeError, OSError) as error:
             self._folder.cleanup()
             raise SystemExit(str(error)) from None
@@ -199,16 +233,12 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
             self._folder.cleanup()
 
 
-def _compile_for_wheel(folder: Path, machine: str | None) -> Path:
+def _compile_for_wheel(folder: Path, machine: str | None) -> list[Path]:
     if machine is None:
-        target = folder / library_name()
-        compile_library(target)
-    elif machine in PORTABLE:
-        target = folder / library_name("linux", machine)
-        compile_library(target, zig(), machine_flags(zig(), machine))
-    else:
+        return compile_all(folder)
+    if machine not in PORTABLE:
         raise RuntimeError(f"expected LODESTREAM_WHEEL_FOR to be one of {', '.join(PORTABLE)}, got {machine}")
-    return target
+    return compile_all(folder, zig(), machine)
 
 
 def _portable_tag(machine: str) -> str:
@@ -225,14 +255,13 @@ def _platform_tag() -> str:
 
 def main() -> None:
     """Compile into the working tree unless that was done."""
-    target = NATIVE / library_name()
-    if is_current(target):
+    if all(map(is_current, libraries(NATIVE))):
         return
     try:
-        compile_library(target)
+        made = compile_all(NATIVE)
     except (RuntimeError, OSError) as error:
         raise SystemExit(str(error)) from None
-    print(f"compiled {os.path.relpath(target)}")
+    print(f"compiled {', '.join(map(os.path.relpath, made))}")
 
 
 if __name__ == "__main__":

@@ -28,6 +28,9 @@
 /* The hash of the sources that the library was compiled from, 16 hexadecimal digits and a zero. */
 LODE_API const char *lode_sources(void);
 
+/* 1 where the processor and the system run what is compiled for x86-64-v3 (AVX2), else 0. */
+LODE_API int64_t lode_runs_v3(void);
+
 /* lifting.c ------------------------------------------------------------------------------------------------------ */
 
 #define LODE_LIFT_STRIP 64

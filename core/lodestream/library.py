@@ -13,7 +13,7 @@ from pathlib import Path
 
 from .errors import UnavailableError
 
-__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "require", "why_missing"]
+__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "require", "why_missing", "wide_name"]
 
 #: Where the library stands, and where its sources stand in a working tree.
 NATIVE = Path(__file__).with_name("native")
@@ -26,6 +26,15 @@ def library_name(system: str = sys.platform, machine: str | None = None) -> str:
     """What the library of a platform is called; of this one, unless another is named."""
     suffix = {"darwin": "dylib", "win32": "dll"}.get(system, "so")
     return f"lodestream-{system}-{(machine or platform.machine()).lower()}.{suffix}"
+
+
+def wide_name(system: str = sys.platform, machine: str | None = None) -> str | None:
+    """What the library is called that is compiled for x86-64-v3; None where there is none.
+
+    The loops of transforms and values take 1.3 to 2 times as long without its wider registers.
+    """
+    name = (machine or platform.machine()).lower()
+    return library_name(system, f"{name}-v3") if name in ("x86_64", "amd64") else None
 
 
 def fingerprint() -> str | None:
@@ -42,7 +51,16 @@ def fingerprint() -> str | None:
 
 @cache
 def _load() -> ctypes.CDLL | str:
-    path, wanted = NATIVE / library_name(), fingerprint()
+    loaded = _load_from(NATIVE / library_name())
+    wide = wide_name()
+    if not isinstance(loaded, str) and wide and loaded.lode_runs_v3() and (NATIVE / wide).exists():
+        wider = _load_from(NATIVE / wide)
+        return loaded if isinstance(wider, str) else wider
+    return loaded
+
+
+def _load_from(path: Path) -> ctypes.CDLL | str:
+    wanted = fingerprint()
     remedy = _COMPILE if wanted else _REMEDY
     if not path.exists():
         others = sorted(other.name for other in NATIVE.glob("lodestream-*"))

@@ -164,18 +164,19 @@ def test_a_wheel_gets_its_library_from_outside_the_sources(monkeypatch: pytest.M
     data: dict[str, Any] = {"force_include": {}}
     building = hook()
     building.initialize("standard", data)
-    ((made, place),) = data["force_include"].items()
-    assert place == f"lodestream/native/{library.library_name()}"
-    assert Path(made).stat().st_size == 4000
+    names = [name for name in (library.library_name(), library.wide_name()) if name]
+    assert list(data["force_include"].values()) == [f"lodestream/native/{name}" for name in names]
+    made = list(data["force_include"])
+    assert {Path(path).stat().st_size for path in made} == {4000}
     assert data["tag"].startswith("py3-none-")
     assert not data["tag"].endswith("-any")
     assert not data["pure_python"]
     building.finalize("standard", data, "")
-    assert not Path(made).exists()
+    assert not any(Path(path).exists() for path in made)
     assert not build.NATIVE.exists()
     building.initialize("editable", data)
     building.finalize("editable", data, "")
-    assert [path.name for path in build.NATIVE.iterdir()] == [library.library_name()]
+    assert sorted(path.name for path in build.NATIVE.iterdir()) == sorted(names)
 
 
 def test_an_installation_that_fails_ends_without_a_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -268,7 +269,24 @@ def test_kernels_include_nothing_that_a_compiler_alone_does_not_have() -> None:
     text = "".join(path.read_text() for path in KERNELS.glob("*.[ch]"))
     included = set(re.findall(r"#include <(.*)>", text))
     assert "stdint.h" in included
-    assert included <= {"float.h", "limits.h", "stdbool.h", "stddef.h", "stdint.h"}
+    assert included <= {"cpuid.h", "float.h", "limits.h", "stdbool.h", "stddef.h", "stdint.h"}
+
+
+@pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
+def test_the_library_for_wider_registers_is_loaded_where_they_are_there() -> None:
+    words = Path("/proc/cpuinfo").read_text().split()
+    there = {"avx2", "bmi1", "bmi2", "fma", "f16c", "movbe", "abm"} <= set(words)
+    assert library.library().lode_runs_v3() == there
+    wanted = library.wide_name() if there else library.library_name()
+    assert Path(library.library()._name).name == wanted
+
+
+@pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
+def test_a_second_library_that_cannot_be_loaded_is_done_without(native: Path) -> None:
+    (native / library.library_name()).write_bytes(OURS)
+    (native / str(library.wide_name())).write_bytes(b"no library")
+    assert library.why_missing() is None
+    assert Path(library.library()._name).name == library.library_name()
 
 
 def test_tables_are_those_of_their_program() -> None:
