@@ -5,13 +5,10 @@ PEERS := .venv-peers
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Compiled kernels are kept beside the environment, under a name that changes with the sources: numba itself looks only
-# at the file of a kernel, not at the files of the kernels that it calls.
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/kernels/$(shell cat core/lodestream/*.py core/lodestream/*/*.py 2>/dev/null | cksum | cut -d ' ' -f 1)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels test test-lowest torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -22,11 +19,16 @@ demo: kernels ## stream a million points over a slow link, stop early, and show 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Three
 # of pytest's share two processors, since some of the tests wait for a clock.
 test: kernels ## run the tests; ARGS="-k name" for some of them
-	@$(BIN)/python -m tests.warming # compile once, not in every process at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 3 --dist loadfile $(ARGS)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
+
+sanitize: kernels ## run tests of the kernels under sanitizers, count their lines, call each with anything; ARGS="--seconds 600"
+	@$(BIN)/python -m tests.kernels.sanitize $(ARGS)
+
+portable: kernels ## compare the kernels' bits from gcc, clang and zig, and on imitated machines, with whatever is there
+	@$(BIN)/python -m tests.kernels.portable --zig $(ARGS)
 
 torture: kernels ## what takes too long for every run, into docs/reliability.md; ARGS="--seconds 300" or "kills fuzz"
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --group torture || true
@@ -36,14 +38,25 @@ torture: kernels ## what takes too long for every run, into docs/reliability.md;
 kernels: $(STAMP)
 	@$(BIN)/python core/kernels/build.py
 
-lint: $(STAMP) ## ruff, mypy --strict, and which package may import which
+C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
+CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
+C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
+
+lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and gcc's warnings where it is
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
+	$(CLANG_FORMAT) --dry-run -Werror $(C) || status=1; \
+	if command -v gcc > /dev/null; then \
+		for file in $(filter %.c,$(C)); do gcc $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
+	else \
+		echo "lint: there is no gcc, so nobody has seen its warnings"; \
+	fi; \
 	exit $$status
 
-format: $(STAMP) ## let ruff lay out the code and sort its imports
+format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C
 	@$(BIN)/ruff check --quiet --select I --fix
 	@$(BIN)/ruff format --quiet
+	@$(CLANG_FORMAT) -i $(C)
 
 bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
 	@$(BIN)/python -m benchmarks $(ARGS)
@@ -58,7 +71,7 @@ bench-stream: kernels ## what comes after a stop, and times to the first and to 
 	@$(BIN)/python -m benchmarks.stream
 
 wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
-	@$(BIN)/python -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
+	@$(BIN)/python -P -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@$(BIN)/python .ci/wheels.py dist
 
 clean: ## remove the environment and everything else that can be made again

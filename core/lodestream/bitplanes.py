@@ -32,7 +32,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import kernels
-from .numba_kernels import inlined
 
 __all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point"]
 
@@ -127,7 +126,6 @@ def pass_gains(
     return errors
 
 
-@inlined
 def reconstruction_point(plane: int) -> int:
     """What is added to a significant magnitude whose bits below ``plane`` are unknown."""
     return (7 << plane) >> 4

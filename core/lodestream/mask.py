@@ -1,8 +1,8 @@
 """The mask of a surface with holes, without loss: each point in the context of those before it.
 
-Points are coded in raster order, each by the mean of two models in the logistic domain (`binary_coder`): one that sees
-the ten nearest points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that
-surrounds a group of sixteen points in a row is equal, one bit says whether they are equal to that too.
+Points are coded in raster order, each by the mean of two models in the logistic domain: one that sees the ten nearest
+points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that surrounds a group of
+sixteen points in a row is equal, one bit says whether they are equal to that too.
 """
 
 from __future__ import annotations

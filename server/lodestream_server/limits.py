@@ -126,8 +126,8 @@ class Limits:
             )
         if own >= most - there:
             raise TooManyError(
-                f"expected one address to leave as many connections without a token to others as it has, got {own}, "
-                f"with {most - there} of {most} left"
+                f"expected no more connections without a token of one address than are left for others, got {own}, "
+                f"and {most - there} of {most} are left"
             )
         self._openings[client] += 1
         try:
@@ -268,8 +268,8 @@ class Limits:
             raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
         if own >= most - everybody and not self._alone():
             raise TooManyError(
-                f"expected {caller.name} to leave as many {what} to others as they have, got {own}, with "
-                f"{most - everybody} of {most} left; try again when some are done"
+                f"expected no more {what} of {caller.name} than are left for others, got {own}, and {most - everybody} "
+                f"of {most} are left; try again when some are done"
             )
 
     def _check_surfaces(self) -> None:

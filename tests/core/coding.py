@@ -1,20 +1,15 @@
 """Coefficients through the embedded coder and back, by the package's own two ends of it.
 
-What stands between the tests and the coder's insides: these two functions and `uncompiled` are all that knows them.
+What stands between the tests and the coder's insides: these two functions are all that knows them.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-import lodestream
 from lodestream.bitplanes import pass_count
 from lodestream.container import Header
 from lodestream.lattice import Lattice
@@ -24,7 +19,7 @@ from lodestream.reconstruction import Coded, Reconstruction
 from lodestream.tile_coder import Channel, TileCoder
 from lodestream.tiles import TileTable, gather
 
-__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "shapes_of", "uncompiled"]
+__all__ = ["Runs", "decode_runs", "encode_runs", "header_for", "passes_of", "planes_of", "shapes_of"]
 
 Ints = NDArray[np.int32]
 #: (tile, channel, first pass, passes), in coding order.
@@ -109,12 +104,3 @@ def decode_runs(layout: Layout, channels: int, coded: Iterable[Coded], state: li
             tiles.spread(tile, state[tile][channel], [coefficients])
         decoded.append(coefficients)
     return decoded
-
-
-def uncompiled(script: str) -> str:
-    """What a script prints in an interpreter in which no kernel is compiled."""
-    core, root = Path(lodestream.__file__).parents[1], Path(__file__).parents[2]
-    paths = os.pathsep.join([str(core), str(root)])
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": paths}
-    command = [sys.executable, "-W", "error", "-c", script]
-    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True, timeout=200).stdout

@@ -3,9 +3,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from lodestream import binary_coder
 from lodestream.container import sections
 from lodestream.lifting import TAPS
+from lodestream.reference.range_coder import LOGISTIC
+
+from .test_library import tables
 
 TEXT = (Path(__file__).parents[2] / "docs" / "format.md").read_text()
 
@@ -17,7 +19,7 @@ def numbers_after(words: str, count: int) -> list[int]:
 
 
 def test_the_page_has_the_tables_of_the_code() -> None:
-    assert numbers_after("    L = ", 33) == binary_coder._LOGISTIC
+    assert numbers_after("    L = ", 33) == LOGISTIC == tables.LOGISTIC
     assert numbers_after("    h = ", len(TAPS)) == [int(tap) for tap in TAPS]
 
 

@@ -27,6 +27,10 @@ def test_lzf(content: bytes, made: bytes) -> None:
     for size in (len(made) - 1, len(made) + 1):
         with pytest.raises(FormatError, match="LZF data that make"):
             decompress(content, size)
+    for room in range(len(made)):
+        target, state = np.full(len(made), 77, np.uint8), np.zeros(2, np.int64)
+        assert kernels.lzf(np.frombuffer(content, np.uint8), target[:room], 1000, state) == 0
+        assert (target[room:] == 77).all()
     for cut in range(1, len(content)):
         with pytest.raises(FormatError, match="LZF data that make"):
             decompress(content[:cut], len(made))
@@ -65,27 +69,52 @@ REFERENCES = st.builds(
     ),
     st.integers(1, 7),
     st.integers(0, 255),
-    st.one_of(st.integers(0, 40), st.integers(0, 8191)),
+    st.one_of(st.integers(0, 31), st.integers(0, 31), st.integers(0, 8191)),
 )
 
 
-@given(
-    data=st.one_of(st.lists(st.one_of(LITERALS, REFERENCES), max_size=40).map(b"".join), st.binary(max_size=200)),
-    cut=st.integers(0, 3),
-    at_once=st.integers(0, 300),
-    more=st.integers(-1, 1),
+#: The first kind begin with bytes that can be referred to.
+CONTENTS = st.one_of(
+    st.lists(st.one_of(LITERALS, REFERENCES), max_size=40).map(
+        lambda runs: b"\x1f" + bytes(range(32)) + b"".join(runs)
+    ),
+    st.binary(max_size=200),
 )
+
+
+@given(data=CONTENTS, cut=st.integers(0, 3), at_once=st.integers(1, 300), more=st.integers(-1, 1))
 def test_lzf_makes_what_a_plain_loop_makes_in_any_runs(data: bytes, cut: int, at_once: int, more: int) -> None:
-    content = b"\x1f" + bytes(range(32)) + data[: len(data) - cut]
+    content = data[: len(data) - cut]
     expected = plain_lzf(content)
     size = max(0, (100 if expected is None else len(expected)) + more)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lzf, "_AT_ONCE", max(at_once, 1))
+        patch.setattr(lzf, "_AT_ONCE", at_once)
         if expected is not None and len(expected) == size:
             assert decompress(content, size).tobytes() == expected
         else:
             with pytest.raises(FormatError, match="LZF data that make"):
                 decompress(content, size)
+
+
+@given(data=CONTENTS, more=st.integers(-3, 1))
+def test_lzf_writes_nowhere_else_and_knows_what_is_damaged(data: bytes, more: int) -> None:
+    expected = plain_lzf(data)
+    room = 60_000 if expected is None else max(0, len(expected) + more)
+    whole, state = np.full(room + 600, 77, np.uint8), np.zeros(2, np.int64)
+    target = whole[300 : 300 + room]
+    right = kernels.lzf(np.frombuffer(data, np.uint8), target, 1 << 20, state)
+    assert right == (expected is not None and len(expected) <= room)
+    if expected is not None and right:
+        assert state.tolist() == [len(data), len(expected)]
+        assert target[: len(expected)].tobytes() == expected
+    assert (whole[:300] == 77).all()
+    assert (whole[300 + room :] == 77).all()
+
+
+@pytest.mark.parametrize("content", [b"\x20\x00", b"\x00a\x20\x01", b"\x02abc\x21\x00", b"\x02abc\xe0\x00\x03"])
+def test_a_reference_to_before_the_first_byte_is_damage(content: bytes) -> None:
+    target, state = np.zeros(900, np.uint8), np.zeros(2, np.int64)
+    assert kernels.lzf(np.frombuffer(content, np.uint8), target, 1 << 20, state) == 0
 
 
 @pytest.mark.parametrize("state", [[-1, 0], [0, -1], [6, 0], [0, 5], [2**62, 2**62], [0], [0, 0, 0]])

@@ -67,11 +67,11 @@ def test_builds_of_one_caller_leave_some_to_the_others(tmp_path: Path) -> None:
         return limits(tmp_path, builds=builds, own=own, alone=alone, max_builds=10)
 
     asyncio.run(read(made(4, 4), request(b"x")))
-    with pytest.raises(TooManyError, match="builds to do of anna"):
+    with pytest.raises(TooManyError, match="pending builds of anna"):
         asyncio.run(read(made(5, 5), request(b"x")))
     asyncio.run(read(made(5, 5), request(b"x"), BERT))
     asyncio.run(read(made(9, 9, alone=True), request(b"x")))
-    with pytest.raises(BusyError, match="at most 10 builds to do on this server"):
+    with pytest.raises(BusyError, match="at most 10 pending builds on this server"):
         asyncio.run(read(made(10, 0), request(b"x")))
 
 

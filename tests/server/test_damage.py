@@ -99,5 +99,5 @@ def test_all_surfaces_of_a_container_are_named_or_counted(
         caplog.clear()
         monkeypatch.setattr(storage, "surfaces_of", lambda sha256, known=known: known)
         damage.tell(storage, "0" * 64, StreamError("expected another"))
-        assert f", the container of surface {words}: " in caplog.records[0].getMessage()
+        assert f", the container of surface {words}, is damaged: " in caplog.records[0].getMessage()
     storage.close()

@@ -139,7 +139,7 @@ def test_a_size_that_is_none_promises_nothing(tmp_path: Path, disk: dict[str, in
 
 
 def test_numbers_are_limits_too(tmp_path: Path) -> None:
-    with pytest.raises(BusyError, match="at most 3 builds"):
+    with pytest.raises(BusyError, match="at most 3 pending builds"):
         asyncio.run(read(limits(tmp_path, builds=3, max_builds=3), request(b"x")))
     with pytest.raises(FullError, match="at most 5 surfaces"):
         asyncio.run(read(limits(tmp_path, surfaces=5, max_surfaces=5), request(b"x")))
@@ -182,7 +182,7 @@ def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Pat
     with ExitStack() as held:
         for client in ("a", "a", "b"):
             held.enter_context(made.opening(client))
-        with pytest.raises(TooManyError, match="2 and 1 left of 4"), made.opening("a"):
+        with pytest.raises(TooManyError, match="got 2, and 1 of 4 are left"), made.opening("a"):
             pass
         held.enter_context(made.opening("c"))
         with pytest.raises(BusyError, match="at most 4"), made.opening("d"):

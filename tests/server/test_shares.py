@@ -160,7 +160,7 @@ def test_builds_of_one_caller_do_not_delay_those_of_another(town: Town, monkeypa
                 break
             theirs.append(answer.headers["location"])
         assert problem(answer) == (429, "too-many")
-        assert "builds to do of bad" in answer.json()["detail"]
+        assert "pending builds of bad" in answer.json()["detail"]
         assert len(theirs) == 20
         mine = good.post("/v1/surfaces", content=npy(hills())).headers["location"]
         monkeypatch.setattr(worker, "build", slow.listed)

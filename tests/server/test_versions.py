@@ -139,7 +139,7 @@ def test_one_without_its_upload_waits_and_says_why(tmp_path: Path) -> None:
     with running(data) as http:
         found = http.get(surface["url"]).json()
         assert found["state"] == "waiting"
-        assert_said(found, f"got version {sections.VERSION + 1}.*upload is not")
+        assert_said(found, f"got version {sections.VERSION + 1}.*upload is missing")
         assert http.post(f"{surface['url']}/retry").json()["state"] == "waiting"
         assert old.is_file()
         # Its file again makes it whole.

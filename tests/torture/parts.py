@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import sys
 import tempfile
 import threading
@@ -24,6 +25,9 @@ import tests.faults.run as faults
 from lodestream.container import read_index
 from lodestream.plan import plan
 from tests.faults.shim import CannotError
+from tests.kernels.compiling import sanitizing_compiler
+from tests.kernels.declared import declarations
+from tests.kernels.fuzzing import fuzz_all
 from tests.server.helpers import hills, npy, push
 from tests.server.programs import server
 
@@ -229,6 +233,14 @@ def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
     return min(item.cases for item in done), facts
 
 
+def _kernels(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    if sanitizing_compiler() is None:
+        return 0, ("skipped: there is neither a gcc nor a clang with sanitizers",)
+    found = fuzz_all(list(declarations()), math.inf if seconds is None else seconds, count, seed=time.time_ns() % 2**32)
+    assert not any(item.fault for item in found), "\n".join(str(item) for item in found if item.fault)
+    return min(item.cases for item in found), tuple(map(str, found))
+
+
 PARTS = {
     part.name: part
     for part in (
@@ -240,6 +252,7 @@ PARTS = {
         Part("history", "One history through disasters, every acknowledged state in order", "disasters", 200, _history),
         Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults),
         Part("fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz),
+        Part("kernels", "Any calls of the C kernels, under sanitizers", "cases of each", 1_000_000, _kernels),
     )
 }
 

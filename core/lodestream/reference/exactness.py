@@ -39,7 +39,7 @@ class _Line:
             raise StreamError(f"expected a rule of exactness for {dtype}, got rule {rule} with {t}")
 
     def _pattern(self, value: Any) -> int:
-        return int(value.view(f"<u{self.dtype.itemsize}"))
+        return int(value.view(f"u{self.dtype.itemsize}"))
 
     def place(self, value: Any) -> int:
         """Where a value is."""

@@ -77,7 +77,7 @@ class _Offsets:
 def with_offsets(fields: Fields, bits: int, values: NDArray[Any]) -> NDArray[Any]:
     """The values sought, from what follows the first byte of a piece, B, and what the layers gave, shape (value,)."""
     step = fields.f64()
-    if values.dtype != np.float32 or bits > MOST_BITS or not 0 < step < np.inf:
+    if values.dtype.str != "<f4" or bits > MOST_BITS or not 0 < step < np.inf:
         raise StreamError(f"expected float32, at most {MOST_BITS} bits and a step, got {values.dtype}, {bits}, {step}")
     offsets = _Offsets(fields.rest(), bits)
     patterns = []

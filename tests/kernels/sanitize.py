@@ -1,0 +1,109 @@
+"""``make sanitize``: the tests of kernels under AddressSanitizer and UndefinedBehaviorSanitizer, which of their lines
+the tests run, and each kernel called with anything for a while.
+
+Needs gcc or clang; where neither is, it says so and that is all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from lodestream.library import library_name
+
+from .compiling import BUILD, COVERAGE, KERNELS, ROOT, SANITIZERS, compiled, preloaded, sanitizing_compiler
+from .coverage import lines_run, told
+from .declared import declarations
+from .fuzzing import FAULTS, fuzz_all
+
+__all__ = ["TESTS", "main", "run_tests"]
+
+#: Tests that together run every line of the kernels, and decode the golden files at every layer, their prefixes, and
+#: files with a bit flipped.
+TESTS = ("tests/core/test_golden.py", "tests/core/test_mask.py")
+
+_SECONDS = 60.0
+
+
+def main() -> int:
+    """Do all of it; 1 where anything was found."""
+    parser = argparse.ArgumentParser(prog="python -m tests.kernels.sanitize", description=__doc__)
+    parser.add_argument(
+        "--seconds", type=float, default=_SECONDS, help=f"of fuzzing, all kernels (default: {_SECONDS:g})"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the fuzzer (default: 1)")
+    args = parser.parse_args()
+    compiler = sanitizing_compiler()
+    if compiler is None:
+        print("sanitize: skipped, there is neither a gcc nor a clang with sanitizers")
+        return 0
+    started = time.monotonic()
+    failed = _tests(compiler)
+    found = fuzz_all(list(declarations()), args.seconds, seed=args.seed)
+    print("\n".join(map(str, found)))
+    failed |= any(item.fault for item in found)
+    print(f"sanitize: {'FAILED' if failed else 'no fault'}, {time.monotonic() - started:.0f} s")
+    return int(failed)
+
+
+def run_tests(compiler: str, library: Path, arguments: Sequence[str], reports: Path) -> list[str]:
+    """Run tests with a library that was compiled with sanitizers.
+
+    Parameters
+    ----------
+    compiler : "gcc" or "clang"
+    library : Path
+    arguments : sequence of str
+        For pytest.
+    reports : Path
+        A folder for what the sanitizers say.
+
+    Returns
+    -------
+    list of str
+        What was wrong.
+    """
+    reports.mkdir(parents=True, exist_ok=True)
+    for old in reports.glob("report.*"):
+        old.unlink()
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": preloaded(compiler),
+        "ASAN_OPTIONS": f"detect_leaks=0:allocator_may_return_null=1:log_path={reports}/report",
+        "UBSAN_OPTIONS": f"print_stacktrace=1:log_path={reports}/report",
+        "PYTHONMALLOC": "malloc",  # else Python's own allocator lies between an array and what stands beside it
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.kernels.plugin", "--kernels", str(library)]
+    done = subprocess.run([*command, *arguments], env=environment, cwd=ROOT)
+    wrong = [f"pytest ended with {done.returncode}"] if done.returncode else []
+    said = (report.read_text(errors="replace").splitlines() for report in sorted(reports.glob("report.*")))
+    return [*wrong, *("\n".join(lines[:40]) for lines in said)]
+
+
+def _tests(compiler: str) -> bool:
+    """Run all of them; whether anything was wrong."""
+    counts = compiler == "gcc" and shutil.which("gcov") is not None
+    flags = [*SANITIZERS, *(COVERAGE if counts else ["-O1"])]
+    flags += ["-shared-libsan"] if compiler == "clang" else []
+    beside = ["write_coverage.c"] if counts else []
+    library = compiled(library_name(), [compiler], flags, beside, folder=BUILD / "sanitized")
+    for old in library.parent.glob("*.gcda"):
+        old.unlink()
+    wrong = run_tests(compiler, library, ["-n", "2", "--dist", "loadfile", *TESTS], FAULTS)
+    print("\n".join(wrong))
+    if counts:
+        print("\n".join(told(lines_run(library.parent, KERNELS))))
+    else:
+        print("lines of C run by the tests: skipped, there is no gcc with gcov")
+    return bool(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
