@@ -62,6 +62,7 @@ bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transfo
 	@$(BIN)/python -m benchmarks $(ARGS)
 
 bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other coders; ARGS="--only ours" or "--tables"
+	@$(PEERS)/bin/python core/kernels/build.py
 	@$(PEERS)/bin/python -m benchmarks.peers $(ARGS)
 
 bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
