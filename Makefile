@@ -62,6 +62,7 @@ bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transfo
 	@$(BIN)/python -m benchmarks $(ARGS)
 
 bench-peers: $(PEERS)/.installed ## compare bytes, speed and memory with other coders; ARGS="--only ours" or "--tables"
+	@$(PEERS)/bin/python core/kernels/build.py
 	@$(PEERS)/bin/python -m benchmarks.peers $(ARGS)
 
 bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS="--streams 100"
@@ -71,7 +72,7 @@ bench-stream: kernels ## what comes after a stop, and times to the first and to 
 	@$(BIN)/python -m benchmarks.stream
 
 wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
-	@$(BIN)/python -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
+	@$(BIN)/python -P -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@$(BIN)/python .ci/wheels.py dist
 
 clean: ## remove the environment and everything else that can be made again

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from .arrays import ROOT
 from .measure import note, table
@@ -127,13 +128,18 @@ def _print_times(folder: Path, programs: Path) -> None:
 
 
 def _print_server(folder: Path, programs: Path) -> None:
-    seconds = [_ready(folder, programs) for _ in range(STARTS)]
-    row = ["ready", f"{seconds[0]:.2f}", f"{statistics.median(seconds):.2f}", f"{MOST_SECONDS:.2f}"]
-    table("The server", ["", "first, s", "median, s", "at most"], [row])
-    note("From its start to the first answer 200 of /readyz, by the clock.")
+    runs = Runs()
+    for _ in range(STARTS):
+        clock, processor = _ready(folder, programs)
+        runs.clock.append(clock)
+        runs.processor.append(processor)
+    clocks = [f"{seconds:.2f}" for seconds in (runs.clock[0], statistics.median(runs.clock))]
+    head = ["", "first, s", "median, s", "of processors, s", "at most, s"]
+    table("The server", head, [["ready", *clocks, f"{runs.median:.2f}", f"{MOST_SECONDS:.2f}"]])
+    note("From its start to the first answer 200 of /readyz, with its fork server.")
 
 
-def _ready(folder: Path, programs: Path) -> float:
+def _ready(folder: Path, programs: Path) -> tuple[float, float]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -145,7 +151,10 @@ def _ready(folder: Path, programs: Path) -> float:
             while server.poll() is None and time.perf_counter() - started < PATIENCE:
                 with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz") as answer:
                     if answer.status == 200:
-                        return time.perf_counter() - started
+                        seconds = time.perf_counter() - started
+                        ours = psutil.Process(server.pid)
+                        times = [process.cpu_times() for process in (ours, *ours.children(recursive=True))]
+                        return seconds, sum(one.user + one.system for one in times)
                 time.sleep(0.02)
         finally:
             server.terminate()
