@@ -139,7 +139,7 @@ def test_statistics_of_other_values_are_not_written(tmp_path: Path) -> None:
         formats.write(other, tmp_path / "b.tif")
     assert [str(warning.message) for warning in caught] == [
         "GeoTIFF is written without STATISTICS_MAXIMUM, STATISTICS_MEAN, STATISTICS_MINIMUM of band 1, "
-        "which are of other values"
+        "which describe other values"
     ]
     assert told(tmp_path / "b.tif")["tags"][1][""] == {"METHOD": "lidar"}
 
