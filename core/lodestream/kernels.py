@@ -15,7 +15,25 @@ from numpy.typing import DTypeLike, NDArray
 
 from .library import library
 
-__all__ = ["MASK_MODEL", "mask"]
+__all__ = [
+    "MASK_MODEL",
+    "mask",
+    "mesh_bounds",
+    "mesh_count_edges",
+    "mesh_develop",
+    "mesh_fill",
+    "mesh_match_edges",
+    "mesh_orient",
+    "mesh_pieces",
+    "mesh_poles",
+    "mesh_rows",
+    "mesh_sort_edges",
+    "mesh_survey",
+    "mesh_tear",
+    "mesh_trace",
+    "mesh_umbrellas",
+    "mesh_unfold",
+]
 
 _REFUSED = -(2**63)
 
@@ -142,3 +160,27 @@ _I8, _U8, _I32, _I64, _F64 = np.int8, np.uint8, np.int32, np.int64, np.float64
 # mask.c
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
+
+# mesh.c
+_MESH = [reads(_I32), reads(_I32)]
+_WALK: list[_Argument] = [writes(_I64), INTEGER]
+mesh_count_edges = Kernel("mesh_count_edges", reads(_I32), writes(_I32))
+mesh_sort_edges = Kernel("mesh_sort_edges", reads(_I32), INTEGER, INTEGER, writes(_I32), writes(_I32))
+mesh_match_edges = Kernel("mesh_match_edges", reads(_I32), reads(_I32), writes(_I32), writes(_I32), writes(_I64))
+mesh_tear = Kernel("mesh_tear", reads(_I32), INTEGER, INTEGER, writes(_I32), writes(_I64))
+mesh_rows = Kernel("mesh_rows", reads(_I32), reads(_I32), writes(_I32))
+mesh_pieces = Kernel("mesh_pieces", reads(_I32), writes(_I32), writes(_I32), *_WALK)
+mesh_orient = Kernel("mesh_orient", *_MESH, writes(_U8), writes(_I32), *_WALK)
+mesh_umbrellas = Kernel("mesh_umbrellas", *_MESH, writes(_I32), writes(_I32), *_WALK)
+mesh_trace = Kernel("mesh_trace", *_MESH, *[reads(_I32)] * 2, INTEGER, writes(_U8), writes(_I32), writes(_U8), *_WALK)
+mesh_poles = Kernel("mesh_poles", *_MESH, *[reads(_I32)] * 4, INTEGER, writes(_U8), writes(_I32), *_WALK)
+mesh_unfold = Kernel("mesh_unfold", *_MESH, reads(_I32), reads(_U8), reads(_I32), INTEGER, *[writes(_I32)] * 3, *_WALK)
+
+# mesh_lattice.c
+_LAID_OUT = [reads(_I32), reads(_I8)]
+mesh_develop = Kernel("mesh_develop", INTEGER, reads(_I32), *map(writes, (_I32, _I32, _I8, _U8, _I64, _I32)), *_WALK)
+mesh_survey = Kernel(
+    "mesh_survey", *_MESH, reads_plane(_F64), reads(_I32), *_LAID_OUT, *map(writes, (_I64, _I64, _U8, _F64))
+)
+mesh_bounds = Kernel("mesh_bounds", reads(_I64), *_LAID_OUT, writes(_I64))
+mesh_fill = Kernel("mesh_fill", reads(_I64), *_LAID_OUT, reads(_I32), *[INTEGER] * 4, *[writes_plane(_I32)] * 2)

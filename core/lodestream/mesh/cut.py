@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import kernel
-from .halfedges import Corners, next_half_edge
+from .. import kernels
+from .halfedges import Corners
+from .walks import walk
 
 __all__ = ["irregular", "trace"]
 
@@ -20,7 +21,6 @@ def irregular(valence: NDArray[np.int32]) -> NDArray[np.bool_]:
     return wrong
 
 
-@kernel
 def trace(
     corners: Corners,
     twins: NDArray[np.int32],
@@ -42,26 +42,13 @@ def trace(
         A line ends at a border and at an irregular vertex. With False also where another line has passed (a motorcycle
         graph), so that there are fewer pieces, whose sides may border on several others.
     cut : bool array of shape (4 F,)
-        Filled with the half-edges along the lines.
+        False; filled with the half-edges along the lines.
     """
-    passed = np.zeros(valence.size, np.bool_)
-    for j in range(starts.size):
-        passed[umbrella[starts[j]]] = True
-    riders = starts.copy()
-    count = riders.size
-    while count > 0:
-        kept = 0
-        for j in range(count):
-            half = riders[j]
-            if cut[half]:
-                continue
-            cut[half] = True
-            cut[twins[half]] = True
-            ahead = next_half_edge(corners, half)
-            vertex = umbrella[ahead]
-            if valence[vertex] != 4 or (passed[vertex] and not whole):
-                continue
-            passed[vertex] = True
-            riders[kept] = next_half_edge(corners, twins[ahead])
-            kept += 1
-        count = kept
+    passed = np.zeros(valence.size, np.uint8)
+    passed[umbrella[starts]] = 1
+    state = np.array([0, 0, len(starts)])
+    walk(
+        kernels.mesh_trace,
+        *(corners, twins, umbrella, valence, whole, passed, starts.copy(), cut.view(np.uint8)),
+        state,
+    )

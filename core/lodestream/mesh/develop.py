@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import inlined, kernel
-from .halfedges import Corners
+from .. import kernels
+from .walks import walk
 
 __all__ = ["Development", "develop_quads", "develop_triangles"]
 
@@ -44,111 +44,29 @@ class Development:
     periods: NDArray[np.int64]
 
 
-@inlined
-def _add_period(periods: NDArray[np.int64], piece: int, x: int, y: int) -> None:
-    """Put a period into the triangular basis (a, b), (0, d)."""
-    a, b, d = periods[piece, 0], periods[piece, 1], periods[piece, 2]
-    while x != 0:
-        times = a // x
-        a, x = x, a - times * x
-        b, y = y, b - times * y
-    if a < 0:
-        a, b = -a, -b
-    d, y = abs(d), abs(y)
-    while y != 0:
-        d, y = y, d % y
-    if d != 0:
-        b %= d
-    periods[piece, 0], periods[piece, 1], periods[piece, 2] = a, b, d
+#: Pieces that there is room for at first, and what the kernel says when there are more.
+_PIECES, _NO_ROOM = 64, 2
 
 
-@kernel
-def _develop(
-    sides: int,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    twins: NDArray[np.int32],
-    piece: NDArray[np.int32],
-    first: NDArray[np.int32],
-    heading: NDArray[np.int8],
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Develop faces of so many sides, where turning at a corner goes on by ``len(rows) / sides`` directions."""
-    faces = piece.size
-    directions = rows.size
-    step = directions // sides
-    heading[:] = -1
-    stack = np.empty(faces, np.int32)
-    turns = np.zeros(64, np.bool_)
-    periods = np.zeros((64, 3), np.int64)
-    number = 0
-    for seed in range(faces):
-        if heading[seed] >= 0:
-            continue
-        if number == turns.size:
-            more_turns, more_periods = np.zeros(2 * number, np.bool_), np.zeros((2 * number, 3), np.int64)
-            more_turns[:number] = turns
-            more_periods[:number] = periods
-            turns, periods = more_turns, more_periods
-        heading[seed] = 0
-        piece[seed] = number
-        first[seed, 0] = 0
-        first[seed, 1] = 0
-        stack[0] = seed
-        top = 1
-        while top > 0:
-            top -= 1
-            face = stack[top]
-            x, y, way = first[face, 0], first[face, 1], heading[face]
-            for k in range(sides):
-                x += rows[way]
-                y += columns[way]
-                twin = twins[4 * face + k]
-                if twin >= 0:
-                    other, m = twin >> 2, twin & 3
-                    # The twin starts here, at corner m of the other face, and runs back.
-                    back = (way + directions // 2 - step * m) % directions
-                    u, v = x, y
-                    for j in range(m):
-                        u -= rows[(back + step * j) % directions]
-                        v -= columns[(back + step * j) % directions]
-                    if heading[other] < 0:
-                        heading[other] = back
-                        piece[other] = number
-                        first[other, 0] = u
-                        first[other, 1] = v
-                        stack[top] = other
-                        top += 1
-                    elif heading[other] != back:
-                        turns[number] = True
-                    elif first[other, 0] != u or first[other, 1] != v:
-                        _add_period(periods, number, u - first[other, 0], v - first[other, 1])
-                way = (way + step) % directions
-        number += 1
-    return turns[:number], periods[:number]
-
-
-_QUAD_ROWS = np.array([0, 1, 0, -1])
-_QUAD_COLUMNS = np.array([1, 0, -1, 0])
-_TRIANGLE_ROWS = np.array([1, 0, -1, -1, 0, 1])
-_TRIANGLE_COLUMNS = np.array([0, 1, 1, 0, -1, -1])
-
-
-def develop_quads(corners: Corners, twins: NDArray[np.int32]) -> Development:
+def develop_quads(twins: NDArray[np.int32]) -> Development:
     """Lay out quads that are wound alike. Where an inner vertex has not four quads, the piece `turns` or overlaps."""
-    return _laid_out(4, _QUAD_ROWS, _QUAD_COLUMNS, corners, twins)
+    return _laid_out(4, twins)
 
 
-def develop_triangles(corners: Corners, twins: NDArray[np.int32]) -> Development:
+def develop_triangles(twins: NDArray[np.int32]) -> Development:
     """Lay out triangles that are wound alike, on a lattice with three directions."""
-    return _laid_out(3, _TRIANGLE_ROWS, _TRIANGLE_COLUMNS, corners, twins)
+    return _laid_out(3, twins)
 
 
-def _laid_out(
-    sides: int, rows: NDArray[np.int64], columns: NDArray[np.int64], corners: Corners, twins: NDArray[np.int32]
-) -> Development:
-    faces = len(corners)
+def _laid_out(sides: int, twins: NDArray[np.int32]) -> Development:
+    faces = len(twins) // 4
     piece = np.empty(faces, np.int32)
     first = np.empty((faces, 2), np.int32)
-    heading = np.empty(faces, np.int8)
-    turns, periods = _develop(sides, rows, columns, twins, piece, first, heading)
-    return Development(piece, first, heading, turns, periods)
+    heading = np.full(faces, -1, np.int8)
+    turns, periods = np.zeros(_PIECES, np.bool_), np.zeros((_PIECES, 3), np.int64)
+    stack, state = np.empty(faces, np.int32), np.zeros(3, np.int64)
+    arrays = (piece, first, heading)
+    while walk(kernels.mesh_develop, sides, twins, *arrays, turns.view(np.uint8), periods, stack, state) == _NO_ROOM:
+        turns = np.concatenate([turns, np.zeros_like(turns)])
+        periods = np.concatenate([periods, np.zeros_like(periods)])
+    return Development(piece, first, heading, turns[: state[2]], periods[: state[2]])

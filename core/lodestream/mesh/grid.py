@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import kernel
+from .. import kernels
 from ..surface import Closed
 from .develop import Development
+from .walks import parts
 
 __all__ = ["Grid", "make_grid"]
 
@@ -41,72 +44,15 @@ class Grid:
     reversed: bool
 
 
-@kernel
-def _bounds(
-    faces: NDArray[np.int64],
-    first: NDArray[np.int32],
-    heading: NDArray[np.int8],
-    down: int,
-    across: int,
-) -> tuple[int, int, int, int]:
+def _bounds(faces: NDArray[np.int64], laid: Development, down: int, across: int) -> tuple[int, int, int, int]:
     """Lowest and highest row and column of the nodes, after the periods `down` and `across` (0: none)."""
-    top = left = 1 << 62
-    bottom = right = -top
-    for face in faces:
-        way = heading[face]
-        # The corners of a cell are its first and those one step away in its two directions.
-        r = int(first[face, 0]) - (way == 2 or way == 3)
-        c = int(first[face, 1]) - (way == 1 or way == 2)
-        top, left = min(top, r), min(left, c)
-        bottom, right = max(bottom, r + 1), max(right, c + 1)
-    if down > 0:
-        top, bottom = 0, down - 1
-    if across > 0:
-        left, right = 0, across - 1
-    return top, bottom, left, right
-
-
-@kernel
-def _fill(
-    faces: NDArray[np.int64],
-    first: NDArray[np.int32],
-    heading: NDArray[np.int8],
-    identity: NDArray[np.int32],
-    top: int,
-    left: int,
-    closed_rows: bool,
-    closed_columns: bool,
-    nodes: NDArray[np.int32],
-    cells: NDArray[np.int32],
-) -> int:
-    """Put faces and corners in their places; give the first face that lies on another or does not join it, or -1."""
-    height, width = nodes.shape
-    for face in faces:
-        way = np.int64(heading[face])
-        r = np.int64(first[face, 0]) - (way == 2 or way == 3) - top
-        c = np.int64(first[face, 1]) - (way == 1 or way == 2) - left
-        if closed_rows:
-            r %= height
-        if closed_columns:
-            c %= width
-        if cells[r, c] >= 0:
-            return int(face)
-        cells[r, c] = face
-        for k in range(4):
-            place = (way + k) % 4
-            i = r + (place >= 2)
-            j = c + (place == 1 or place == 2)
-            if closed_rows and i == height:
-                i = 0
-            if closed_columns and j == width:
-                j = 0
-            corner = 4 * face + k
-            other = nodes[i, j]
-            if other < 0:
-                nodes[i, j] = corner
-            elif identity[other] != identity[corner]:
-                return int(face)
-    return -1
+    bounds = np.tile([np.iinfo(np.int64).max, np.iinfo(np.int64).min], 2)
+    for part in parts(len(faces)):
+        kernels.mesh_bounds(faces[part], laid.first, laid.heading, bounds)
+    top, bottom, left, right = (int(bound) for bound in bounds)
+    rows = (0, down - 1) if down else (top, bottom + 1)
+    columns = (0, across - 1) if across else (left, right + 1)
+    return *rows, *columns
 
 
 def make_grid(
@@ -137,7 +83,7 @@ def make_grid(
     a, b, d = (int(value) for value in laid.periods[piece])
     if laid.turns[piece] or b or (a and a < _MIN_CLOSED) or (d and d < _MIN_CLOSED):
         return None
-    top, bottom, left, right = _bounds(faces, laid.first, laid.heading, a, d)
+    top, bottom, left, right = _bounds(faces, laid, a, d)
     height, width = bottom - top + 1, right - left + 1
     closed = (a > 0, d > 0)
     down, across = height - (not closed[0]), width - (not closed[1])
@@ -145,24 +91,41 @@ def make_grid(
         return None
     nodes = np.full((height, width), -1, np.int32)
     cells = np.full((down, across), -1, np.int32)
-    if _fill(faces, laid.first, laid.heading, identity, top, left, *closed, nodes, cells) >= 0:
-        return None
+    for part in parts(len(faces)):
+        run = faces[part]
+        if kernels.mesh_fill(run, laid.first, laid.heading, identity, top, left, *closed, nodes, cells) < len(run):
+            return None
     return _in_order(Grid(nodes, cells, closed, False), vertex)
+
+
+class _Turn(NamedTuple):
+    """A grid transposed, then reversed along some axes, then rolled by so many nodes along both."""
+
+    transposed: bool
+    flips: tuple[bool, bool]
+    shifts: tuple[int, int] = (0, 0)
+
+    def of(self, values: NDArray[np.int32]) -> NDArray[np.int32]:
+        turned = values.T if self.transposed else values
+        turned = turned[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
+        return np.roll(turned, self.shifts, (0, 1)) if any(self.shifts) else turned
 
 
 def _in_order(grid: Grid, vertex: NDArray[np.int32]) -> Grid:
     """Transpose, reverse and roll a grid so that its vertices come in the order of their numbers, as far as may be."""
-    best: tuple[NDArray[np.int32], Grid] | None = None
-    for transposed in (False, True):
-        for rows in (False, True):
-            for columns in (False, True):
-                turned = _rolled(_turned(grid, transposed, rows, columns), vertex)
-                order = turned.corners.reshape(-1)
-                order = vertex[order[order >= 0]]
-                if best is None or _precedes(order, best[0]):
-                    best = order, turned
+    numbers = np.where(grid.corners < 0, np.int32(-1), vertex[grid.corners])
+    best: tuple[NDArray[np.int32], _Turn] | None = None
+    for transposed, *flips in product((False, True), repeat=3):
+        turn = _Turn(transposed, (flips[0], flips[1]))
+        lines = turn.of(numbers)
+        rows, columns = grid.closed[::-1] if transposed else grid.closed
+        turn = turn._replace(shifts=(-_start(lines.T) if rows else 0, -_start(lines) if columns else 0))
+        order = turn.of(numbers)
+        order = order[order >= 0]
+        if best is None or _precedes(order, best[0]):
+            best = order, turn
     assert best is not None
-    return best[1]
+    return _turned(grid, best[1])
 
 
 def _precedes(order: NDArray[np.int32], other: NDArray[np.int32]) -> bool:
@@ -170,56 +133,31 @@ def _precedes(order: NDArray[np.int32], other: NDArray[np.int32]) -> bool:
     return bool(different.size and order[different[0]] < other[different[0]])
 
 
-def _turned(grid: Grid, transposed: bool, rows: bool, columns: bool) -> Grid:
-    corners, faces, closed = grid.corners, grid.faces, grid.closed
-    if transposed:
-        corners, faces, closed = corners.T, faces.T, (closed[1], closed[0])
-    for axis, flip in enumerate((rows, columns)):
-        if flip:
-            corners = np.flip(corners, axis)
-            faces = np.flip(faces, axis)
-            if closed[axis]:  # the cell behind the last node is now before the first
-                faces = np.roll(faces, -1, axis)
-    return Grid(corners, faces, closed, grid.reversed ^ transposed ^ rows ^ columns)
+def _turned(grid: Grid, turn: _Turn) -> Grid:
+    closed = grid.closed[::-1] if turn.transposed else grid.closed
+    # On a closed axis that is reversed, the cell behind the last node is now before the first.
+    rows, columns = (
+        shift - (wraps and flip) for shift, wraps, flip in zip(turn.shifts, closed, turn.flips, strict=True)
+    )
+    corners, faces = turn.of(grid.corners), turn._replace(shifts=(rows, columns)).of(grid.faces)
+    reverse = grid.reversed ^ turn.transposed ^ turn.flips[0] ^ turn.flips[1]
+    return Grid(np.ascontiguousarray(corners), np.ascontiguousarray(faces), closed, reverse)
 
 
-def _rolled(grid: Grid, vertex: NDArray[np.int32]) -> Grid:
-    corners, faces = grid.corners, grid.faces
-    for axis in (0, 1):
-        if grid.closed[axis]:
-            lines = corners if axis else corners.T
-            shift = -_start(np.ascontiguousarray(lines), vertex)
-            corners, faces = np.roll(corners, shift, axis), np.roll(faces, shift, axis)
-    return Grid(np.ascontiguousarray(corners), np.ascontiguousarray(faces), grid.closed, grid.reversed)
-
-
-@kernel
-def _start(lines: NDArray[np.int32], vertex: NDArray[np.int32]) -> int:
-    """Where most of the closed lines may begin so that the first of their vertices is the one of the lowest number."""
-    count, length = lines.shape
-    votes = np.zeros(length + 1, np.int64)
-    for line in range(count):
-        lowest, place, high = -1, -1, -1
-        for j in range(length):
-            if lines[line, j] >= 0:
-                number = vertex[lines[line, j]]
-                high = max(high, number)
-                if place < 0 or number < lowest:
-                    lowest, place = number, j
-        if high == lowest:
-            continue  # a pole, or nothing
-        begin = place
-        while lines[line, begin - 1] < 0:
-            begin -= 1
-        if begin < 0:
-            votes[begin + length] += 1
-            votes[length] -= 1
-            begin = 0
-        votes[begin] += 1
-        votes[place + 1] -= 1
-    best, most, total = 0, np.int64(-1), np.int64(0)
-    for j in range(length):
-        total += votes[j]
-        if total >= most:
-            best, most = j, total
-    return best
+def _start(lines: NDArray[np.int32]) -> int:
+    """Where most closed lines of numbers may begin so that the first of each is its lowest; -1 where there is none."""
+    length = lines.shape[1]
+    most = lines.max(axis=1)
+    lines = np.ascontiguousarray(lines)
+    place = lines.view(np.uint32).argmin(axis=1)
+    several = most > lines[np.arange(len(lines)), place]  # no pole, and not empty
+    lines, place = lines[several], place[several]
+    # A line may begin at its lowest number, or where there is none before that.
+    begin = place.copy()
+    gaps = np.flatnonzero(lines[np.arange(len(lines)), place - 1] < 0)
+    before = np.take_along_axis(lines[gaps], (place[gaps, None] - 1 - np.arange(length)) % length, axis=1)
+    begin[gaps] -= (before >= 0).argmax(axis=1)
+    # Votes for a place begin there and end behind it; those that go round at the end count as 1 less everywhere.
+    votes = np.bincount(begin % length, minlength=length + 1) - np.bincount(place + 1, minlength=length + 1)
+    total = np.cumsum(votes[:length])[::-1]
+    return int(length - 1 - total.argmax())

@@ -12,7 +12,7 @@ from ..errors import FormatError
 from .halfedges import Corners, find_pieces, find_twins, find_umbrellas
 from .limits import check_pieces
 from .model import Mesh, name_faces
-from .poles import find_fans, find_poles, unfold
+from .poles import find_fans, find_poles, leaving_half_edges, unfold
 from .polygons import Polygons
 from .triangles import pair_in_order, pair_triangles
 
@@ -117,7 +117,7 @@ def _poles_and_pairs(
     """Which umbrellas are poles; a half-edge on the diagonal of each pair of triangles; choices in words."""
     corners, twins = polygons.corners, polygons.twins
     piece = np.empty(len(corners), np.int32)
-    pieces = find_pieces(corners, twins, piece)
+    pieces = find_pieces(twins, piece)
     check_pieces(pieces, len(corners))
     triangle = corners[:, 3] < 0
     has_triangles = np.bincount(piece[triangle], minlength=pieces) > 0
@@ -144,7 +144,7 @@ def _poles_and_pairs(
     missing = np.empty(len(valence), np.int32)
     for order in _pole_orders(polygons, umbrella, valence, piece, left):
         _forget_poles(umbrella, piece, left, pole)
-        leaving = _leaving(polygons, umbrella, valence)
+        leaving = leaving_half_edges(twins, umbrella, valence)
         find_poles(corners, twins, umbrella, valence, leaving, order, True, pole, missing)
         fan = ((umbrella >= 0) & pole[umbrella]).reshape(-1, 4).any(axis=1)
         stuck = np.isin(piece, piece[left]) & triangle
@@ -182,16 +182,6 @@ def _pair(
     return edges.astype(np.int32), faces[pairing.unpaired], pairing.choices
 
 
-def _leaving(polygons: Polygons, umbrella: NDArray[np.int32], valence: NDArray[np.int32]) -> NDArray[np.int32]:
-    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open."""
-    halves = np.flatnonzero(umbrella >= 0)
-    corner_of = np.empty(len(valence), np.int32)
-    corner_of[umbrella[halves]] = halves.astype(np.int32)
-    borders = halves[polygons.twins[halves] < 0]
-    corner_of[umbrella[borders]] = borders
-    return corner_of
-
-
 def _pole_orders(
     polygons: Polygons,
     umbrella: NDArray[np.int32],
@@ -203,7 +193,7 @@ def _pole_orders(
     if not left.size:
         return
     faces = np.isin(piece, piece[left])
-    corner_of = _leaving(polygons, umbrella, valence)
+    corner_of = leaving_half_edges(polygons.twins, umbrella, valence)
     order = np.unique(umbrella.reshape(-1, 4)[faces][:, :3])
     feasible = np.zeros(len(valence), np.bool_)
     missing = np.empty(len(valence), np.int32)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import kernel
-from .halfedges import Corners, first_around, next_half_edge, previous_half_edge
+from .. import kernels
+from .halfedges import Corners
+from .walks import walk
 
-__all__ = ["find_fans", "find_poles", "unfold"]
+__all__ = ["find_fans", "find_poles", "leaving_half_edges", "unfold"]
 
 #: Fewer triangles round an inner vertex would share two edges each.
 _MIN_FAN = 3
@@ -44,7 +45,18 @@ def find_fans(
     return pole, misfits
 
 
-@kernel
+def leaving_half_edges(
+    twins: NDArray[np.int32], umbrella: NDArray[np.int32], valence: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open."""
+    halves = np.flatnonzero(umbrella >= 0).astype(np.int32)
+    leaving = np.empty(len(valence), np.int32)
+    leaving[umbrella[halves]] = halves
+    borders = halves[twins[halves] < 0]
+    leaving[umbrella[borders]] = borders
+    return leaving
+
+
 def find_poles(
     corners: Corners,
     twins: NDArray[np.int32],
@@ -65,7 +77,7 @@ def find_poles(
     corners, twins, umbrella, valence
         See `find_umbrellas`.
     corner_of : int32 array of shape (U,)
-        A half-edge that leaves each umbrella; with no face before it where the umbrella is open.
+        See `leaving_half_edges`.
     order : int32 array
         The umbrellas that may be poles.
     together : bool
@@ -75,41 +87,14 @@ def find_poles(
     missing : int32 array of shape (U,)
         Filled with the triangles by which inner vertices are short of six, those of poles beside them counted.
     """
-    for vertex in range(valence.size):
-        missing[vertex] = _REGULAR - valence[vertex] if valence[vertex] > 0 else 0
-    ring = np.empty(valence.size, np.int32)
-    for j in range(order.size):
-        vertex = order[j]
-        faces = abs(valence[vertex])
-        if faces < 2 or (valence[vertex] > 0 and faces < _MIN_FAN):
-            continue
-        # The vertices between two triangles of the fan.
-        half = corner_of[vertex]
-        count = 0
-        fits = True
-        for turn in range(faces):
-            other = umbrella[next_half_edge(corners, half)]
-            fits &= not (together and pole[other])
-            if valence[vertex] > 0 or turn > 0:
-                fits &= missing[other] > 0 if valence[other] > 0 else valence[other] == -2
-                ring[count] = other
-                count += 1
-            half = previous_half_edge(corners, half)
-            if valence[vertex] < 0 and turn == faces - 1:
-                fits &= not (together and pole[umbrella[half]])
-                break
-            half = twins[half]
-        if not fits:
-            continue
-        pole[vertex] = True
-        if together:
-            missing[vertex] = 0
-            for index in range(count):
-                if valence[ring[index]] > 0:
-                    missing[ring[index]] -= 1
+    missing[:] = np.where(valence > 0, _REGULAR - valence, 0)
+    walk(
+        kernels.mesh_poles,
+        *(corners, twins, umbrella, valence, corner_of, order, together, pole.view(np.uint8), missing),
+        np.zeros(4, np.int64),
+    )
 
 
-@kernel
 def unfold(
     corners: Corners,
     twins: NDArray[np.int32],
@@ -148,41 +133,22 @@ def unfold(
     int
         How many new vertices there are.
     """
-    done = np.zeros(corners.shape[0], np.bool_)
-    count = 0
-    for seed in range(umbrella.size):
-        if umbrella[seed] < 0 or not pole[umbrella[seed]] or done[seed >> 2]:
-            continue
-        first, closed = first_around(corners, twins, seed)
-        half = first
-        start = count
-        while True:
-            face, tip = half >> 2, half & 3
-            across = previous_half_edge(corners, half)
-            following = twins[across]
-            last = following < 0 or following == first
-            done[face] = True
-            pole_of[count] = corners[face, tip]
-            new_corners[face, 0] = vertices + count
-            new_corners[face, 1] = corners[face, (tip + 1) % 3]
-            new_corners[face, 2] = corners[face, (tip + 2) % 3]
-            new_corners[face, 3] = vertices + (start if last and closed else count + 1)
-            for a in range(attributes.shape[0]):
-                old = attributes[a, face]
-                row = new_attributes[a, face]
-                row[0] = old[tip]
-                row[1] = old[(tip + 1) % 3]
-                row[2] = old[(tip + 2) % 3]
-                row[3] = old[3] if folded[face] else old[tip]
-                if not folded[face] and following >= 0:
-                    beside = attributes[a, following >> 2]
-                    if beside[(following + 1 - 4 * (following >> 2)) % 3] == row[2]:
-                        row[3] = beside[following & 3]
-            count += 1
-            if last:
-                if not closed:
-                    pole_of[count] = corners[face, tip]
-                    count += 1
-                break
-            half = following
-    return count
+    state = np.zeros(4, np.int64)
+    walk(
+        kernels.mesh_unfold,
+        *(corners, twins, _first_of_fans(twins, umbrella, pole), folded.view(np.uint8), attributes, vertices),
+        *(new_corners, new_attributes, pole_of),
+        state,
+    )
+    return int(state[3])
+
+
+def _first_of_fans(twins: NDArray[np.int32], umbrella: NDArray[np.int32], pole: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """A half-edge that leaves each pole, the one at the border or else the lowest; in the order of the lowest ones."""
+    tips = np.flatnonzero((umbrella >= 0) & pole[umbrella]).astype(np.int32)
+    first = np.full(len(pole), -1, np.int32)
+    first[umbrella[tips[::-1]]] = tips[::-1]
+    lowest = np.sort(first[pole])
+    at_border = tips[twins[tips] < 0]
+    first[umbrella[at_border]] = at_border
+    return first[umbrella[lowest]]

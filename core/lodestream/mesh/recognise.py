@@ -176,7 +176,7 @@ class _Recognition:
         piece = self.piece
         pieces = int(piece.max()) + 1
         if self.seams:
-            pieces = find_pieces(self.quads.corners, self.quads.twins, piece)
+            pieces = find_pieces(self.quads.twins, piece)
         part = join_pieces(self.vertex.reshape(-1, 4), piece, pieces, len(self.mesh.vertices))
         blocks = [self._block(grid, int(part[piece[_first_face(grid)]])) for grid in grids]
         blocks, merged = join_blocks(blocks, grids, self.mesh.vertices)
@@ -185,7 +185,7 @@ class _Recognition:
         return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), notes, left_out)
 
     def _grids(self) -> list[Grid]:
-        laid = develop_quads(self.quads.corners, self.twins)
+        laid = develop_quads(self.twins)
         self.piece = laid.piece
         runs = _runs(laid.piece, len(laid.turns))
         self._check_count(len(runs))
@@ -247,7 +247,7 @@ class _Recognition:
             cut = np.zeros(4 * len(corners), np.bool_)
             trace(corners, self.twins, self.umbrella, self.valence, starts, whole, cut)
             apart = np.where(cut, -1, self.twins).astype(np.int32)
-            find_pieces(corners, apart, piece)
+            find_pieces(apart, piece)
             count = len(np.unique(piece[chosen]))
             if best is None or count < best[0]:
                 best = count, apart
@@ -257,7 +257,7 @@ class _Recognition:
         if count > most_blocks(size) or size < LEAST_QUADS * count:
             raise FormatError(self._too_small(chosen, count, wrong))
         self.cuts += count
-        laid = develop_quads(corners, apart)
+        laid = develop_quads(apart)
         grids = []
         for number, faces in enumerate(_runs(laid.piece, len(laid.turns))):
             if not chosen[faces[0]]:

@@ -7,30 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import kernel
+from .. import kernels
 from .halfedges import Corners
 from .model import Mesh
 from .patchwork import Quads
+from .walks import parts
 
 __all__ = ["equal_rows", "sort_attributes", "tear"]
 
 
-@kernel
 def rows_of_vertices(corners: Corners, rows: NDArray[np.int32], row_of: NDArray[np.int32]) -> bool:
     """Find the one row of values that all corners at each vertex have; False when they differ somewhere.
 
-    Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face.
+    Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face; of no use when they differ.
     """
     row_of[:] = -1
-    agree = True
-    for face in range(corners.shape[0]):
-        for k in range(4):
-            vertex = corners[face, k]
-            if vertex >= 0:
-                if row_of[vertex] < 0:
-                    row_of[vertex] = rows[face, k]
-                agree &= row_of[vertex] == rows[face, k]
-    return agree
+    return all(kernels.mesh_rows(corners[part], rows[part], row_of) for part in parts(len(corners)))
 
 
 def equal_rows(values: NDArray[Any]) -> NDArray[np.int32]:
@@ -74,29 +66,10 @@ def sort_attributes(mesh: Mesh) -> tuple[dict[str, NDArray[np.int32]], dict[str,
     return shared, seams, left_out
 
 
-@kernel
-def _tear(
-    corners: NDArray[np.int32], attributes: NDArray[np.int32], twins: NDArray[np.int32], torn: NDArray[np.int64]
-) -> None:
-    """Part faces at edges where an attribute differs; count those of each attribute."""
-    for half in range(twins.size):
-        twin = twins[half]
-        if twin < half:
-            continue
-        face, k, other, m = half >> 2, half & 3, twin >> 2, twin & 3
-        differs = False
-        for a in range(attributes.shape[0]):
-            one, two = attributes[a, face], attributes[a, other]
-            if one[k] != two[(m + 1) & 3] or one[(k + 1) & 3] != two[m]:
-                torn[a] += 1
-                differs = True
-        if differs:
-            twins[half] = -1
-            twins[twin] = -1
-
-
 def tear(quads: Quads, twins: NDArray[np.int32]) -> NDArray[np.int64]:
     """Part faces in `twins` where an attribute differs across their edge; for each attribute the number of edges."""
-    torn = np.zeros(len(quads.attributes), np.int64)
-    _tear(quads.corners, quads.attributes, twins, torn)
+    torn, there = np.zeros(len(quads.attributes), np.int64), np.empty(len(quads.attributes), np.int64)
+    for part in parts(len(quads.corners)):
+        kernels.mesh_tear(quads.attributes, part.start, part.stop, twins, there)
+        torn += there
     return torn

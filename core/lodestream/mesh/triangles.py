@@ -7,15 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numba_kernels import kernel
+from .. import kernels
 from .develop import Development, develop_triangles
 from .halfedges import Corners
+from .walks import parts
 
 __all__ = ["Pairing", "pair_in_order", "pair_triangles"]
 
 #: Coordinates along the two other directions, from those of `develop_triangles`, when the edges of a direction are the
 #: diagonals.
 _AXES = np.array([[[1, 1], [-1, 0]], [[0, 1], [-1, -1]], [[-1, 0], [0, -1]]])
+
+#: Which of x, y and x + y goes along them.
+_ALONG = np.array([[2, 0], [1, 2], [0, 1]])
 
 #: Poles that are none cut a mesh into more pieces than are looked at one by one.
 _MOST_PIECES = 1 << 14
@@ -43,43 +47,36 @@ class Pairing:
     choices: tuple[str, ...]
 
 
-@kernel
-def _survey(
-    corners: Corners,
-    twins: NDArray[np.int32],
-    points: NDArray[np.float64],
-    piece: NDArray[np.int32],
-    first: NDArray[np.int32],
-    heading: NDArray[np.int8],
-    axes: NDArray[np.int64],
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
-    single: NDArray[np.int64],
-    length: NDArray[np.float64],
-) -> None:
-    """For each piece and direction: the box along the two others, triangles without partner, lengths of edges."""
-    rows = np.array([1, 0, -1, -1, 0, 1])
-    columns = np.array([0, 1, 1, 0, -1, -1])
-    for face in range(corners.shape[0]):
-        p = piece[face]
-        x, y, way = np.int64(first[face, 0]), np.int64(first[face, 1]), np.int64(heading[face])
-        for k in range(3):
-            family = way % 3
-            if twins[4 * face + k] < 0:
-                single[p, family] += 1
-            a, b = corners[face, k], corners[face, (k + 1) % 3]
-            square = 0.0
-            for axis in range(points.shape[1]):
-                square += (points[a, axis] - points[b, axis]) ** 2
-            length[p, family] += np.sqrt(square)
-            for choice in range(3):
-                for axis in range(2):
-                    value = axes[choice, axis, 0] * x + axes[choice, axis, 1] * y
-                    low[p, choice, axis] = min(low[p, choice, axis], value)
-                    high[p, choice, axis] = max(high[p, choice, axis], value)
-            x += rows[way]
-            y += columns[way]
-            way = (way + 2) % 6
+@dataclass(frozen=True, slots=True)
+class _Survey:
+    """What there is of the triangles of each piece.
+
+    Attributes
+    ----------
+    extent : int64 array of shape (P, 3)
+        Of their corners along x, y and x + y.
+    single : bool array of shape (P, 3)
+        Whether a half-edge of each of the three directions has no twin.
+    length : float64 array of shape (P, 3)
+        Of all half-edges of each direction.
+    """
+
+    extent: NDArray[np.int64]
+    single: NDArray[np.bool_]
+    length: NDArray[np.float64]
+
+    @staticmethod
+    def of(corners: Corners, twins: NDArray[np.int32], points: NDArray[np.float64], laid: Development) -> _Survey:
+        shape = (len(laid.turns), 3)
+        low, high = np.full(shape, np.iinfo(np.int64).max), np.full(shape, np.iinfo(np.int64).min)
+        single, length = np.zeros(shape, np.uint8), np.zeros(shape)
+        twins = twins.reshape(-1, 4)
+        for part in parts(len(corners)):
+            kernels.mesh_survey(
+                *(corners[part], twins[part], points, laid.piece[part], laid.first[part], laid.heading[part]),
+                *(low, high, single, length),
+            )
+        return _Survey(high - low, single.view(np.bool_), length)
 
 
 def pair_triangles(corners: Corners, twins: NDArray[np.int32], points: NDArray[np.float64]) -> Pairing:
@@ -96,15 +93,11 @@ def pair_triangles(corners: Corners, twins: NDArray[np.int32], points: NDArray[n
     twins : int32 array of shape (4 T,)
     points : float64 array of shape (V, 2) or (V, 3)
     """
-    laid = develop_triangles(corners, twins)
+    laid = develop_triangles(twins)
     pieces = len(laid.turns)
     if pieces > _MOST_PIECES:
         return Pairing(np.zeros(0, np.int32), np.ones(len(corners), np.bool_), ())
-    low = np.full((pieces, 3, 2), np.iinfo(np.int64).max)
-    high = np.full((pieces, 3, 2), np.iinfo(np.int64).min)
-    single = np.zeros((pieces, 3), np.int64)
-    length = np.zeros((pieces, 3))
-    _survey(corners, twins, points, laid.piece, laid.first, laid.heading, _AXES, low, high, single, length)
+    survey = _Survey.of(corners, twins, points, laid)
     sizes = np.bincount(laid.piece, minlength=pieces)
     order = np.argsort(laid.piece, kind="stable")
     ends = np.cumsum(sizes)
@@ -113,15 +106,15 @@ def pair_triangles(corners: Corners, twins: NDArray[np.int32], points: NDArray[n
     for number in range(pieces):
         if laid.turns[number]:
             continue
-        fits = [choice for choice in range(3) if single[number, choice] == 0]
-        boxes = {it: _box(laid.periods[number], it, high[number, it] - low[number, it]) for it in fits}
+        fits = [choice for choice in range(3) if not survey.single[number, choice]]
+        boxes = {it: _box(laid.periods[number], it, survey.extent[number, _ALONG[it]]) for it in fits}
         least = min((_cells(box) for box in boxes.values()), default=(False, 0.0))
         fits = [choice for choice in fits if _cells(boxes[choice]) == least]
         if len(fits) == 1:
             chosen[number] = fits[0]
         elif fits:
             faces = order[ends[number] - sizes[number] : ends[number]]
-            chosen[number], why = _choose(corners, laid, faces, fits, boxes, length[number])
+            chosen[number], why = _choose(corners, laid, faces, fits, boxes, survey.length[number])
             choices.append(f"{len(fits)} diagonals fit, {why}")
     way = laid.heading[:, None] + np.array([0, 2, 4])
     along = chosen[laid.piece]
