@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from lodestream.formats.mesh_output import output_of
-from lodestream.mesh import Mesh
+from lodestream.mesh import Mesh, walks
+from lodestream.mesh.polygons import Polygons, prepare
 from lodestream.surface import Surface
 
 #: Faces as lists of vertices.
@@ -124,3 +127,67 @@ def assert_same_faces(surface: Surface, faces: FaceList) -> None:
     assert without_sense(numbers[face].tolist() for face in out) == without_sense(faces)
     edges = Counter((face[k - 1], face[k]) for face in out for k in range(len(face)))
     assert max(edges.values()) == 1
+
+
+def grown(rng: np.random.Generator, triangles: int) -> tuple[int, FaceList]:
+    """Vertices and triangles of a disc to which so many are added at random: on an edge, or between two."""
+    border, edges, faces = [0, 1, 2], {frozenset(edge) for edge in ((0, 1), (1, 2), (0, 2))}, [[0, 1, 2]]
+    count = 3
+    for place in rng.integers(0, 1 << 30, triangles).tolist():
+        j = place % len(border)
+        before, vertex, after = border[j - 1], border[j], border[(j + 1) % len(border)]
+        if place & 1 and frozenset((before, after)) not in edges:
+            faces.append([before, after, vertex])
+            edges.add(frozenset((before, after)))
+            del border[j]
+        else:
+            faces.append([before, count, vertex])
+            edges |= {frozenset((before, count)), frozenset((count, vertex))}
+            border.insert(j, count)
+            count += 1
+    return count, faces
+
+
+def any_faces(seed: int, kind: str = "") -> tuple[FaceList, int]:
+    """Faces in any order over so many vertices: grids that are closed, holed, collapsed or cut, and several of them."""
+    rng = np.random.default_rng(seed)
+    faces: FaceList = []
+    vertices = 0
+    for _ in range(rng.integers(1, 4)):
+        rows, columns = (int(size) for size in rng.integers(3, 8, 2))
+        closed = (bool(rng.integers(2)), bool(rng.integers(2)))
+        more = grid_faces(rows, columns, closed, int(rng.integers(columns)) if closed == (True, True) else 0)
+        count = rows * columns
+        if rng.integers(3) == 0:
+            count, more = star(int(rng.integers(3, 7)), int(rng.integers(1, 4)))
+        elif rng.integers(3) == 0 and kind != "quads":
+            more = collapse(more, range(columns), 0)
+        if rng.integers(3) == 0 and kind != "quads":
+            count, more = grown(rng, int(rng.integers(1, 40)))
+        if rng.integers(2):
+            more = [face for face in more if rng.random() < 0.8] or more
+        if kind == "triangles" or (kind == "" and rng.integers(2)):
+            more = cut_in_two(more, "main")
+        faces += [[vertex + vertices for vertex in face] for face in more]
+        vertices += count
+    return scrambled(faces, vertices, rng), vertices
+
+
+def corners_of(faces: FaceList) -> NDArray[np.int32]:
+    """Rows of four corners, -1 in the last place of triangles."""
+    return np.array([face + [-1] * (4 - len(face)) for face in faces], np.int32).reshape(-1, 4)
+
+
+def wound_alike(seed: int, kind: str = "") -> tuple[Polygons, int]:
+    """Any faces, turned round so that all of a piece are wound alike, and how many vertices there are."""
+    faces, vertices = any_faces(seed, kind)
+    mesh = Mesh.of(np.random.default_rng(seed).random((vertices, 3)), faces)
+    return prepare(mesh, (), np.zeros((0, len(faces), 4), np.int32)), vertices
+
+
+@contextmanager
+def calls_of(steps: int) -> Iterator[None]:
+    """Let kernels over meshes take so many steps or faces in a call."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(walks, "_AT_ONCE", steps)
+        yield
