@@ -2,7 +2,7 @@
  * round faces go, which corners lie round one vertex, and where grid lines and fans of triangles run.
  *
  * What walks further than a range of faces can be interrupted: all it knows lies in arrays of the caller, and a call
- * takes so many steps. Each walk visits a half-edge or a face once, so that it ends whatever the twins are.
+ * takes so many steps. Each walk marks or counts what it visits, so that it ends whatever the twins are.
  */
 #include "mesh.h"
 
@@ -169,24 +169,24 @@ int64_t lode_mesh_pieces(const int32_t *twins, int64_t twins_count, int32_t *pie
     return steps > 0;
 }
 
-/* The side on which a face lies, by that of the one beside it at a half-edge: turned round where both half-edges run
- * the same way; -1 where there is none beside it. */
-static inline int orient_face(const struct mesh *mesh, int64_t face, uint8_t *turned, int32_t *queue, int64_t *end) {
+/* Put the faces beside one into the queue, turned round if that one is, or else if the half-edges between both run the
+ * same way. 1 if that fits to those that were seen before, 0 if not, -1 where there are no such faces. */
+static inline int turn_beside(const int32_t *corners, const int32_t *twins, int64_t face, int64_t faces,
+                              uint8_t *turned, int32_t *queue, int64_t *end) {
     for (int64_t half = 4 * face; half < 4 * face + 4; half++) {
-        int64_t twin = mesh->twins[half];
+        int32_t twin = twins[half], other = twin >> 2;
         if (twin < 0)
             continue;
-        if (twin >= mesh->halves)
+        if (other >= faces)
             return -1;
-        int64_t other = twin >> 2;
-        uint8_t side = turned[face] ^ (mesh->corners[half] == mesh->corners[twin]);
+        uint8_t side = turned[face] ^ (corners[half] == corners[twin]);
         if (turned[other] > 1) {
-            if (*end == mesh->halves / 4)
+            if (*end == faces)
                 return -1;
             turned[other] = side;
-            queue[(*end)++] = (int32_t)other;
-            fetch(&mesh->twins[twin]);
-            fetch(&mesh->corners[twin]);
+            queue[(*end)++] = other;
+            fetch(&twins[4 * (int64_t)other]);
+            fetch(&corners[4 * (int64_t)other]);
         } else if (turned[other] != side) {
             return 0;
         }
@@ -197,7 +197,6 @@ static inline int orient_face(const struct mesh *mesh, int64_t face, uint8_t *tu
 int64_t lode_mesh_orient(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
                          uint8_t *turned, int64_t turned_count, int32_t *queue, int64_t queue_count, int64_t *state,
                          int64_t state_count, int64_t steps) {
-    struct mesh mesh = {corners, twins, twins_count};
     int64_t faces = turned_count;
     if (!is_mesh(corners_count, twins_count) || faces != twins_count / 4 || queue_count != faces || state_count != 5)
         return LODE_REFUSED;
@@ -210,7 +209,7 @@ int64_t lode_mesh_orient(const int32_t *corners, int64_t corners_count, const in
             if (!within(face, faces) || turned[face] > 1)
                 return LODE_REFUSED;
             balance += turned[face] ? -1 : 1;
-            int fits = orient_face(&mesh, face, turned, queue, &end);
+            int fits = turn_beside(corners, twins, face, faces, turned, queue, &end);
             if (fits < 0)
                 return LODE_REFUSED;
             if (!fits)
@@ -311,7 +310,7 @@ int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, const int
             place = kept = 0;
         }
         int64_t half = riders[place++];
-        if (!is_half_edge(corners, twins_count, half) || !is_half_edge(corners, twins_count, twins[half]))
+        if (!within(half, twins_count) || !within(twins[half], twins_count))
             return LODE_REFUSED;
         if (cut[half])
             continue;
@@ -322,7 +321,7 @@ int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, const int
         if (valence[vertex] != 4 || (passed[vertex] && !whole))
             continue;
         passed[vertex] = 1;
-        if (!is_half_edge(corners, twins_count, twins[ahead]))
+        if (!within(twins[ahead], twins_count))
             return LODE_REFUSED;
         riders[kept++] = (int32_t)next_half_edge(corners, twins[ahead]);
     }
@@ -358,11 +357,11 @@ static inline int look_at_triangle(const struct fan *fan, int64_t half, bool fir
 }
 
 /* The vertex is a pole, so that one triangle less is missing where two triangles of its fan meet. */
-static inline int take_triangle(const struct fan *fan, int64_t half, bool first) {
+static inline int take_triangle(const struct fan *fan, int64_t half) {
     int64_t right = fan->umbrella[next_half_edge(fan->corners, half)];
     if (!within(right, fan->vertices))
         return -1;
-    if (!first && fan->valence[right] > 0 && fan->missing[right] > INT32_MIN)
+    if (fan->valence[right] > 0 && fan->missing[right] > INT32_MIN)
         fan->missing[right]--;
     return 1;
 }
@@ -395,7 +394,7 @@ int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, const int
         if (!is_half_edge(corners, twins_count, half) || turn >= faces || faces > twins_count)
             return LODE_REFUSED;
         bool first = open && turn == 0, last = open && turn == faces - 1;
-        int fits = taking ? take_triangle(&fan, half, first) : look_at_triangle(&fan, half, first, last);
+        int fits = taking ? take_triangle(&fan, half) : look_at_triangle(&fan, half, first, last);
         if (fits < 0)
             return LODE_REFUSED;
         half = twin_before(corners, twins, half);

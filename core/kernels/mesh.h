@@ -14,13 +14,6 @@
 
 #include "lodestream.h"
 
-/* What is read from it are numbers of half-edges that need not be there: `is_half_edge` tells. */
-struct mesh {
-    const int32_t *corners;
-    const int32_t *twins;
-    int64_t halves;
-};
-
 static inline bool within(int64_t place, int64_t count) {
     return place >= 0 && place < count;
 }

@@ -129,6 +129,25 @@ def assert_same_faces(surface: Surface, faces: FaceList) -> None:
     assert max(edges.values()) == 1
 
 
+def grown(rng: np.random.Generator, triangles: int) -> tuple[int, FaceList]:
+    """Vertices and triangles of a disc to which so many are added at random: on an edge, or between two."""
+    border, edges, faces = [0, 1, 2], {frozenset(edge) for edge in ((0, 1), (1, 2), (0, 2))}, [[0, 1, 2]]
+    count = 3
+    for place in rng.integers(0, 1 << 30, triangles).tolist():
+        j = place % len(border)
+        before, vertex, after = border[j - 1], border[j], border[(j + 1) % len(border)]
+        if place & 1 and frozenset((before, after)) not in edges:
+            faces.append([before, after, vertex])
+            edges.add(frozenset((before, after)))
+            del border[j]
+        else:
+            faces.append([before, count, vertex])
+            edges |= {frozenset((before, count)), frozenset((count, vertex))}
+            border.insert(j, count)
+            count += 1
+    return count, faces
+
+
 def any_faces(seed: int, kind: str = "") -> tuple[FaceList, int]:
     """Faces in any order over so many vertices: grids that are closed, holed, collapsed or cut, and several of them."""
     rng = np.random.default_rng(seed)
@@ -143,6 +162,8 @@ def any_faces(seed: int, kind: str = "") -> tuple[FaceList, int]:
             count, more = star(int(rng.integers(3, 7)), int(rng.integers(1, 4)))
         elif rng.integers(3) == 0 and kind != "quads":
             more = collapse(more, range(columns), 0)
+        if rng.integers(3) == 0 and kind != "quads":
+            count, more = grown(rng, int(rng.integers(1, 40)))
         if rng.integers(2):
             more = [face for face in more if rng.random() < 0.8] or more
         if kind == "triangles" or (kind == "" and rng.integers(2)):

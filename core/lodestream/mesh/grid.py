@@ -157,7 +157,7 @@ def _start(lines: NDArray[np.int32]) -> int:
     gaps = np.flatnonzero(lines[np.arange(len(lines)), place - 1] < 0)
     before = np.take_along_axis(lines[gaps], (place[gaps, None] - 1 - np.arange(length)) % length, axis=1)
     begin[gaps] -= (before >= 0).argmax(axis=1)
+    # Votes for a place begin there and end behind it; those that go round at the end count as 1 less everywhere.
     votes = np.bincount(begin % length, minlength=length + 1) - np.bincount(place + 1, minlength=length + 1)
-    votes[0] += np.count_nonzero(begin < 0)
     total = np.cumsum(votes[:length])[::-1]
     return int(length - 1 - total.argmax())

@@ -80,7 +80,7 @@ def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertice
     some[corner] = home
     beside = some[corner]
     apart = beside != home
-    one, other = np.unique(np.stack([beside[apart], home[apart]]), axis=1)
+    one, other = np.divmod(np.unique(beside[apart].astype(np.int64) * pieces + home[apart]), pieces)
     while True:
         # Each piece, and the one that stands for it, gets the least of the numbers beside it.
         least = np.minimum(part[one], part[other])
