@@ -36,7 +36,7 @@ static uint32_t kept_registers(void) {
     return low;
 }
 
-int64_t lode_runs_v3(void) {
+int lode_runs_v3(void) {
     enum { EBX = 1, ECX = 2, VECTORS = 6 };
     uint32_t fma = 1u << 12, movbe = 1u << 22, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;
     uint32_t bmi1 = 1u << 3, avx2 = 1u << 5, bmi2 = 1u << 8, lzcnt = 1u << 5;
@@ -46,7 +46,7 @@ int64_t lode_runs_v3(void) {
 
 #else
 
-int64_t lode_runs_v3(void) {
+int lode_runs_v3(void) {
     return 0;
 }
 

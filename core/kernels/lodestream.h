@@ -29,7 +29,7 @@
 LODE_API const char *lode_sources(void);
 
 /* 1 where the processor and the system run what is compiled for x86-64-v3 (AVX2), else 0. */
-LODE_API int64_t lode_runs_v3(void);
+LODE_API int lode_runs_v3(void);
 
 /* lifting.c ------------------------------------------------------------------------------------------------------ */
 

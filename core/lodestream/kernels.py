@@ -157,7 +157,7 @@ class _Integer:
     @staticmethod
     def passed(value: Any) -> tuple[int]:
         number = index(value)
-        if number.bit_length() > 63:  # ctypes would leave out the bits beyond
+        if not -(2**63) <= number < 2**63:  # ctypes would leave out the bits beyond
             raise ValueError(f"expected an integer of 64 bits, got {number}")
         return (number,)
 
