@@ -220,8 +220,8 @@ def test_options_that_have_no_place(terrain_file: Path) -> None:
         (OptionError, "'maybe'", [heights], {"closed": "maybe"}),
         (OptionError, "closed=auto", [ls.Surface(blocks=[block(0), block(1)])], {"closed": "rows"}),
         (OptionError, "'colour'", [heights], {"attribute_precision": {"colour": 1}}),
-        (InputError, "by itself", [heights, heights], {}),
-        (InputError, "by itself", [terrain_file, heights], {}),
+        (InputError, "as the only source", [heights, heights], {}),
+        (InputError, "as the only source", [terrain_file, heights], {}),
         (OptionError, "at least one file", [], {}),
         (InputError, "MessagePack", [ls.Surface(heights, metadata={"a": object()})], {}),
     ):
