@@ -81,7 +81,8 @@ static bool band_fits(const int64_t *fields, int64_t size, int64_t flags) {
                                              << (i == BAND_OFFSET || i == BAND_FLAGS || i == BAND_PARENT ? 40 : 31))
             return false;
     struct band band = band_of(fields);
-    if (!is_shift(fields[BAND_ROW_SHIFT]) || !is_shift(fields[BAND_COLUMN_SHIFT]) || fields[BAND_KIND] >= KINDS)
+    if (band.stride < 1 || band.stride < band.columns || !is_shift(fields[BAND_ROW_SHIFT]) ||
+        !is_shift(fields[BAND_COLUMN_SHIFT]) || fields[BAND_KIND] >= KINDS)
         return false;
     if (band.rows == 0 || band.columns == 0)
         return true;

@@ -45,8 +45,8 @@ int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, const double 
         const int64_t *band = bands + number * BAND_FIELDS;
         int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE];
         int64_t rows = band[BAND_ROWS], columns = band[BAND_COLUMNS];
-        if (offset < 0 || stride < 0 || rows < 0 || columns < 0 || stride > INT32_MAX || rows > INT32_MAX ||
-            columns > truth_count || offset > truth_count ||
+        if (offset < 0 || stride < 1 || stride < columns || rows < 0 || columns < 0 || stride > INT32_MAX ||
+            rows > INT32_MAX || columns > truth_count || offset > truth_count ||
             (rows > 0 && offset + (rows - 1) * stride + columns > truth_count))
             return LODE_REFUSED;
         struct sums sums;

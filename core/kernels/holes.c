@@ -8,7 +8,10 @@
 #include "copying.h"
 #include "lodestream.h"
 
-enum { GROUP = 8 }; /* points that are left out together where none is a hole */
+enum {
+    GROUP = 8, /* points that are left out together where none is a hole */
+    MOST_STEPS = 1 << 20,
+};
 
 /* A plate lies at (8 near - 2 corners - far) / 20 of the points around one. Each step goes further than there, by 1.4,
  * so that fewer are needed. */
@@ -161,7 +164,8 @@ static void relax_hole(struct rows r, int64_t j, int64_t step, int64_t columns, 
 
 int64_t lode_relax(double *values, int64_t values_count, const uint8_t *known, int64_t known_count, int64_t rows,
                    int64_t columns, int64_t first, int64_t last, int64_t rows_wrap, int64_t columns_wrap) {
-    if (!is_grid(values_count, known_count, rows, columns) || !is_run(first, last, INT64_MAX))
+    if (!is_grid(values_count, known_count, rows, columns) || !is_run(first, last, INT64_MAX) ||
+        last - first > MOST_STEPS)
         return LODE_REFUSED;
     for (int64_t at = first; at < last;) {
         int64_t line = at / columns, start = at % columns, stop = least(columns, start + (last - at));

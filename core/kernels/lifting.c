@@ -492,13 +492,14 @@ int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64
                   int64_t from, int32_t *work, int64_t work_count) {
     bool along_rows = axis == 1;
     int64_t length = along_rows ? columns : rows, across = along_rows ? rows : columns;
-    int64_t gap = along_rows || across < NARROW ? 1 : STRIP, coarse = length - midpoints;
-    int64_t places = run + BEFORE + AFTER + midpoints + 2 * REACH;
+    int64_t gap = along_rows || across < NARROW ? 1 : STRIP;
     if (rows < 1 || columns < 1 || length > INT32_MAX || (rows > 1 && pitch < columns) || midpoints < 1 ||
-        run < midpoints || run > midpoints + 1 || run > coarse || coarse > run + 1 ||
-        (run == midpoints && run != coarse) || table_count != 4 * REACH || a < -127 || a > 127 || b < -127 || b > 127 ||
-        from < 0 || from >= run || from % (CHUNK / gap) || (from > 0 && across > gap) ||
-        work_count < places * gap + ALIGNED)
+        midpoints > length || run < midpoints || run > midpoints + 1)
+        return LODE_REFUSED;
+    int64_t places = run + BEFORE + AFTER + midpoints + 2 * REACH, coarse = length - midpoints;
+    if (run > coarse || coarse > run + 1 || (run == midpoints && run != coarse) || table_count != 4 * REACH ||
+        a < -127 || a > 127 || b < -127 || b > 127 || from < 0 || from >= run || from % (CHUNK / gap) ||
+        (from > 0 && across > gap) || work_count < places * gap + ALIGNED)
         return LODE_REFUSED;
     for (int64_t i = 0; i < 4 * REACH; i += 2)
         if (table[i] < 0 || table[i] >= midpoints || table[i + 1] < -1 || table[i + 1] > 1)

@@ -137,7 +137,7 @@ LODE_API int64_t lode_push(double *values, int64_t values_count, const uint8_t *
                            int64_t columns_wrap, const double *coarser, int64_t coarser_count);
 
 /* Bring holes nearer to where a thin plate would lie through what is around them: steps `first` to `last` - 1 of a walk
- * that goes over all points in raster order, then back, and so on; rows x columns steps are a sweep.
+ * that goes over all points in raster order, then back, and so on, at most 2^20 in a call; rows x columns are a sweep.
  * Returns 0.
  */
 LODE_API int64_t lode_relax(double *values, int64_t values_count, const uint8_t *known, int64_t known_count,

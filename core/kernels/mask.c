@@ -39,7 +39,7 @@ LODE_INLINE void code_points(bool reads, struct coder *coder, uint8_t *at, int64
         further = (further << 1 | far_up[j + 2]) & 31;
         int32_t wide = further << 11 | above << 4 | before;
         int32_t near = NEAR + ((further >> 1 & 7) << 7 | (above >> 1 & 31) << 2 | (before & 3));
-        int bit = code_mixed_bit(reads, coder, at[j], &model[wide], &model[near], &model[WEIGHTS]);
+        int bit = code_mixed_bit(reads, coder, at[j] != 0, &model[wide], &model[near], &model[WEIGHTS]);
         at[j] = (uint8_t)bit;
         before = (before << 1 | bit) & 15;
     }

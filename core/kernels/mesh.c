@@ -33,7 +33,8 @@ int64_t lode_mesh_count_edges(const int32_t *corners, int64_t corners_count, int
 int64_t lode_mesh_sort_edges(const int32_t *corners, int64_t corners_count, int64_t first, int64_t last, int32_t *start,
                              int64_t start_count, int32_t *order, int64_t order_count) {
     int32_t low, high;
-    if (!is_faces(corners_count) || first < 0 || last > corners_count / 4 || order_count > corners_count)
+    if (!is_faces(corners_count) || first < 0 || first > last || last > corners_count / 4 ||
+        order_count > corners_count)
         return LODE_REFUSED;
     for (int64_t half = 4 * first; half < 4 * last; half++) {
         if ((half & 3) == 3 && is_triangle(corners, half))
@@ -77,7 +78,7 @@ int64_t lode_mesh_match_edges(const int32_t *corners, int64_t corners_count, con
 
 int64_t lode_mesh_tear(const int32_t *attributes, int64_t attributes_count, int64_t first, int64_t last, int32_t *twins,
                        int64_t twins_count, int64_t *torn, int64_t torn_count) {
-    if (!is_faces(twins_count) || first < 0 || last > twins_count / 4 ||
+    if (!is_faces(twins_count) || first < 0 || first > last || last > twins_count / 4 ||
         (torn_count && attributes_count / torn_count != twins_count) || attributes_count != torn_count * twins_count)
         return LODE_REFUSED;
     for (int64_t a = 0; a < torn_count; a++)

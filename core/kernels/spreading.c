@@ -155,7 +155,7 @@ int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sig
         int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = window[0];
         int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
         if (window[1] < first_row || window[2] < first_column || height < 0 || width < 0 || height > INT32_MAX ||
-            stride < width || stride > INT32_MAX || offset < 0 || offset > known_count - width ||
+            stride < width || stride < 1 || stride > INT32_MAX || offset < 0 || offset > known_count - width ||
             (height - 1) * stride > known_count - width - offset || tile < 0 || tile >= state_count ||
             state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
             return LODE_REFUSED;

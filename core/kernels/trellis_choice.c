@@ -31,11 +31,11 @@ static double magnitude(double value) {
     return __builtin_fabs(value);
 }
 
-/* Whether rows x columns elements from `place` on, rows `stride` apart, lie within `size`. */
+/* Whether rows x columns elements from `place` on, rows `stride` apart and none in another, lie within `size`. */
 static bool holds(int64_t size, int64_t place, int64_t stride, int64_t rows, int64_t columns) {
-    if (place < 0 || place > size || stride < 0 || rows < 1 || columns < 1 || columns > size - place)
+    if (place < 0 || place > size || rows < 1 || columns < 1 || columns > size - place)
         return false;
-    return stride == 0 || rows - 1 <= (size - place - columns) / stride;
+    return rows == 1 || (stride >= columns && rows - 1 <= (size - place - columns) / stride);
 }
 
 /* Whether a band lies within `size` elements. */
@@ -47,7 +47,8 @@ static bool is_band(const int64_t *band, int64_t size) {
 /* Whether what is around a band and its parents lie within `size` elements, too. */
 static bool has_surroundings(const int64_t *band, int64_t size) {
     int64_t down = band[BAND_ROW_SHIFT], right = band[BAND_COLUMN_SHIFT];
-    if (band[BAND_STRIDE] >= band[BAND_OFFSET] || down < 0 || down > 31 || right < 0 || right > 31)
+    if (band[BAND_STRIDE] < 0 || band[BAND_STRIDE] >= band[BAND_OFFSET] || down < 0 || down > 31 || right < 0 ||
+        right > 31)
         return false;
     return holds(size, band[BAND_OFFSET] - band[BAND_STRIDE] - 1, band[BAND_STRIDE], band[BAND_ROWS] + 2,
                  band[BAND_COLUMNS] + 2) &&

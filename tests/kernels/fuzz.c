@@ -40,12 +40,14 @@ const char *__ubsan_default_options(void) {
 /* Which branches a case has taken, as pairs of places in the code, and how often in powers of two. */
 static uint8_t taken[MAP], seen[MAP];
 static uintptr_t last_place;
+static int64_t work; /* places that a case has passed */
 
 void __sanitizer_cov_trace_pc(void) {
     uintptr_t place = (uintptr_t)__builtin_return_address(0);
     uint8_t *count = &taken[((place * 31) ^ last_place) % MAP];
     *count = (uint8_t)(*count + (*count < 255));
     last_place = place * 7;
+    work++;
 }
 
 struct comparison comparisons[COMPARISONS];
@@ -221,7 +223,7 @@ static int64_t run(const struct subject *subject, struct subject *results) {
     current = subject;
     case_count++;
     memset(taken, 0, sizeof taken);
-    last_place = 0, comparison_count = 0;
+    last_place = 0, comparison_count = 0, work = 0;
     int64_t result = kernel->call(values);
     current = NULL;
     for (int i = 0; i < kernel->arguments; i++) {
@@ -253,6 +255,7 @@ static bool is_new(void) {
 }
 
 static struct subject kept[MOST_KEPT];
+static int64_t works[MOST_KEPT];
 static int64_t kept_count, accepted_count;
 
 static void keep(const struct subject *subject) {
@@ -261,6 +264,7 @@ static void keep(const struct subject *subject) {
     if (full)
         discard(kernel, &kept[place]);
     kept[place] = copied(kernel, subject);
+    works[place] = work;
 }
 
 static void begin_with(const char *path, bool all) {
@@ -278,9 +282,11 @@ static void begin_with(const char *path, bool all) {
     }
 }
 
+/* Any of those kept, or of the latest; of two mostly that which takes less time. */
 static const struct subject *some_kept(void) {
     int64_t latest = kept_count < LATEST ? kept_count : LATEST;
-    return &kept[below(2) ? below(kept_count) : kept_count - 1 - below(latest)];
+    int64_t one = below(2) ? below(kept_count) : kept_count - 1 - below(latest), other = below(kept_count);
+    return &kept[below(4) && works[other] < works[one] ? other : one];
 }
 
 static void one_case(void) {

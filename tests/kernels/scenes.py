@@ -44,6 +44,23 @@ def _encode(name: str) -> None:
         originals()[name].encode()
 
 
+def _small_surfaces() -> None:
+    """What is quickly coded can be changed often: points few, of every kind."""
+    rng = np.random.default_rng(1)
+    for shape in ((1, 3), (2, 2), (5, 4), (9, 12)):
+        steps, offset = rng.integers(-9, 9, shape).cumsum(1), rng.random((shape[0], 1))
+        holes = np.where(rng.random(shape) < 0.2, np.nan, steps + offset)
+        holes.flat[0] = 1.0
+        for values in (
+            steps.astype(np.int16),
+            (0.3 * (steps + offset)).astype(np.float32),
+            rng.normal(size=shape),
+            holes,
+        ):
+            for rms in (None, "5e-2d"):
+                ls.decode(ls.encode(ls.Surface(values), rms=rms))
+
+
 def _windows() -> None:
     for name in ("heights-int16", "holes-int16", "torus-odd", "attributes-types"):
         decoder = ls.Decoder()
@@ -89,6 +106,7 @@ def _compressed_scans() -> None:
 SCENES: dict[str, Callable[[], None]] = {
     **{f"decode {name}": partial(_decode, name) for name in sorted(originals())},
     **{f"encode {name}": partial(_encode, name) for name in sorted(originals())},
+    "small surfaces": _small_surfaces,
     "windows": _windows,
     "meshes": _meshes,
     "compressed scans": _compressed_scans,
