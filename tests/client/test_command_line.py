@@ -432,12 +432,10 @@ def test_out_is_written_by_rename(run: Run, container_file: Path, tmp_path: Path
 
 
 def test_an_unknown_package_s_command(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
-    from importlib.metadata import EntryPoint
+    from importlib import metadata
 
-    from lodestream_client import program
-
-    broken = EntryPoint("juggle", "no_such_package.command:register", "lodestream.commands")
-    monkeypatch.setattr(program, "entry_points", lambda group: [broken])
+    broken = metadata.EntryPoint("juggle", "no_such_package.command:register", "lodestream.commands")
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [broken])
     code, _, stderr = run("juggle")
     assert code == 1
     assert "juggle is not fully installed" in stderr
