@@ -80,10 +80,11 @@ class PlainReconstruction(Reconstruction):
 
     def _decode(self, length: int) -> None:
         _say_so()
-        for segment in self._queue[: length - self._taken]:
+        count = max(0, length - self._taken)  # what a state behind the last one asks for is decoded
+        for segment in self._queue[:count]:
             number = segment.tile * self.header.channels + segment.channel
             begins = self._decoder.units[number].remaining < 0
             top = segment.first // 2 + 1 if begins else None
             self._decoder.take([reference.Segment(number, segment.passes, top, segment.data)])
-        del self._queue[: length - self._taken]
-        self._taken = max(self._taken, length)
+        del self._queue[:count]
+        self._taken += count
