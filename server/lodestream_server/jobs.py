@@ -34,7 +34,7 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -349,7 +349,10 @@ class Builder:
             try:
                 async with self._turns.turn(self._callers[record.id], record.attempts):
                     await self._check_share(record)
-                    return await self._check_upload(record) or await self._attempt(record)
+                    state = await self._check_upload(record) or await self._attempt(record)
+                    if state is not None:
+                        return state
+                    continue
             except MemoryError:
                 deaths, reason = deaths + 1, self._out_of_memory()
             except ProcessDiedError as error:
@@ -378,9 +381,11 @@ class Builder:
             except FullError as error:
                 raise _LaterError(f"disk space of its owner: {error}") from None
 
-    async def _attempt(self, record: Record) -> State:
+    async def _attempt(self, record: Record) -> State | None:
+        """What a build makes of a surface; None where its upload was put into its place again meanwhile."""
         folder = self._storage.work_folder(record.id)
         job = self._job(record, folder)
+        begun = await asyncio.to_thread(_identities, job.files)
         allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory)
         # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
         call = Call(worker.build, (job,), self._settings.build_seconds, partial(make_folder, folder), allowed)
@@ -393,6 +398,10 @@ class Builder:
             if result is None:
                 return "ready"
             await asyncio.to_thread(discard, folder)  # whoever sees that it has failed sees nothing of it
+            # A build may read the files that were there when it began: not those of the same bytes that somebody has
+            # uploaded after the last owner of the first had deleted them.
+            if await asyncio.to_thread(_identities, job.files) != begun:
+                return None
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         finally:
             self._running.pop(record.id, None)
@@ -498,6 +507,15 @@ def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:
         # No container is longer than what it was made of takes in memory, and one that was uploaded is copied.
         file_bytes=max(memory, size) + (1 << 20),
     )
+
+
+def _identities(files: Sequence[Path]) -> list[tuple[int, int, int]] | None:
+    """What tells files from others in their places; None where one is not there."""
+    try:
+        found = [os.stat(path) for path in files]
+    except OSError:
+        return None
+    return [(status.st_dev, status.st_ino, status.st_ctime_ns) for status in found]
 
 
 def _not_now(error: OSError) -> worker.Refused:

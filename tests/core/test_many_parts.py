@@ -100,7 +100,8 @@ def test_four_times_the_parts_take_about_four_times_as_long(maker: Maker, count:
         folder.mkdir()
     few, many = maker(folders[0], count), maker(folders[1], MORE * count)
     seconds(few)  # loads libraries and compiles
-    assert seconds(many) <= TIMES * seconds(few) + NOISE
+    # The least of three: what else a busy machine does is counted too.
+    assert min(seconds(many) for _ in range(3)) <= TIMES * seconds(few) + NOISE
 
 
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)
