@@ -68,6 +68,7 @@ def code_passes(
     data: NDArray[np.uint8],
     costs: NDArray[np.float64],
     trellis: bool,
+    state: NDArray[np.int64] | None = None,
 ) -> None:
     """Code runs of passes of one channel, one after another; plane p of a tile has the passes 2 p + 1 and 2 p.
 
@@ -97,13 +98,17 @@ def code_passes(
         The bits written when each pass ended, by its number; or empty.
     trellis : bool
         The coefficients are indices with a trellis, see `trellis`; ``models`` are of a trellis.
+    state : int64, shape (`kernels.PASSES_STATE`,), optional
+        How far the runs are, zeros at first; updated. A call that was interrupted goes on from there when it is made
+        again with the same arrays.
 
     Raises
     ------
     ValueError
         When what ``bands`` or ``runs`` say does not fit the other arrays, or there is no room for what is written.
     """
-    state = np.zeros(kernels.PASSES_STATE, np.int64)
+    if state is None:
+        state = np.zeros(kernels.PASSES_STATE, np.int64)
     arrays = known, sign, flags, early, true, models, data, costs, state
     while kernels.passes(reading, trellis, bands, runs, *arrays, _AT_ONCE) < len(runs):
         pass

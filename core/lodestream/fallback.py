@@ -80,10 +80,11 @@ class PlainReconstruction(Reconstruction):
 
     def _decode(self, length: int) -> None:
         _say_so()
-        for segment in self._queue[: length - self._taken]:
+        for place in range(self._taken, length):
+            segment = self._queue[place]
             number = segment.tile * self.header.channels + segment.channel
             begins = self._decoder.units[number].remaining < 0
             top = segment.first // 2 + 1 if begins else None
             self._decoder.take([reference.Segment(number, segment.passes, top, segment.data)])
-        del self._queue[: length - self._taken]
-        self._taken = max(self._taken, length)
+            self._taken = place + 1
+            self._forget(self._taken)

@@ -232,8 +232,9 @@ class Kernel:
     def __call__(self, *values: Any) -> int:
         """Call it; ValueError or TypeError where the values are not what was declared."""
         if self._function is None:
-            self._function = library()[f"lode_{self.name}"]
-            self._function.argtypes, self._function.restype = self.types, ctypes.c_int64
+            function = library()[f"lode_{self.name}"]
+            function.argtypes, function.restype = self.types, ctypes.c_int64
+            self._function = function  # only now: another thread may be calling, and would pass numbers of 32 bits
         arguments: list[Any] = []
         try:
             for passed, value in zip(self._passed, values, strict=True):

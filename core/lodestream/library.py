@@ -55,7 +55,8 @@ def _load() -> ctypes.CDLL | str:
     wide = wide_name()
     if not isinstance(loaded, str) and wide and loaded.lode_runs_v3() and (NATIVE / wide).exists():
         wider = _load_from(NATIVE / wide)
-        return loaded if isinstance(wider, str) else wider
+        if not isinstance(wider, str) and wider.lode_sources() == loaded.lode_sources():
+            return wider
     return loaded
 
 

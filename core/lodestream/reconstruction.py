@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any
@@ -64,8 +64,9 @@ class Reconstruction:
 
     def __init__(self, header: Header) -> None:
         self.header = header
-        self._queue: list[Coded] = []  # what is not decoded yet
-        self._added = self._taken = 0
+        self._queue: dict[int, Coded] = {}  # what is not decoded yet, by number
+        self._added = self._taken = self._forgotten = 0
+        self._begun: tuple[int, list[Callable[[], None]]] = 0, []  # the batch on its way: what it ends before, its work
         self._lock = Lock()
         self._pieces: dict[int, tuple[bytes, int]] = {}
         self._tiles: list[Tiles] = []
@@ -77,7 +78,7 @@ class Reconstruction:
 
     def add(self, segment: Coded) -> None:
         """Take a segment; nothing is decoded yet."""
-        self._queue.append(segment)
+        self._queue[self._added] = segment
         self._added += 1
 
     def correct(self, number: int, data: bytes, offset: int) -> None:
@@ -207,18 +208,28 @@ class Reconstruction:
         return self._tiles
 
     def _decode(self, length: int) -> None:
+        """Decode the first ``length`` segments. After an interruption at any place the next call goes on from there."""
         every = self._prepare()
         while self._taken < length:
-            count = min(_BATCH, length - self._taken)
-            runs: list[list[tuple[int, int, int, bytes]]] = [[] for _ in every]
-            for segment in self._queue[:count]:
-                last = segment.first - segment.passes + 1
-                runs[segment.channel].append((segment.tile, segment.first, last, segment.data))
-            for tiles, own in zip(every, runs, strict=True):
-                if own:
-                    tiles.read(own)
-            del self._queue[:count]
-            self._taken += count
+            if self._begun[0] <= self._taken:
+                end = min(self._taken + _BATCH, length)
+                runs: list[list[tuple[int, int, int, bytes]]] = [[] for _ in every]
+                for number in range(self._taken, end):
+                    segment = self._queue[number]
+                    last = segment.first - segment.passes + 1
+                    runs[segment.channel].append((segment.tile, segment.first, last, segment.data))
+                self._begun = end, [tiles.reading(own) for tiles, own in zip(every, runs, strict=True) if own]
+            end, work = self._begun
+            for read in work:
+                read()
+            self._taken = end
+            self._forget(end)
+
+    def _forget(self, end: int) -> None:
+        """Drop the segments before number ``end``, and any that an interruption has left."""
+        while self._forgotten < end:
+            self._queue.pop(self._forgotten, None)
+            self._forgotten += 1
 
 
 class Progress:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
+from .kernels import PASSES_STATE
 from .layout import REMEMBERED, Band, Layout
 from .quantiser import Quantiser, step_of
 from .spreading import UNANNOUNCED, spread_bands
@@ -127,11 +128,16 @@ class Tiles:
 
     def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
         """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
+        self.reading(runs)()
+
+    def reading(self, runs: Sequence[tuple[int, int, int, bytes]]) -> Callable[[], None]:
+        """What does `read` when it is called. If an interruption ends the call, another one goes on where it was."""
         tile, first, last, length = np.array([(*run[:3], len(run[3])) for run in runs], np.int64).reshape(-1, 4).T
         bands = np.array(self.table.first)
         count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
         data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
-        self.code(True, np.stack([bands[tile], count, tile, first, last, start, length], 1), _NOTHING, data, _FREE)
+        table = np.stack([bands[tile], count, tile, first, last, start, length], 1)
+        return partial(self.code, True, table, _NOTHING, data, _FREE, np.zeros(PASSES_STATE, np.int64))
 
     def code(
         self,
@@ -140,10 +146,11 @@ class Tiles:
         true: NDArray[np.int32],
         data: NDArray[np.uint8],
         costs: NDArray[np.float64],
+        state: NDArray[np.int64] | None = None,
     ) -> None:
         """Read or write runs of passes, see `bitplanes.code_passes`."""
         arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
-        code_passes(reading, self.table.bands, runs, *arrays, self.trellis)
+        code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.

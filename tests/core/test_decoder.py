@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import Decoder, OptionError, Target, Tolerance, TruncatedStreamError, View
+from lodestream import Decoder, OptionError, Target, Tolerance, TruncatedStreamError, View, kernels
 from lodestream.container import Index, describe
 from lodestream.plan import plan
 from lodestream.target import Order
@@ -291,3 +291,32 @@ def test_bytes_after_the_end_and_a_damaged_footer_are_refused_and_the_surface_st
             feed_in_bytes(bytewise, data)
         assert whole.complete
         assert bytewise.complete
+
+
+def test_an_interrupted_view_is_decoded_on_from_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    container = ls.encode(terrain((150, 130)))
+    wanted = Decoder()
+    wanted.feed(container)
+    surface = wanted.surface()
+    passes, calls = kernels.passes, 0
+
+    def interrupted(*arguments: Any) -> int:
+        nonlocal calls
+        calls += 1
+        done = passes(*arguments[:-1], 5000)
+        if calls % 3 == 0 and calls < 15:
+            raise KeyboardInterrupt
+        return done
+
+    monkeypatch.setattr(kernels, "passes", interrupted)
+    decoder = Decoder()
+    decoder.feed(container)
+    interrupts = 0
+    while True:
+        try:
+            points = decoder.surface().points
+            break
+        except KeyboardInterrupt:
+            interrupts += 1
+    assert interrupts == 4
+    assert np.array_equal(points, surface.points)

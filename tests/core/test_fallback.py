@@ -89,6 +89,23 @@ def test_slices_in_any_order_give_the_same_views(target: Target) -> None:
             assert_same(views[number].surface(), wanted[number].surface())
 
 
+def test_a_state_before_the_last_one_decodes_nothing_of_what_came_since() -> None:
+    data = (GOLDEN / "planar-open.lode").read_bytes()
+    with without_kernels():
+        slow, fed_so_far = ls.Decoder(), 0
+        while len(slow.layers) < 2:
+            slow.feed(data[fed_so_far : fed_so_far + 1])
+            fed_so_far += 1
+        slow.surface()
+        slow.feed(data[fed_so_far:])
+        plain = slow._reconstruction
+        waiting = dict(plain._queue)
+        assert len(waiting) > 0  # or decoding too much would not show
+        slow.layers[0].surface()
+        assert plain._queue == waiting
+        assert_same(slow.surface(), fed(data).surface())
+
+
 def test_some_attributes_alone_are_the_same() -> None:
     data = (GOLDEN / "attributes-types.lode").read_bytes()
     first, *others = fed(data).surface().blocks[0].attributes

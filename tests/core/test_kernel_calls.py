@@ -215,6 +215,23 @@ def test_what_was_not_declared_never_gets_there(value: Any, declared: Any, kind:
         called(1)
 
 
+def test_a_function_is_kept_for_other_threads_only_once_its_types_are_declared(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = Kernel("kept", INTEGER)
+    kept: list[Any] = []
+
+    class Function:
+        def __setattr__(self, name: str, value: Any) -> None:
+            kept.append(kernel._function)  # what another thread would call now
+
+        def __call__(self, *arguments: Any) -> int:
+            return 0
+
+    monkeypatch.setattr(kernels, "library", lambda: {"lode_kept": Function()})
+    assert kernel(1) == 0
+    assert kept == [None, None]
+    assert isinstance(kernel._function, Function)
+
+
 def test_a_refusal_of_the_kernel_is_an_error_with_what_it_was_given() -> None:
     field, model, data, state = np.zeros((3, 8), "u1"), np.zeros(9, "i4"), np.zeros(70, "u1"), np.zeros(4, "i8")
     with pytest.raises(

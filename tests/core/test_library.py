@@ -198,6 +198,7 @@ def native(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 
 
 OURS = (library.NATIVE / library.library_name()).read_bytes()
+CURRENT = str(library.fingerprint()).encode()
 
 
 def refused() -> str:
@@ -229,11 +230,10 @@ def test_what_cannot_be_loaded_is_refused(native: Path, content: bytes) -> None:
 
 
 def test_a_library_of_other_sources_is_refused_with_the_remedy(native: Path) -> None:
-    current = str(library.fingerprint()).encode()
-    assert OURS.count(current) == 1
-    (native / library.library_name()).write_bytes(OURS.replace(current, b"0123456789abcdef"))
+    assert OURS.count(CURRENT) == 1
+    (native / library.library_name()).write_bytes(OURS.replace(CURRENT, b"0123456789abcdef"))
     reason = refused()
-    assert f"({current.decode()}), got 0123456789abcdef" in reason
+    assert f"({CURRENT.decode()}), got 0123456789abcdef" in reason
     assert "make kernels" in reason
     assert "build.py" in reason
 
@@ -242,9 +242,10 @@ def test_a_library_without_sources_beside_it_is_loaded_as_it_is(
     native: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(library, "KERNELS", tmp_path / "none")
-    (native / library.library_name()).write_bytes(OURS.replace(str(build.fingerprint()).encode(), b"f" * 16))
+    (native / library.library_name()).write_bytes(OURS.replace(CURRENT, b"f" * 16))
     assert library.why_missing() is None
     assert isinstance(library.library(), ctypes.CDLL)
+    assert library.library().lode_sources() == b"f" * 16
 
 
 def test_the_remedy_of_an_installed_package_is_another_installation(
@@ -286,6 +287,17 @@ def test_a_second_library_that_cannot_be_loaded_is_done_without(native: Path) ->
     (native / library.library_name()).write_bytes(OURS)
     (native / str(library.wide_name())).write_bytes(b"no library")
     assert library.why_missing() is None
+    assert Path(library.library()._name).name == library.library_name()
+
+
+@pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
+def test_a_second_library_of_other_sources_than_the_first_is_done_without(
+    native: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    wide = (Path(library.__file__).with_name("native") / str(library.wide_name())).read_bytes()
+    monkeypatch.setattr(library, "KERNELS", tmp_path / "none")  # installed: nothing else says which are wanted
+    (native / library.library_name()).write_bytes(OURS)
+    (native / str(library.wide_name())).write_bytes(wide.replace(CURRENT, b"f" * 16))
     assert Path(library.library()._name).name == library.library_name()
 
 
