@@ -21,6 +21,7 @@ settings.register_profile(
 )
 settings.register_profile("ci", settings.get_profile("default"))
 settings.register_profile("torture", settings.get_profile("default"), derandomize=False, max_examples=2000)
+settings.register_profile("sanitizers", settings.get_profile("default"), max_examples=10)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 
 

@@ -26,7 +26,14 @@ __all__ = ["TESTS", "main", "run_tests"]
 
 #: Tests that together run every line of the kernels, and decode the golden files at every layer, their prefixes, and
 #: files with a bit flipped.
-TESTS = ("tests/core/test_golden.py", "tests/core/test_mask.py")
+TESTS = tuple(
+    f"tests/core/test_{name}.py"
+    for name in (
+        *("golden", "picture", "bitplanes_kernel", "lifting", "exactness", "single_error", "mesh_walks"),
+        *("mesh_lattice", "hostile_walks", "mesh_attributes", "spreading", "rate_distortion", "bitplanes", "mask"),
+        *("fill", "lzf", "transform", "kernel_calls"),
+    )
+)
 
 _SECONDS = 60.0
 
@@ -38,13 +45,14 @@ def main() -> int:
         "--seconds", type=float, default=_SECONDS, help=f"of fuzzing, all kernels (default: {_SECONDS:g})"
     )
     parser.add_argument("--seed", type=int, default=1, help="of the fuzzer (default: 1)")
+    parser.add_argument("--every-line", action="store_true", help="fail where a line of C is run by no test")
     args = parser.parse_args()
     compiler = sanitizing_compiler()
     if compiler is None:
         print("sanitize: skipped, there is neither a gcc nor a clang with sanitizers")
         return 0
     started = time.monotonic()
-    failed = _tests(compiler)
+    failed = _tests(compiler, args.every_line)
     found = fuzz_all(list(declarations()), args.seconds, seed=args.seed)
     print("\n".join(map(str, found)))
     failed |= any(item.fault for item in found)
@@ -77,6 +85,7 @@ def run_tests(compiler: str, library: Path, arguments: Sequence[str], reports: P
         "LD_PRELOAD": preloaded(compiler),
         "ASAN_OPTIONS": f"detect_leaks=0:allocator_may_return_null=1:log_path={reports}/report",
         "UBSAN_OPTIONS": f"print_stacktrace=1:log_path={reports}/report",
+        "HYPOTHESIS_PROFILE": "sanitizers",
         "PYTHONMALLOC": "malloc",  # else Python's own allocator lies between an array and what stands beside it
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
     }
@@ -87,8 +96,8 @@ def run_tests(compiler: str, library: Path, arguments: Sequence[str], reports: P
     return [*wrong, *("\n".join(lines[:40]) for lines in said)]
 
 
-def _tests(compiler: str) -> bool:
-    """Run all of them; whether anything was wrong."""
+def _tests(compiler: str, every_line: bool) -> bool:
+    """Run all of them; whether anything was wrong, as lines that never ran are where every one is asked for."""
     counts = compiler == "gcc" and shutil.which("gcov") is not None
     flags = [*SANITIZERS, *(COVERAGE if counts else ["-O1"])]
     flags += ["-shared-libsan"] if compiler == "clang" else []
@@ -99,7 +108,10 @@ def _tests(compiler: str) -> bool:
     wrong = run_tests(compiler, library, ["-n", "2", "--dist", "loadfile", *TESTS], FAULTS)
     print("\n".join(wrong))
     if counts:
-        print("\n".join(told(lines_run(library.parent, KERNELS))))
+        lines = lines_run(library.parent, KERNELS)
+        print("\n".join(told(lines)))
+        if every_line and any(file.missing for file in lines):
+            wrong.append("lines that never ran")
     else:
         print("lines of C run by the tests: skipped, there is no gcc with gcov")
     return bool(wrong)
