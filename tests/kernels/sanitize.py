@@ -109,7 +109,8 @@ def _tests(compiler: str, every_line: bool) -> bool:
     for old in library.parent.glob("*.gcda"):
         old.unlink()
     wrong = run_tests(
-        compiler, library, ["-n", "2", "--dist", "loadfile", *TESTS, *(MORE_TESTS if every_line else ())], FAULTS
+    chosen = [*TESTS, *(MORE_TESTS if every_line else ())]
+        compiler, library, ["-n", "2", "--dist", "loadfile", *chosen], FAULTS
     )
     print("\n".join(wrong))
     if counts:
