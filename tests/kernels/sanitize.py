@@ -108,10 +108,8 @@ def _tests(compiler: str, every_line: bool) -> bool:
     library = compiled(library_name(), [compiler], flags, beside, folder=BUILD / "sanitized")
     for old in library.parent.glob("*.gcda"):
         old.unlink()
-    wrong = run_tests(
     chosen = [*TESTS, *(MORE_TESTS if every_line else ())]
-        compiler, library, ["-n", "2", "--dist", "loadfile", *chosen], FAULTS
-    )
+    wrong = run_tests(compiler, library, ["-n", "2", "--dist", "loadfile", *chosen], FAULTS)
     print("\n".join(wrong))
     if counts:
         lines = lines_run(library.parent, KERNELS)
