@@ -300,7 +300,7 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
             download.answer(answer.status, answer.headers)
             download.receive(answer.content)
             download.finish()
-    return describe(reception.index)
+    return describe(reception.index, channels=True)
 
 
 def identify(url: str) -> Flow[Identity]:

@@ -98,11 +98,13 @@ LODE_API int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int
  * LODE_PART_ROWS x LODE_PART_COLUMNS points, fewer at the ends: those from `first` to `last` - 1 in raster order.
  *
  * points:      (rows, columns, channels); no integers of 64 bits, which float64 cannot tell apart.
- * coordinates: (geometric, height, pitch), of the first channels; at least as many rows and columns as points.
- * rules:       (geometric, 4): of each lattice decimal, origin, step, scale.
+ * coordinates: (compared, height, pitch), of at most three channels from `channel` on; at least as many rows and
+ *              columns as points.
+ * rules:       (compared, 4): of each lattice decimal, origin, step, scale.
  * counted:     (rows, columns): 0 where a point is left out; or empty: all count.
- * figures:     (parts, 2): of each part the sum of the squared distances, of each column from top to bottom and then
- *              of the columns from left to right; and the largest.
+ * figures:     (parts, 1, 2), or (parts, 1 + compared, 2) where several channels are compared: of each part the sum of
+ *              the squared distances, of each column from top to bottom and then of the columns from left to right, and
+ *              the largest; then the same of each channel by itself.
  *
  * Returns 0.
  */
@@ -110,7 +112,8 @@ LODE_API int64_t lode_square_distances(const void *points, int64_t points_count,
                                        const int32_t *coordinates, int64_t coordinates_count, const double *rules,
                                        int64_t rules_count, const uint8_t *counted, int64_t counted_count,
                                        double *figures, int64_t figures_count, int64_t rows, int64_t columns,
-                                       int64_t channels, int64_t height, int64_t pitch, int64_t first, int64_t last);
+                                       int64_t channels, int64_t channel, int64_t height, int64_t pitch, int64_t first,
+                                       int64_t last);
 
 #define LODE_PART_ROWS 128
 #define LODE_PART_COLUMNS 512

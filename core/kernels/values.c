@@ -18,6 +18,8 @@ enum {
     TOGETHER = 512,   /* values worked on together */
     SIDE_BY_SIDE = 4, /* parts whose rows are read from end to end: memory comes faster so */
     WIDEST = SIDE_BY_SIDE * LODE_PART_COLUMNS,
+    MOST_KINDS =
+        4, /* of figures of one part: of the distances and of three channels; they take the room of four parts */
     RULE_NUMBERS = 4,
 };
 
@@ -256,8 +258,13 @@ struct comparison {
     const int32_t *coordinates;
     const double *rules;
     const uint8_t *counted; /* or null: all are */
-    int64_t type, columns, channels, geometric, height, pitch;
+    int64_t type, columns, channels, channel, compared, height, pitch;
 };
+
+/* Figures of a part: of the distances and, where several channels are compared, of each. */
+static int64_t kinds_of(int64_t compared) {
+    return compared > 1 ? 1 + compared : 1;
+}
 
 /* Squared distances of at most TOGETHER points of a row in one channel. */
 static void channel_distances(const struct comparison *c, int64_t channel, int64_t row, int64_t left, int64_t count,
@@ -267,7 +274,8 @@ static void channel_distances(const struct comparison *c, int64_t channel, int64
     double values[TOGETHER], own[TOGETHER];
     evaluate(c->coordinates + (channel * c->height + row) * c->pitch + left, count, &rule, values);
     int64_t size = TYPE[c->type].size;
-    const void *points = (const char *)c->points + ((row * c->columns + left) * c->channels + channel) * size;
+    int64_t place = (row * c->columns + left) * c->channels + c->channel + channel;
+    const void *points = (const char *)c->points + place * size;
     if (c->channels > 1) {
         copy(size, points, c->channels, own, 1, count);
         points = own;
@@ -275,72 +283,81 @@ static void channel_distances(const struct comparison *c, int64_t channel, int64
     square(values, count, c->type, points, squares);
 }
 
-/* The same in all channels. */
+/* The same of all kinds of figures, TOGETHER numbers each. */
 static void row_distances(const struct comparison *c, int64_t row, int64_t left, int64_t count, double *squares) {
-    double more[TOGETHER];
-    channel_distances(c, 0, row, left, count, squares);
-    for (int64_t channel = 1; channel < c->geometric; channel++) {
-        channel_distances(c, channel, row, left, count, more);
-        for (int64_t j = 0; j < count; j++)
-            squares[j] += more[j];
+    int64_t kinds = kinds_of(c->compared);
+    for (int64_t channel = 0; channel < c->compared; channel++) {
+        double *own = squares + (kinds > 1 ? channel + 1 : 0) * TOGETHER;
+        channel_distances(c, channel, row, left, count, own);
+        if (kinds > 1)
+            for (int64_t j = 0; j < count; j++)
+                squares[j] = channel ? squares[j] + own[j] : own[j];
     }
     if (c->counted) {
         const uint8_t *counted = c->counted + row * c->columns + left;
-        for (int64_t j = 0; j < count; j++)
-            squares[j] = counted[j] ? squares[j] : 0.0;
+        for (int64_t kind = 0; kind < kinds; kind++)
+            for (int64_t j = 0; j < count; j++)
+                squares[kind * TOGETHER + j] = counted[j] ? squares[kind * TOGETHER + j] : 0.0;
     }
 }
 
 /* Figures of parts side by side, together `count` points wide: those of columns, then of those. */
 static void part_figures(const struct comparison *c, int64_t top, int64_t bottom, int64_t left, int64_t count,
                          double *figures) {
-    double squares[TOGETHER], sums[WIDEST], worst[WIDEST];
-    for (int64_t j = 0; j < count; j++)
+    double squares[MOST_KINDS * TOGETHER], sums[WIDEST], worst[WIDEST];
+    int64_t kinds = kinds_of(c->compared);
+    for (int64_t j = 0; j < kinds * count; j++)
         sums[j] = worst[j] = 0.0;
     for (int64_t row = top; row < bottom; row++)
         for (int64_t start = 0; start < count; start += TOGETHER) {
             int64_t some = least(count - start, TOGETHER);
             row_distances(c, row, left + start, some, squares);
-            for (int64_t j = 0; j < some; j++) {
-                sums[start + j] += squares[j];
-                worst[start + j] = squares[j] > worst[start + j] ? squares[j] : worst[start + j];
+            for (int64_t kind = 0; kind < kinds; kind++) {
+                double *sum = sums + kind * count + start, *most = worst + kind * count + start;
+                const double *own = squares + kind * TOGETHER;
+                for (int64_t j = 0; j < some; j++) {
+                    sum[j] += own[j];
+                    most[j] = own[j] > most[j] ? own[j] : most[j];
+                }
             }
         }
-    for (int64_t j = 0; j < count; j++) {
-        double *own = figures + 2 * (j / LODE_PART_COLUMNS);
-        if (j % LODE_PART_COLUMNS == 0)
-            own[0] = own[1] = 0.0;
-        own[0] += sums[j];
-        own[1] = worst[j] > own[1] ? worst[j] : own[1];
-    }
+    for (int64_t kind = 0; kind < kinds; kind++)
+        for (int64_t j = 0; j < count; j++) {
+            double *own = figures + 2 * (j / LODE_PART_COLUMNS * kinds + kind);
+            if (j % LODE_PART_COLUMNS == 0)
+                own[0] = own[1] = 0.0;
+            own[0] += sums[kind * count + j];
+            own[1] = worst[kind * count + j] > own[1] ? worst[kind * count + j] : own[1];
+        }
 }
 
 int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, const int32_t *coordinates,
                               int64_t coordinates_count, const double *rules, int64_t rules_count,
                               const uint8_t *counted, int64_t counted_count, double *figures, int64_t figures_count,
-                              int64_t rows, int64_t columns, int64_t channels, int64_t height, int64_t pitch,
-                              int64_t first, int64_t last) {
-    int64_t geometric = rules_count / RULE_NUMBERS;
-    if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || geometric < 1 ||
-        geometric > channels || !is_shape(coordinates_count, height, pitch, geometric) || height < rows ||
-        pitch < columns || (counted_count && counted_count != rows * columns) || points_type < 0 ||
-        points_type >= TYPES || points_type == NUMBER_int64 || points_type == NUMBER_uint64)
+                              int64_t rows, int64_t columns, int64_t channels, int64_t channel, int64_t height,
+                              int64_t pitch, int64_t first, int64_t last) {
+    int64_t compared = rules_count / RULE_NUMBERS, kinds = kinds_of(compared);
+    if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || compared < 1 ||
+        kinds > MOST_KINDS || channel < 0 || channel > channels - compared ||
+        !is_shape(coordinates_count, height, pitch, compared) || height < rows || pitch < columns ||
+        (counted_count && counted_count != rows * columns) || points_type < 0 || points_type >= TYPES ||
+        points_type == NUMBER_int64 || points_type == NUMBER_uint64)
         return LODE_REFUSED;
     int64_t across = (columns + LODE_PART_COLUMNS - 1) / LODE_PART_COLUMNS;
     int64_t down = (rows + LODE_PART_ROWS - 1) / LODE_PART_ROWS;
-    if (first < 0 || last < first || last > down * across || figures_count != 2 * down * across)
+    if (first < 0 || last < first || last > down * across || figures_count != 2 * kinds * down * across)
         return LODE_REFUSED;
     for (int64_t at = 0; at < rules_count; at += RULE_NUMBERS)
         if (!is_rule(rules[at + 1], rules[at + 2], rules[at + 3]))
             return LODE_REFUSED;
     struct comparison comparison = {points,      coordinates, rules,    counted_count ? counted : 0,
-                                    points_type, columns,     channels, geometric,
-                                    height,      pitch};
+                                    points_type, columns,     channels, channel,
+                                    compared,    height,      pitch};
     for (int64_t part = first; part < last;) {
         int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
-        int64_t parts = least(least(across - part % across, last - part), SIDE_BY_SIDE);
+        int64_t parts = least(least(across - part % across, last - part), kinds > 1 ? 1 : SIDE_BY_SIDE);
         part_figures(&comparison, top, least(top + LODE_PART_ROWS, rows), left,
-                     least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * part);
+                     least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * kinds * part);
         part += parts;
     }
     return 0;

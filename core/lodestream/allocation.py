@@ -21,7 +21,8 @@ _FIRST_LAYER = 48  # bytes of coefficients in the first layer
 _LEAST_GROWTH = 1.3
 _LEAST_LAYER = 160  # bytes: a layer's frame takes about 30
 _LAST_LOSSY = 0.92
-# Of streams made for one error.
+# Of streams made for one error; one of fewer bytes is one layer.
+_BRIEF = 6000
 _FEWEST = 3
 _SECOND = 16.0  # times the first layer
 _BYTES_FOR_A_LAYER = 12000
@@ -148,6 +149,8 @@ def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64], few: boo
     if sizes.size == 0:
         return []
     total = float(sizes[-1])
+    if few and total < _BRIEF:
+        return [sizes.size]
     first = min(_FIRST_LAYER, total)
     # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
     targets = _few_targets(first, total) if few else _targets(first, max(first, _LAST_LOSSY * total))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +10,9 @@ from numpy.typing import NDArray
 
 from .capacity import Capacity
 from .container import headers, sections
-from .container.frames import Frame, FrameReader, section_extent
+from .container.frames import Frame, FrameReader, index_extent, section_extent
 from .container.model import ByteRange, Header, Index, Piece
-from .container.pieces import windows
-from .container.reader import INDEX_GROWTH, index_from, read_metadata, with_level_bytes
+from .container.reader import INDEX_GROWTH, index_from, index_of, read_metadata
 from .container.slices import Slices, State
 from .digest import DIGEST
 from .errors import CorruptStreamError, TruncatedStreamError
@@ -69,6 +67,7 @@ class Decoder:
         self._values: dict[str, Any] = {}
         self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
         self._frames = FrameReader()
+        self._pages: Frame | None = None  # of the index, before its root
         self._slices: Slices | None = None
         self._focus: Region | None = None  # the region that comes first
         self._near: NDArray[np.bool_] | None = None  # its tiles, once the index is known
@@ -212,12 +211,18 @@ class Decoder:
             self._take_exactness(frame, self.header)
         elif frame.kind == sections.METADATA:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+        elif frame.kind == sections.PAGES:
+            self._pages = frame
         else:
-            place = ByteRange(frame.offset, frame.end - frame.offset)
-            self.capacity.take(INDEX_GROWTH * place.length)
-            index = sections.parse_index(frame.payload, frame.payload_offset, place, self.header)
-            known = with_level_bytes(index)
-            self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
+            self._take_index(frame, self.header)
+
+    def _take_index(self, root: Frame, header: Header) -> None:
+        pages, self._pages = self._pages, None
+        if pages is None:
+            raise CorruptStreamError("expected the pages of an index before its root, got the root", root.offset)
+        self.capacity.take(INDEX_GROWTH * (root.end - pages.offset))
+        known = index_of(pages, root, header)
+        self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
 
     def _take_footer(self, data: Bytes) -> None:
         offset, length = self._frames.position, sections.FOOTER_LENGTH
@@ -254,7 +259,7 @@ class Decoder:
         number = len(self.layers)
         if number >= header.layer_count:
             raise CorruptStreamError(f"expected {header.layer_count} layers, got more", frame.offset)
-        rms, max_error, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+        errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
         self.capacity.take(_ENTRY * len(entries))
         segments = []
         for entry in entries:
@@ -269,20 +274,15 @@ class Decoder:
         last = number + 1 == header.layer_count
         complete = last and not header.corrected
         whole = complete or (last and self._level == header.levels)
-        self._show(State(number, self._level, frame.end, rms, max_error, complete, whole))
+        self._show(State(number, self._level, frame.end, errors.rms, errors.maximum, complete, whole))
 
     def _take_exactness(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
             raise CorruptStreamError("expected layers, got exactness", frame.offset)
-        figures = self._correct(frame, header)
-        self._show(State(len(self.layers), header.levels, frame.end, *figures, True, True))
-
-    def _correct(self, frame: Frame, header: Header) -> tuple[float, float]:
-        count = sum(1 for _ in windows(header))
-        figures, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, count)
+        errors, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, header)
         for number, piece in enumerate(pieces):
             self._reconstruction.correct(number, *piece)
-        return figures
+        self._show(State(len(self.layers), header.levels, frame.end, errors.rms, errors.maximum, True, True))
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
         if DIGEST in values:
@@ -326,14 +326,18 @@ class Decoder:
         start, run = self._loose.pop(offset, (offset, bytearray()))
         run += data
         kind, place = run[0], ByteRange(start, len(run))
-        if kind not in (sections.INDEX, sections.METADATA):
+        if kind not in (sections.PAGES, sections.METADATA):
             raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
-        extent = section_extent(run, start)
-        if extent is None or len(run) < extent[1]:
+        if kind == sections.METADATA:
+            extent = section_extent(run, start)
+            end = None if extent is None else extent[1]
+        else:
+            end = index_extent(run, start)
+        if end is None or len(run) < end:
             self._loose[start + len(run)] = start, run
             return
-        if len(run) > extent[1]:
-            raise CorruptStreamError("expected a section by itself, got bytes after it", start + extent[1])
+        if len(run) > end:
+            raise CorruptStreamError("expected a section by itself, got bytes after it", start + end)
         if kind == sections.METADATA:
             self._take_metadata(read_metadata(bytes(run), place))
         elif self.header is not None:
@@ -364,7 +368,7 @@ class Decoder:
         self._slices.add(offset, data)
         for item, payload in self._slices.items():
             place = item.range.offset
-            if zlib.crc32(payload) != item.crc:
+            if sections.check_of(payload) != item.check:
                 raise CorruptStreamError("expected a segment or piece to match its CRC, got other bytes", place)
             if isinstance(item, Piece):
                 self._reconstruction.correct(self._slices.number(item), payload, place)

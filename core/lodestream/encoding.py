@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 from .allocation import TileCurve, assign_layers
 from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
-from .container.model import Header
+from .container.fields import told, told_roughly
+from .container.model import Errors, Header
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
 from .lattice import Lattice
-from .picture import coordinate_distances
+from .picture import Original, coordinate_distances, other_originals
 from .piece_coder import as_returned, encode_pieces
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
@@ -36,7 +38,6 @@ _ROUNDING = 0.2
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
 
-Figures = tuple[float, float]
 State = NDArray[np.int8]
 
 
@@ -94,15 +95,16 @@ class Encoding:
         self.header = self._header()
         states = assign_layers(curves, self.layout, len(channels), self.quantiser is not None)
         self.progress(0.4)
-        states, figures = self._measured(states)
+        states, errors = self._measured(states)
         self.progress(0.7)
-        pieces, exact, lossless = encode_pieces(prepared, self.header, self._last)
-        levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
+        pieces, exact = encode_pieces(prepared, self.header, self._last)
+        lossless = all(exact)
+        levels = self._level_errors(_remaining(errors[-1], exact, self.geometric))
         self.progress(0.8)
         metadata = dict(prepared.surface.metadata)
         if lossless:
             metadata[DIGEST] = values_digest(as_returned(prepared.given, self.header.hole))
-        coded = self._coded(states, figures)
+        coded = self._coded(states, errors)
         return write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
 
     def _header(self) -> Header:
@@ -150,7 +152,7 @@ class Encoding:
             self.header = self._header()
             done.append(base)
             self.progress(0.1 + 0.2 * len(done) / MOST_TRIES)
-            rms = self._figures(state, canvases)[0]
+            rms = told(self._distances(state, canvases)[0][0])
             if rms <= wanted:
                 kept.clear()
                 kept[base] = found
@@ -228,15 +230,39 @@ class Encoding:
     def _tables_of_channels(self) -> list[TileTable]:
         return [self._table(number) for number in range(len(self.channels))]
 
-    def _figures(self, state: State, canvases: list[NDArray[np.int32]]) -> Figures:
-        """RMS and maximum error of what a receiver shows in this state, see `reconstruction.Reconstruction`."""
+    def _distances(self, state: State, canvases: list[NDArray[np.int32]]) -> list[tuple[float, float]]:
+        """Errors of what a receiver shows in this state: of the distances and, if there are several, of coordinates."""
         fractions = []
         for number in range(self.geometric):
             places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
             fractions.append(self._picture(number, state, places)[1])
-        curves = len(canvases) - len(self.prepared.parts)
         lattices = self.lattices[: self.geometric]
-        return coordinate_distances(self.prepared.originals, lattices, canvases[curves:], fractions)
+        return coordinate_distances(self.prepared.originals, lattices, canvases[self._curves_first :], fractions)
+
+    def _errors(self, state: State, canvases: list[NDArray[np.int32]]) -> Errors:
+        """Errors of what a receiver shows in this state, as a container tells them."""
+        distances, *found = self._distances(state, canvases)
+        if len(self.lattices) > 1:
+            found = found or [distances]
+            for number, (originals, component) in enumerate(self._others, self.geometric):
+                places = [canvas[0, :, : -PADDING or None] for canvas in canvases]
+                fraction = self._picture(number, state, places)[1]
+                shown = [canvas[:1] for canvas in canvases[self._curves_first :]]
+                found += coordinate_distances(originals, [self.lattices[number]], shown, [fraction], component)
+        channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in found)
+        return Errors(told(distances[0]), told(distances[1]), channels)
+
+    @property
+    def _curves_first(self) -> int:
+        """How many grids are curves."""
+        return len(self.layout.grids) - len(self.prepared.parts)
+
+    @cached_property
+    def _others(self) -> list[tuple[list[Original], int]]:
+        """What the channels that are no coordinates are compared with."""
+        prepared, blocks = self.prepared, self.prepared.surface.blocks
+        arrays = [[_with_channels(array) for array in (b.points, *b.attributes.values())] for b in blocks]
+        return other_originals(prepared.arrangement, arrays, [block.mask for block in blocks], self.geometric)
 
     def _picture(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Picture:
         return channel_picture(self.header, number, self.tiles[number], state[:, number], self.layout.levels, canvases)
@@ -246,55 +272,65 @@ class Encoding:
         shapes = [grid.shape for grid in self.layout.grids]
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
-    def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
+    def _measured(self, states: list[State]) -> tuple[list[State], list[Errors]]:
         """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
         canvases = self._canvases()
         kept: list[State] = []
-        figures: list[Figures] = []
+        errors: list[Errors] = []
         for state in states:
             announced = state < self._all_passes()
             shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
-            measured = self._figures(shown.astype(np.int8), canvases)
-            while figures and measured[0] > figures[-1][0]:
+            measured = self._errors(shown.astype(np.int8), canvases)
+            while errors and measured.rms > errors[-1].rms:
                 kept.pop()
-                figures.pop()
+                errors.pop()
             kept.append(state)
-            figures.append(measured)
+            errors.append(measured)
         del canvases
         pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
         self._last = to_values(self.header, pictures, self.layout.levels)
-        return kept, figures
+        return kept, errors
 
-    def _level_figures(self, last: Figures) -> list[Figures]:
-        """Errors of the states that hold all levels up to one; the last of them is the lattice itself."""
+    def _level_errors(self, last: Errors) -> list[Errors]:
+        """Errors of the states that hold all levels up to one; the last of them is the complete surface."""
         canvases, start = self._canvases(), initial_state(self.header)
-        figures = []
+        errors = []
         for level in range(self.layout.levels):
             state = start.copy()
             state[: self.layout.tiles_of(level).stop] = 0
-            figures.append(self._figures(state, canvases))
-        return [*figures, last]
+            errors.append(self._errors(state, canvases))
+        return [*errors, last]
 
     def _all_passes(self) -> State:
         """Passes of every tile and channel."""
         return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in self.channels], axis=1)
 
-    def _coded(self, states: list[State], figures: list[Figures]) -> list[CodedLayer]:
+    def _coded(self, states: list[State], errors: list[Errors]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self.tiles, self._last  # as large as what takes their place
         coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
         before = start = self._all_passes()
         layers = []
-        for state, (rms, worst) in zip(states, figures, strict=True):
+        for state, measured in zip(states, errors, strict=True):
             segments = []
             for tile, number in np.argwhere(state < before):
                 first, last = int(before[tile, number]), int(state[tile, number])
                 data = coder.code(int(tile), int(number), first, first - last)
                 top, begins = int(self.channels[number].top[tile]), first == start[tile, number]
                 segments.append(CodedSegment(int(tile), int(number), top, first - last, bool(begins), data))
-            layers.append(CodedLayer(rms, worst, segments))
+            layers.append(CodedLayer(measured, segments))
             before = state
         return layers
+
+
+def _with_channels(array: NDArray[Any]) -> NDArray[Any]:
+    return array if array.ndim == 3 else array[..., np.newaxis]
+
+
+def _remaining(errors: Errors, exact: list[bool], geometric: int) -> Errors:
+    """The errors of the complete surface, of which some channels are exact."""
+    channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
+    return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)
 
 
 def _largest(values: NDArray[np.int32]) -> int:

@@ -73,6 +73,11 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     """
     if not data:
         return restored.copy()
+    if len(data) > 1 + restored.nbytes:
+        raise CorruptStreamError(
+            f"expected at most {1 + restored.nbytes} bytes of exactness for {restored.size} values, got {len(data)}",
+            offset,
+        )
     dtype = restored.dtype
     unsigned = np.dtype(f"<u{dtype.itemsize}")
     if data[0] == _RAW:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
@@ -13,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .container import headers, sections
+from .container.fields import told, told_roughly
 from .container.frames import Frame, section_extent, whole_section
-from .container.model import ByteRange, Header, Index, LayerRecord, Piece, Segment
-from .container.pieces import windows
+from .container.model import ByteRange, Errors, Header, Index, LayerRecord, Piece, Segment
 from .decoder import Decoder
 from .errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
 from .heights import to_xyz
+from .lattice import Lattice
 from .library import require
 from .measure import extent_of
-from .picture import coordinate_distances, originals_of
-from .reconstruction import Reconstruction, initial_state
+from .picture import Original, coordinate_distances, originals_of, other_originals
+from .reconstruction import Picture, Reconstruction, initial_state
 from .seams import restore
 from .surface import Surface
 
@@ -67,7 +67,7 @@ class _Found:
     segments: list[Segment] = field(default_factory=list)
     pieces: list[Piece] = field(default_factory=list)
     exactness: ByteRange | None = None
-    figures: tuple[float, float] | None = None
+    remaining: Errors | None = None
     metadata: ByteRange | None = None
     tops: dict[tuple[int, int], int] = field(default_factory=dict)  # of tiles and channels that have been named
 
@@ -175,32 +175,31 @@ def _note(found: _Found, frame: Frame, header: Header) -> None:
     if frame.kind == sections.LAYER:
         _note_layer(found, frame, header)
     elif frame.kind == sections.EXACTNESS:
-        count = sum(1 for _ in windows(header))
-        found.figures, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, count)
+        found.remaining, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, header)
         found.exactness = place
-        found.pieces = [Piece(ByteRange(at, len(data)), zlib.crc32(data) if data else 0) for data, at in pieces]
+        found.pieces = [Piece(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in pieces]
     elif frame.kind == sections.METADATA:
         found.metadata = place
 
 
 def _note_layer(found: _Found, frame: Frame, header: Header) -> None:
-    rms, worst, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+    errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
     number = len(found.layers)
     level = found.layers[-1].level if found.layers else 0
     for entry in entries:
         # The decoder has made sure that it is told at the first segment of each.
         top = found.tops.setdefault((entry.tile, entry.channel), entry.top)
         place = ByteRange(frame.payload_offset + start, entry.length)
-        crc = zlib.crc32(frame.payload[start : start + entry.length])
-        found.segments.append(Segment(number, entry.tile, entry.channel, top, entry.passes, place, crc))
+        check = sections.check_of(frame.payload[start : start + entry.length])
+        found.segments.append(Segment(number, entry.tile, entry.channel, top, entry.passes, place, check))
         start += entry.length
         level = max(level, header.layout.tiles[entry.tile].level)
-    if found.layers and rms > found.layers[-1].rms:
+    if found.layers and errors.rms > found.layers[-1].rms:
         raise CorruptStreamError(
-            f"expected an RMS error of at most {found.layers[-1].rms}, that of the layer before, got {rms}",
+            f"expected an RMS error of at most {found.layers[-1].rms}, that of the layer before, got {errors.rms}",
             frame.offset,
         )
-    found.layers.append(LayerRecord(number, frame.offset, frame.end, level, rms, worst))
+    found.layers.append(LayerRecord(number, frame.offset, frame.end, level, *errors))
 
 
 def _take_footer(file: BinaryIO, size: int, decoder: Decoder) -> None:
@@ -214,7 +213,7 @@ def _take_footer(file: BinaryIO, size: int, decoder: Decoder) -> None:
             f"(at byte {end})"
         )
     decoder.feed(footer)
-    if sections.parse_footer(footer, end) != decoder.index.index:
+    if sections.parse_footer(footer, end)[0] != decoder.index.index:
         raise CorruptStreamError("expected a footer that points at the index, got another place", end)
     if decoder.index.size != size:
         raise CorruptStreamError(
@@ -231,22 +230,23 @@ def _compare(index: Index, found: _Found) -> None:
         ("piece", index.pieces, found.pieces),
         ("section", (index.exactness, index.metadata), (found.exactness, found.metadata)),
     )
-    for word, told, real in pairs:
-        wrong = [k for k, (a, b) in enumerate(zip(told, real, strict=False)) if a != b]
-        if wrong or len(told) != len(real):
-            number = wrong[0] if wrong else min(len(told), len(real))
+    for word, named, real in pairs:
+        wrong = [k for k, (a, b) in enumerate(zip(named, real, strict=False)) if a != b]
+        if wrong or len(named) != len(real):
+            number = wrong[0] if wrong else min(len(named), len(real))
             raise CorruptStreamError(f"expected an index that matches the file, got another {word} {number}", offset)
-    last = found.figures or (found.layers[-1].rms, found.layers[-1].max_error)
-    if (index.levels[-1].rms, index.levels[-1].max_error) != last:
+    last = found.remaining or found.layers[-1].errors
+    if index.levels[-1].errors != last:
         raise CorruptStreamError(f"expected errors {last} of the complete surface in the index, got others", offset)
 
 
 def _check_values(index: Index, surface: Surface) -> None:
     """Refuse holes or an extent that are not the surface's. The digest was checked when it was decoded."""
     header = index.header
-    if header.exact != (index.digest is not None):
-        wanted = "the SHA-256 of the values" if header.exact else "no SHA-256 of values that are not exact"
-        raise CorruptStreamError(f"expected {wanted}, got {index.digest!a:.80}", index.metadata.offset)
+    if index.digest is not None and not header.exact:
+        raise CorruptStreamError(
+            f"expected no SHA-256 of values that are not exact, got {index.digest!a:.80}", index.metadata.offset
+        )
     holes = tuple(block.holes for block in surface.blocks)
     if holes != (header.holes or (0,) * len(holes)):
         raise CorruptStreamError(f"expected {header.holes} holes in the blocks, got {holes}", 0)
@@ -290,22 +290,25 @@ def _check_errors(decoder: Decoder, index: Index, surface: Surface, progress: Ca
     for record, view in zip(index.layers, decoder.layers, strict=False):
         # What the last layer does not name has no coefficient but 0.
         state = view._state if record.number < last else np.zeros_like(view._state)
-        _agree((record.rms, record.max_error), ruler.errors(state), f"layer {record.number}", record.offset)
+        _agree(record.errors, ruler.errors(state), f"layer {record.number}", record.offset)
         progress(_DECODED + (1 - _DECODED) * (record.number + 1) / count)
     for known in index.levels[:-1]:
         state = initial_state(index.header)
         state[: index.header.layout.tiles_of(known.level).stop] = 0
-        _agree((known.rms, known.max_error), ruler.errors(state), f"level {known.level}", index.index.offset)
+        _agree(known.errors, ruler.errors(state), f"level {known.level}", index.index.offset)
         progress(_DECODED + (1 - _DECODED) * (last + 1 + known.level + 1) / count)
-    _agree((index.levels[-1].rms, index.levels[-1].max_error), (0.0, 0.0), "the exact surface", index.index.offset)
+    nothing = Errors(0.0, 0.0, ((0.0, 0.0),) * len(index.levels[-1].channels))
+    _agree(index.levels[-1].errors, nothing, "the exact surface", index.index.offset)
 
 
-def _agree(told: tuple[float, float], found: tuple[float, float], what: str, offset: int) -> None:
-    if not all(math.isclose(a, b, rel_tol=_TOLERANCE) for a, b in zip(told, found, strict=True)):
-        raise CorruptStreamError(
-            f"expected the RMS and maximum error of {what}, {found[0]} and {found[1]}, got {told[0]} and {told[1]}",
-            offset,
-        )
+def _agree(said: Errors, found: Errors, what: str, offset: int) -> None:
+    pairs = [(told, said[:2], found[:2])]
+    pairs += [(told_roughly, *channel) for channel in zip(said.channels, found.channels, strict=True)]
+    for rounded, one, other in pairs:
+        for a, b in zip(one, other, strict=True):
+            if not rounded(b * (1 - _TOLERANCE)) <= a <= rounded(b * (1 + _TOLERANCE)):
+                wanted, got = (f"{pair[0]} and {pair[1]}" for pair in (other, one))
+                raise CorruptStreamError(f"expected the RMS and maximum error of {what}, {wanted}, got {got}", offset)
 
 
 class _Ruler:
@@ -313,18 +316,36 @@ class _Ruler:
 
     def __init__(self, header: Header, reconstruction: Reconstruction, surface: Surface) -> None:
         self._header, self._reconstruction = header, reconstruction
-        points = []
+        arrays: list[list[NDArray[Any]]] = []  # points and attributes, of each block
         for block in surface.blocks:
             heights = block.points[..., 2] if header.plane is not None else block.points
-            points.append(np.ascontiguousarray(heights if heights.ndim == 3 else heights[..., np.newaxis]))
-        self._originals = originals_of(header.arrangement, points, [block.mask for block in surface.blocks])
-        self._chosen = np.arange(header.channels) < header.geometric
+            every = (heights, *block.attributes.values())
+            arrays.append([np.ascontiguousarray(a if a.ndim == 3 else a[..., np.newaxis]) for a in every])
+        masks = [block.mask for block in surface.blocks]
+        self._originals = originals_of(header.arrangement, [own[0] for own in arrays], masks)
+        self._others = other_originals(header.arrangement, arrays, masks, header.geometric)
 
-    def errors(self, state: NDArray[np.int8]) -> tuple[float, float]:
-        """RMS and maximum error of the full-resolution picture of a state, exactness aside."""
+    def errors(self, state: NDArray[np.int8]) -> Errors:
+        """Errors of the full-resolution picture of a state, exactness aside."""
         header, known = self._header, self._reconstruction
-        pictures = known.pictures(known.length, state, header.levels, self._chosen)[: header.geometric]
-        curves = len(header.layout.grids) - len(header.parts)
-        coordinates = [np.stack([grids[curves + k] for grids, _ in pictures]) for k in range(len(header.parts))]
-        lattices, fractions = header.lattices[: header.geometric], [fraction for _, fraction in pictures]
-        return coordinate_distances(self._originals, lattices, coordinates, fractions)
+
+        def picture(channel: int) -> Picture:
+            return known.picture(known.length, state, header.levels, channel)
+
+        pictures = [picture(channel) for channel in range(header.geometric)]
+        distances, *found = self._compared(self._originals, header.lattices[: header.geometric], pictures)
+        if header.channels > 1:
+            found = found or [distances]
+            for number, (originals, component) in enumerate(self._others, header.geometric):
+                own = header.lattices[number : number + 1]
+                found += self._compared(originals, own, [picture(number)], component)
+        return Errors(*distances, tuple(found))
+
+    def _compared(
+        self, originals: list[Original], lattices: Sequence[Lattice], pictures: list[Picture], component: int = 0
+    ) -> list[tuple[float, float]]:
+        curves = len(self._header.layout.grids) - len(self._header.parts)
+        parts = range(len(self._header.parts))
+        coordinates = [np.stack([grids[curves + k] for grids, _ in pictures]) for k in parts]
+        fractions = [fraction for _, fraction in pictures]
+        return coordinate_distances(originals, lattices, coordinates, fractions, component)

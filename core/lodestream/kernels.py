@@ -280,7 +280,7 @@ mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), wr
 PART_ROWS, PART_COLUMNS = 128, 512
 store_values = Kernel("store_values", reads_plane(_I32), writes_values(), *[INTEGER] * 5, *[REAL] * 3)
 square_distances = Kernel(
-    "square_distances", reads_values(), reads(_I32), reads(_F64), reads(_BOOL), writes(_F64), *[INTEGER] * 7
+    "square_distances", reads_values(), reads(_I32), reads(_F64), reads(_BOOL), writes(_F64), *[INTEGER] * 8
 )
 
 # holes.c

@@ -11,7 +11,7 @@ import msgpack
 from .digest import DIGEST
 from .errors import CorruptStreamError, InputError
 
-__all__ = ["MAX_BYTES", "check", "check_length", "fitted", "packed", "with_notes"]
+__all__ = ["FOREIGN", "MAX_BYTES", "check", "check_length", "fitted", "packed", "with_notes"]
 
 #: Most bytes of metadata as a container has them, a MessagePack map, with the fingerprint of the values in it.
 MAX_BYTES = 1 << 16
@@ -25,8 +25,11 @@ _ROOM = 1 << 12
 #: The fingerprint that an encoder adds: 64 digits in hexadecimal.
 _FINGERPRINT = {DIGEST: "0" * 64}
 
+#: A map from names of authors, such as "org.example.tool", to anything of theirs, which others pass on unchanged.
+FOREIGN = "foreign"
+
 #: Maps of which single entries are dropped, so many levels deep; of the other values, the whole one.
-_DEPTHS = {"bands": 2, "faces": 1, "scalars": 1, "tags": 2}
+_DEPTHS = {"bands": 2, "faces": 1, "foreign": 1, "scalars": 1, "tags": 2}
 
 _Path = tuple[str | int, ...]
 
@@ -48,8 +51,12 @@ def check(metadata: Mapping[str, Any]) -> None:
     Raises
     ------
     InputError
-        With their size and largest entry; or if MessagePack cannot represent a value.
+        With their size and largest entry; or if MessagePack cannot represent a value; or if ``foreign`` is no map from
+        names.
     """
+    foreign = metadata.get(FOREIGN, {})
+    if not isinstance(foreign, Mapping) or not all(isinstance(name, str) for name in foreign):
+        raise InputError(f"expected {FOREIGN!r} as a map from names of authors, got {foreign!r:.80}")
     size = len(packed({**metadata, **_FINGERPRINT}))
     if size > MAX_BYTES:
         most, largest = max((len(_packed(value)), str(key)) for key, value in metadata.items())

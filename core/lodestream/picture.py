@@ -16,7 +16,7 @@ from .lattice import Lattice
 from .measure import distances
 from .sides import Arrangement, stored
 
-__all__ = ["Original", "coordinate_distances", "originals_of", "store_values"]
+__all__ = ["Original", "coordinate_distances", "originals_of", "other_originals", "store_values"]
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
 
@@ -94,54 +94,126 @@ def originals_of(
     return originals
 
 
+def other_originals(
+    arrangement: Arrangement | None,
+    arrays: Sequence[Sequence[NDArray[Any]]],
+    masks: Sequence[NDArray[np.bool_] | None],
+    geometric: int,
+) -> list[tuple[list[Original], int]]:
+    """What the pictures of each channel that is no coordinate are compared with, and its number in those arrays.
+
+    Points count where they are valid and the channel is finite; those of several parts count in each of them.
+
+    Parameters
+    ----------
+    arrangement : Arrangement or None
+        None: there is one block, which is one part.
+    arrays : for each block its points, then its attributes
+        Shape (row, column, channel).
+    masks : bool, shape (row, column), or None, one for each block
+        True where a point is valid.
+    geometric : int
+        The first so many channels of the points are coordinates.
+    """
+    parts = None if arrangement is None else arrangement.parts
+    if parts is None:
+        valid = [masks[0]]
+    else:
+        own = [(part, masks[part.block]) for part in parts]
+        valid = [None if mask is None else stored(part, mask) for part, mask in own]
+    found = []
+    for number, array in enumerate(arrays[0]):
+        first = 0 if number else geometric
+        if first == array.shape[2]:
+            continue
+        points = [array] if parts is None else [stored(part, arrays[part.block][number]) for part in parts]
+        points = [np.ascontiguousarray(values) for values in points]
+        for channel in range(first, array.shape[2]):
+            every = zip(points, valid, strict=True)
+            found.append(([Original(values, _finite(values[..., channel], mask)) for values, mask in every], channel))
+    return found
+
+
+def _finite(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Where values are valid and finite; None: everywhere."""
+    if values.dtype.kind != "f":
+        return mask
+    finite: NDArray[np.bool_] = np.isfinite(values)
+    if mask is not None:
+        finite &= mask
+    return None if finite.all() else finite
+
+
 def coordinate_distances(
     originals: Sequence[Original],
     lattices: Sequence[Lattice],
     coordinates: Sequence[NDArray[np.int32]],
     fractions: Sequence[int],
-) -> tuple[float, float]:
+    channel: int = 0,
+) -> list[tuple[float, float]]:
     """`distances` between points and the values of lattice coordinates.
 
     Parameters
     ----------
     originals : one for each part
-    lattices : one for each channel that is a coordinate
+    lattices : one for each channel that is compared, at most three
     coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each part
     fractions : int for each of these channels
         Coordinates stand over two to this power.
+    channel : int
+        The first of the points' channels that are compared.
+
+    Returns
+    -------
+    list of (rms, maximum)
+        Of the distances; and, where there are several channels, of each by itself.
     """
-    dtype = originals[0].points.dtype
+    dtype, count = originals[0].points.dtype, sum(original.count for original in originals)
+    if not count:
+        return [(0.0, 0.0)] * _kinds(len(lattices))
     if dtype.kind == "f" or dtype.itemsize < 8:
         rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
-        parts = [_distances(*pair, rules) for pair in zip(originals, coordinates, strict=True)]
-        worst = max(part[1] for part in parts)
-        if 1e-250 < worst < 1e250:
-            total = math.fsum(part[0] for part in parts)
-            return math.sqrt(total / sum(original.count for original in originals)), math.sqrt(worst)
+        parts = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
+        worst = [max(part[1][kind] for part in parts) for kind in range(_kinds(len(lattices)))]
+        if 1e-250 < worst[0] < 1e250:
+            totals = [math.fsum(part[0][kind] for part in parts) for kind in range(len(worst))]
+            return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
     # Integers that float64 cannot tell apart, or squares that it cannot hold.
     compared = []
+    last = channel + len(lattices)
     for original, place in zip(originals, coordinates, strict=True):
         rows, columns, _ = original.points.shape
         picture = np.empty((rows, columns, len(lattices)), original.points.dtype)
         for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
             store_values(lattice, (place[number, :, :columns], fraction), picture, number)
         chosen = slice(None) if original.counted is None else original.counted
-        points = original.points[..., : len(lattices)]
-        compared.append((points[chosen], picture[chosen]))
+        compared.append((original.points[..., channel:last][chosen], picture[chosen]))
     if len(compared) == 1 and compared[0][0].ndim == 3:
-        return distances(*compared[0], len(lattices))
-    points, picture = (np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2))
-    return distances(points, picture, len(lattices))
+        points, picture = compared[0]
+    else:
+        points, picture = (
+            np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
+        )
+    found = [distances(points, picture, len(lattices))]
+    if len(lattices) > 1:
+        found += [distances(points[..., k], picture[..., k], 1) for k in range(len(lattices))]
+    return found
 
 
-def _distances(original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64]) -> tuple[float, float]:
-    """The sum and the largest of the squared distances of one part; ``rules``: `_rule` of each lattice."""
+def _kinds(channels: int) -> int:
+    return 1 + channels if channels > 1 else 1
+
+
+def _distances(
+    original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64], channel: int
+) -> tuple[list[float], list[float]]:
+    """Sums and largest of the squared distances of one part, see `kernels.square_distances`."""
     rows, columns, channels = original.points.shape
     count = -(-rows // kernels.PART_ROWS) * -(-columns // kernels.PART_COLUMNS)
-    figures = np.empty((count, 2))
+    figures = np.empty((count, _kinds(len(rules)), 2))
     counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
     arrays = original.points, coordinates, rules, counted, figures
-    shapes = rows, columns, channels, *coordinates.shape[1:]
+    shapes = rows, columns, channels, channel, *coordinates.shape[1:]
     for first in range(0, count, _PARTS):
         kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, count))
-    return math.fsum(figures[:, 0]), float(figures[:, 1].max())
+    return [math.fsum(own) for own in figures[..., 0].T], figures[..., 1].max(axis=0).tolist()

@@ -16,8 +16,8 @@ from .surface import Block, Surface
 __all__ = ["as_returned", "encode_pieces"]
 
 
-def encode_pieces(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], bool, bool]:
-    """The section's pieces; whether the coordinates are exact then, and whether all is.
+def encode_pieces(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+    """The section's pieces; and of each channel whether it is exact then.
 
     A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
     NaN and infinities, and all values of holes that are kept.
@@ -34,7 +34,7 @@ def encode_pieces(prepared: Preparation, header: Header, restored: list[Values])
     rough += [False] * (prepared.point_channels - prepared.geometric)
     for kind in prepared.kinds:
         rough += [kind.name in prepared.attribute_precisions] * kind.channels
-    exact = [True, True]
+    exact = [True] * header.channels
     for window in windows(header):
         block, lattice = prepared.surface.blocks[window.block], header.lattices[window.channel]
         mask = prepared.kept[window.block] if window.kept else block.mask
@@ -48,9 +48,9 @@ def encode_pieces(prepared: Preparation, header: Header, restored: list[Values])
                 given, wanted = wanted, np.where(np.isfinite(wanted), known, wanted)
             else:
                 given, wanted = wanted, known
-            exact[0 if window.channel < prepared.geometric else 1] &= exactness.agree(given, wanted)
+            exact[window.channel] &= exactness.agree(given, wanted)
         pieces.append(exactness.encode_piece(wanted, known, lattice.step if wanted.dtype == np.float32 else None))
-    return pieces, exact[0], all(exact)
+    return pieces, exact
 
 
 def as_returned(surface: Surface, hole: int) -> Iterator[Block]:

@@ -15,7 +15,7 @@ from .container.headers import TILE_BITS
 from .container.model import AttributeKind, JointChanges
 from .heights import to_heights
 from .joints import Groups
-from .lattice import Lattice, find_lattice, offset_lattice, precision_lattice
+from .lattice import Lattice, find_lattice, offset_lattice, precision_lattice, short_lattice
 from .layout import Layout
 from .measure import extent_of
 from .mesh.joining import change_of
@@ -145,7 +145,7 @@ class Preparation:
             if fineness < _COARSEST:
                 return None
         lattices = self.lattices(None)
-        lattices[: self.geometric] = [precision_lattice(*span, error / fineness) for span in spans]
+        lattices[: self.geometric] = [short_lattice(*span, error / fineness) for span in spans]
         return lattices, fineness
 
     def lies_on_coarse_lattice(self) -> bool:

@@ -120,7 +120,8 @@ def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: lis
         step = 2.0 * math.floor(allowed - rounding) + 1.0
     else:
         rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
-        step = 2.0 * (allowed - rounding)
+        # A container tells errors rounded up by at most one part in 2**20, and no more than was asked for.
+        step = 2.0 * (allowed * (1.0 - 2.0**-20) - rounding)
     if step <= 0:
         raise InputError(
             f"expected a precision above {rounding * math.sqrt(geometric)} for {dtype} values, got {precision}"

@@ -133,6 +133,12 @@ class Reconstruction:
                     pictures.append(pictures[0])  # of the right shapes
         return pictures
 
+    def picture(self, length: int, state: NDArray[np.int8], level: int, channel: int) -> Picture:
+        """One channel of the grids of ``level``, see `pictures`."""
+        with self._lock:
+            self._decode(length)
+            return channel_picture(self.header, channel, self._tiles[channel], state[:, channel], level)
+
     def window(
         self,
         length: int,

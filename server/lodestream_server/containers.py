@@ -179,7 +179,7 @@ def index_memory(file: BinaryIO) -> int:
 
     tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
     try:
-        return INDEX_GROWTH * parse_footer(read_from(file.fileno(), tail, FOOTER_LENGTH), tail).length
+        return INDEX_GROWTH * parse_footer(read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
     except CorruptStreamError:
         return 0
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from lodestream.container import FrameReader, Index, read_index
+from lodestream.container.sections import check_of
 from lodestream.errors import LodestreamError
 
 from . import markers
@@ -247,7 +247,7 @@ def _index(file: BinaryIO) -> Index | str:
     except LodestreamError as error:
         return str(error)
     for segment in index.segments:
-        if zlib.crc32(read(segment.range.offset, segment.range.length)) != segment.crc:
+        if check_of(read(segment.range.offset, segment.range.length)) != segment.check:
             return f"expected segments that match the index, got another one (at byte {segment.range.offset})"
     return index
 

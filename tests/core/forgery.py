@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lodestream.container import ByteRange, Index, headers, read_index, sections
+from lodestream.container import Index, headers, read_index, sections
+from lodestream.container.fields import told
+from lodestream.container.index import serialize_index
 from lodestream.digest import DIGEST
 
 __all__ = [
@@ -17,6 +19,7 @@ __all__ = [
     "sections_of",
     "unchanged",
     "with_header",
+    "with_index",
     "with_layer_errors",
     "with_metadata",
 ]
@@ -33,31 +36,48 @@ def rewritten(data: bytes, change: Callable[[int, int, bytearray], None], index:
     """
     out = bytearray(data[:8])
     seen: dict[int, int] = {}
-    for offset, end in sections_of(index_of(data)):
+    anew = dict(zip((sections.PAGES, sections.INDEX), serialize_index(index), strict=True)) if index else {}
+    places = []
+    for offset, end in sections_of(data):
         kind = data[offset]
-        start = offset + 2
-        while data[start - 1] > 127:
-            start += 1
-        payload = bytearray(data[start : end - 4])
-        if kind == sections.INDEX and index is not None:
-            payload = bytearray(sections.serialize_index(index))
+        payload = bytearray(anew.get(kind, payload_of(data, offset, end)))
         change(kind, seen.get(kind, 0), payload)
         seen[kind] = seen.get(kind, 0) + 1
-        where = len(out)
+        places.append(len(out))
         out += sections.section(kind, bytes(payload))
-    return bytes(out + sections.serialize_footer(ByteRange(where, len(out) - where)))
+    return bytes(out + sections.serialize_footer(*(len(out) - place for place in places[-2:])))
 
 
-def sections_of(index: Index) -> list[tuple[int, int]]:
+def payload_of(data: bytes, offset: int, end: int) -> bytes:
+    start = offset + 2
+    while data[start - 1] > 127:
+        start += 1
+    return data[start : end - 4]
+
+
+def with_index(data: bytes, index: Index) -> bytes:
+    """The container with another index after its other sections."""
+    pages, root = (
+        sections.section(kind, payload)
+        for kind, payload in zip((sections.PAGES, sections.INDEX), serialize_index(index), strict=True)
+    )
+    footer = sections.serialize_footer(len(pages) + len(root), len(root))
+    return data[: index_of(data).index.offset] + pages + root + footer
+
+
+def sections_of(data: bytes) -> list[tuple[int, int]]:
+    """Where each section begins and ends."""
+    index, tail = index_of(data), len(data) - sections.FOOTER_LENGTH
     places = [(8, index.layers[0].offset)]
     if index.header.masked:
         serialized = headers.serialize_header(replace(index.header, masked=False, holes=(), mask_data=()))
         places = [(8, len(serialized)), (len(serialized), index.layers[0].offset)]
     places += [(layer.offset, layer.end) for layer in index.layers]
-    for place in (index.exactness, index.metadata, index.index):
+    for place in (index.exactness, index.metadata):
         if place is not None:
             places.append((place.offset, place.end))
-    return places
+    _, root = sections.parse_footer(data[tail:], tail)
+    return [*places, (index.index.offset, root.offset), (root.offset, root.end)]
 
 
 def unchanged(kind: int, number: int, payload: bytearray) -> None:
@@ -75,7 +95,7 @@ def with_layer_errors(data: bytes, number: int, factor: float, place: int) -> by
 
     def change(kind: int, k: int, payload: bytearray) -> None:
         if (kind, k) == (sections.LAYER, number):
-            payload[8 * place : 8 * place + 8] = np.float64(figures[place]).tobytes()
+            payload[4 * place : 4 * place + 4] = np.float64(told(figures[place])).tobytes()[4:]
 
     return rewritten(data, change, replace(index, layers=tuple(layers)))
 
@@ -101,4 +121,5 @@ def with_header(data: bytes, **changes: Any) -> bytes:
     index = index_of(data)
     header = replace(index.header, **changes)
     made = headers.serialize_header(header)
-    return made + data[index.header.length :]
+    rest = with_index(data, replace(index, header=replace(index.header, length=len(made))))
+    return made + rest[index.header.length :]

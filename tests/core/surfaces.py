@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container import Index, read_index
+from lodestream.container.fields import told
 from lodestream.decoder import Decoder, View
 from lodestream.plans import Plan
 
-__all__ = ["SAMPLES", "contained", "errors", "figures", "follow", "index_of", "terrain", "torus"]
+__all__ = ["SAMPLES", "contained", "errors", "figures", "follow", "index_of", "is_told", "terrain", "torus"]
 
 Points = NDArray[Any]
 
@@ -73,6 +74,11 @@ def contained(name: str) -> tuple[bytes, Index]:
 def index_of(container: bytes) -> Index:
     """The index of a whole container."""
     return read_index(lambda offset, length: container[offset : offset + length], len(container))
+
+
+def is_told(error: float, found: float) -> bool:
+    """Whether a container tells an error that was measured so, but for the order of adding up."""
+    return told(found * (1 - 1e-9)) <= error <= told(found * (1 + 1e-9))
 
 
 def errors(original: Points, picture: Points) -> tuple[float, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import struct
 import tracemalloc
 import zlib
 from collections.abc import Callable
@@ -14,14 +16,24 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import CorruptStreamError, Decoder, StreamError, TruncatedStreamError, UnsupportedVersionError
-from lodestream.container import FrameReader, Index, describe, read_index, read_metadata, sections
-from lodestream.container.fields import FieldReader, FieldWriter
+from lodestream import (
+    CorruptStreamError,
+    Decoder,
+    StreamError,
+    TruncatedStreamError,
+    UnsupportedVersionError,
+    reference,
+)
+from lodestream.container import ByteRange, FrameReader, Index, describe, read_index, read_metadata, sections
+from lodestream.container import index as container_index
+from lodestream.container.fields import LARGEST, FieldReader, FieldWriter, told, told_roughly
+from lodestream.container.model import Errors, OptionalSection
 from lodestream.coordinate_rules import evaluate
+from lodestream.inspection import inspect
 from lodestream.plan import plan
 from lodestream.reception import Reception
 
-from .forgery import with_header
+from .forgery import with_header, with_index
 from .surfaces import contained, figures, follow, index_of
 
 HEADER_START = len(sections.SIGNATURE)
@@ -49,14 +61,23 @@ def assert_equal(one: Index, other: Index) -> None:
 def lying_header(shape: tuple[int, int], channels: int = 1, **changes: Any) -> bytes:
     """A header that promises another surface."""
     out = FieldWriter()
+    codecs = changes.get("codecs", (1,))
+    for number in (changes.get("count", len(codecs)), *codecs):
+        out.varint(number)
     out.byte(changes.get("flags", 4))
     out.byte(changes.get("dtype", 8))
-    for number in (*shape, channels, changes.get("layers", 1)):
-        out.varint(number)
+    out.varint(channels)
+    out.varint(changes.get("layers", 1))
     out.byte(changes.get("tile", 7 | 7 << 4))
-    out.pack("d", changes.get("extent", 1.0))
-    out.byte(changes.get("rule", 0))
-    out.pack("dd", changes.get("origin", 0.0), changes.get("step", 1.0))
+    out.varint(changes.get("base", 0))
+    out.number(changes.get("extent", 1.0))
+    for number in shape:
+        out.varint(number)
+    for _ in range(channels):
+        out.byte(changes.get("rule", 0))
+        out.number(changes.get("origin", 0.0))
+        out.number(changes.get("step", 1.0))
+    out.data += bytes(channels) + changes.get("rest", bytes(channels))
     return sections.SIGNATURE + sections.section(sections.HEADER, bytes(out.data))
 
 
@@ -122,44 +143,88 @@ def test_random_access_refuses_what_is_damaged_or_cut(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "header",
+    ("header", "words"),
     [
-        lying_header((0, 5)),
-        lying_header((1, 1)),
-        lying_header((2**31, 2)),
-        lying_header((2**31 + 1, 1)),
-        lying_header((2**62, 2**62)),
-        lying_header((2**31, 1), tile=1 | 13 << 4),
-        lying_header((1, 2**31), tile=13 | 1 << 4),
-        lying_header((2**20, 2**11), channels=2, flags=0),
-        lying_header((5, 5), channels=0),
-        lying_header((5, 5), channels=2),
-        lying_header((5, 5), channels=60000, flags=0),
-        lying_header((5, 5), layers=0),
-        lying_header((5, 5), layers=2**20),
-        lying_header((5, 5), flags=32),
-        lying_header((5, 5), dtype=10),
-        lying_header((5, 5), tile=0),
-        lying_header((5, 5), tile=14),
-        lying_header((5, 5), rule=2),
-        lying_header((5, 5), step=0.0),
-        lying_header((5, 5), step=-1.0),
-        lying_header((5, 5), step=math.nan),
-        lying_header((5, 5), origin=math.inf),
-        lying_header((5, 5), extent=-1.0),
-        lying_header((5, 5), extent=math.nan),
-        lying_header((100, 100)),
+        (lying_header((0, 5)), "got 0 x 1"),
+        (lying_header((1, 1)), "got 1 x 1"),
+        (lying_header((2**62, 2**62)), "expected points"),
+        (lying_header((2**62, 2), channels=3, flags=0), "expected points"),
+        (lying_header((2**30, 1), tile=1 | 13 << 4), "expected tiles"),
+        (lying_header((1, 2**30), tile=13 | 1 << 4), "expected tiles"),
+        (lying_header((2**20, 2**11), channels=2, flags=0), "predictors"),
+        (lying_header((5, 5), channels=0), "expected points"),
+        (lying_header((5, 5), channels=2), "expected points"),
+        (lying_header((5, 5), channels=70000, flags=0), "at most 65536"),
+        (lying_header((5, 5), channels=9000, flags=0, rest=b""), "more bytes"),
+        (lying_header((5, 5), layers=0), "0 layers"),
+        (lying_header((5, 5), dtype=10), "a type below 10"),
+        (lying_header((5, 5), tile=0), "expected tiles"),
+        (lying_header((5, 5), tile=14), "expected tiles"),
+        (lying_header((5, 5), rule=2), "expected a lattice"),
+        (lying_header((5, 5), step=0.0), "expected a lattice"),
+        (lying_header((5, 5), step=-1.0), "expected a lattice"),
+        (lying_header((5, 5), step=math.nan), "expected a lattice"),
+        (lying_header((5, 5), origin=math.inf), "expected a lattice"),
+        (lying_header((5, 5), extent=-1.0), "expected an extent"),
+        (lying_header((5, 5), extent=math.nan), "expected an extent"),
+        (lying_header((5, 5), codecs=(3, 1)), "each above the one before"),
+        (lying_header((5, 5), codecs=(0, 1)), "each above the one before"),
+        (lying_header((5, 5), count=2**40), "expected a number of at most"),
+        (lying_header((5, 5), rest=b"\x01\x10\x00"), "predictors of 0 steps, got 1"),
+        (lying_header((100, 100)), "predictors of 4 steps, got 0"),
     ],
 )
-def test_headers_that_lie_are_corrupt_and_take_no_memory(header: bytes) -> None:
+def test_headers_that_lie_are_corrupt_and_take_no_memory(header: bytes, words: str) -> None:
     tracemalloc.start()
     try:
-        with pytest.raises(CorruptStreamError) as caught:
+        with pytest.raises(CorruptStreamError, match=words) as caught:
             Decoder().feed(header)
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()
     assert HEADER_START <= caught.value.offset < len(header)
+
+
+def test_headers_of_more_than_fits_are_too_large_and_take_no_memory() -> None:
+    for header in (
+        lying_header((2**31, 2), rest=bytes(3)),
+        lying_header((2, 2**50), rest=bytes(3)),
+        lying_header((2**20, 2**20), rest=b"\x1e" + bytes(60)),
+    ):
+        tracemalloc.start()
+        try:
+            with pytest.raises(ls.TooLargeError, match=r"expected at most|expected a surface"):
+                Decoder().feed(header)
+            assert tracemalloc.get_traced_memory()[1] < 10_000_000
+        finally:
+            tracemalloc.stop()
+
+
+def test_a_codec_that_is_not_there_is_named_before_anything_else_is_read() -> None:
+    decoder = Decoder()
+    decoder.feed(lying_header((5, 5), layers=2**40))
+    assert decoder.header is not None
+    assert (decoder.header.codecs, decoder.header.layer_count) == ((1,), 2**40)
+    for header in (lying_header((5, 5), codecs=(1, 9)), lying_header((0, 0), codecs=(1, 9), dtype=77)):
+        with pytest.raises(UnsupportedVersionError, match="needs codec 9"):
+            Decoder().feed(header)
+        with pytest.raises(UnsupportedVersionError):
+            reference.read_container(header)
+
+
+def test_a_container_names_the_codecs_that_it_needs() -> None:
+    rng = np.random.default_rng(4)
+    heights = rng.normal(size=(20, 20)).cumsum(axis=0)
+    holes = np.ones((20, 20), np.bool_)
+    holes[3:5, 7] = False
+    kinds: list[tuple[bytes, tuple[int, ...]]] = [
+        (ls.encode(np.rint(heights).astype(np.int16)), (1,)),
+        (ls.encode(heights), (1, 5)),
+        (ls.encode(ls.Surface(np.rint(heights).astype(np.int16), mask=holes)), (1, 4)),
+        (ls.encode(np.add.outer(np.arange(40.0), np.arange(50.0)) ** 1.5, rms="1e-2d"), (1, 3)),
+    ]
+    for container, codecs in kinds:
+        assert index_of(container).header.codecs == codecs
 
 
 @pytest.mark.parametrize(
@@ -248,8 +313,9 @@ def test_a_length_that_promises_more_than_follows_takes_no_memory(length: bytes)
         assert caught.value.offset == index.header.length
 
 
-def layer(*entries: sections.Entry, rms: float = 1.0, body: bytes | None = None, channels: int = 1) -> bytes:
-    table = sections.serialize_layer(rms, 1.0, entries, channels)
+def layer(*entries: sections.Entry, body: bytes | None = None, channels: int = 1) -> bytes:
+    errors = Errors(1.0, 1.0, ((1.0, 1.0),) * channels if channels > 1 else ())
+    table = sections.serialize_layer(errors, entries, channels)
     return sections.section(
         sections.LAYER, table + (body if body is not None else b"x" * sum(e.length for e in entries))
     )
@@ -269,8 +335,8 @@ def layer(*entries: sections.Entry, rms: float = 1.0, body: bytes | None = None,
         [layer(sections.Entry(0, 0, 5, 2, 0))],
         [layer(sections.Entry(0, 0, 5, 2, 3)), layer(sections.Entry(0, 0, 5, 1, 3))],
         [layer(sections.Entry(0, 0, 5, 2, 3)), layer(sections.Entry(0, 0, 0, 10, 3))],
-        [layer(rms=math.nan)],
-        [layer(rms=-1.0)],
+        [sections.section(sections.LAYER, b"\xff\xff\xff\xff" + bytes(5))],
+        [sections.section(sections.LAYER, b"\x00\x00\xf0\x7f" + bytes(5))],
         [sections.section(sections.LAYER, b"")],
         [sections.section(sections.EXACTNESS, b"too early")],
         [sections.section(sections.METADATA, b"\xc1")],
@@ -280,6 +346,7 @@ def layer(*entries: sections.Entry, rms: float = 1.0, body: bytes | None = None,
         [sections.section(sections.METADATA, b"\xdf\xff\xff\xff\xff")],
         [sections.section(sections.METADATA, b"\x91" * 5000)],
         [sections.section(sections.INDEX, b"\x00")],
+        [sections.section(sections.PAGES, b""), sections.section(sections.INDEX, b"\x00")],
         [sections.section(sections.HEADER, b"")],
         [layer()] * 11,
     ],
@@ -314,13 +381,7 @@ def test_noise_in_place_of_every_segment_still_makes_pictures() -> None:
 
 def test_an_index_that_lies_is_corrupt() -> None:
     container, index = contained("small")
-
-    def with_index(changed: Index) -> bytes:
-        body = sections.section(sections.INDEX, sections.serialize_index(changed))
-        place = replace(index.index, length=len(body))
-        return container[: index.index.offset] + body + sections.serialize_footer(place)
-
-    assert_equal(index_of(with_index(index)), index)
+    assert_equal(index_of(with_index(container, index)), index)
     first, large = index.segments[0], replace(index.segments[0].range, length=10**6)
     lies = [
         replace(
@@ -330,28 +391,115 @@ def test_an_index_that_lies_is_corrupt() -> None:
         ),
         replace(index, segments=(replace(first, range=large), *index.segments[1:])),
         replace(index, segments=(replace(first, top=29), *index.segments[1:])),
-        replace(index, segments=(replace(first, passes=0), *index.segments[1:])),
-        replace(index, segments=(*index.segments[:-1], replace(index.segments[-1], tile=9999))),
+        replace(index, segments=(replace(first, top=0), *index.segments[1:])),
+        replace(index, segments=(replace(first, passes=2 * first.top), *index.segments[1:])),
+        replace(index, levels=index.levels[:-1]),
+        replace(index, header=replace(index.header, length=index.header.length + 1)),
+        replace(index, optional=(OptionalSection(200, ByteRange(index.layers[1].offset + 1, 9)),)),
+        replace(index, optional=(OptionalSection(9, ByteRange(index.layers[1].offset, 9)),)),
         replace(index, exactness=None),
         replace(index, metadata=replace(index.metadata, length=5)),
-        replace(index, layers=(replace(index.layers[0], rms=math.inf), *index.layers[1:])),
     ]
     for lie in lies:
         with pytest.raises(CorruptStreamError):
-            index_of(with_index(lie))
+            index_of(with_index(container, lie))
     # Segments that are each no longer than their layer, but are so together, would stand before it.
     longest = [
         replace(s, range=replace(s.range, length=index.layers[s.layer].end - index.layers[s.layer].offset))
         for s in index.segments
     ]
-    with pytest.raises(CorruptStreamError, match="within their layer"):
-        index_of(with_index(replace(index, segments=tuple(longest))))
+    with pytest.raises(CorruptStreamError, match=r"within their layer|at most"):
+        index_of(with_index(container, replace(index, segments=tuple(longest))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda page: page[:-1],
+        lambda page: page + b"\1",
+        lambda page: bytes([page[0] + 1]) + page[1:],
+        lambda page: page + b"\0\xff\xff\3",
+        lambda page: page + b"\0",
+        lambda page: page + b"\x7f\5",
+        lambda page: b"",
+    ],
+)
+def test_a_page_that_lies_is_corrupt(change: Callable[[bytes], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    container, index = contained("small")
+    for name in ("_segment_pages", "_piece_pages"):
+        honest = getattr(container_index, name)
+        with monkeypatch.context() as patch:
+            patch.setattr(container_index, name, lambda index, honest=honest: [change(*honest(index))])
+            forged = with_index(container, index)
+        with pytest.raises(CorruptStreamError):
+            index_of(forged)
+
+
+def test_noise_in_place_of_a_page_is_refused_or_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    container, index = contained("small")
+    honest, rng, refused = container_index._segment_pages, np.random.default_rng(5), 0
+    for _ in range(300):
+
+        def noisy(index: Index) -> list[bytes]:
+            page = bytearray(*honest(index))
+            for place in rng.integers(0, len(page), rng.integers(1, 4)):
+                page[place] = rng.integers(0, 256)
+            return [bytes(page)]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(container_index, "_segment_pages", noisy)
+            forged = with_index(container, index)
+        try:
+            index_of(forged)
+        except CorruptStreamError:
+            refused += 1
+    assert refused > 200
+
+
+def test_optional_sections_may_stand_anywhere_and_have_their_place_in_the_index() -> None:
+    container, index = contained("small")
+    ends = [index.header.length, index.layers[2].end, index.metadata.end]
+    out, start, optional, shift = bytearray(), 0, [], []
+    for number, end in enumerate(ends):
+        out += container[start:end]
+        for kind in range(200, 201 + number):
+            section = sections.section(kind, bytes(50 * kind))
+            optional.append(OptionalSection(kind, ByteRange(len(out), len(section))))
+            out += section
+        shift.append(len(out) - end)
+        start = end
+    out += container[start:]
+    made = with_index(container, replace(index, optional=tuple(optional)))
+    out[index.index.offset + shift[-1] :] = made[index.index.offset :]
+    found = index_of(bytes(out))
+    assert found.optional == tuple(optional)
+    assert [r.offset - known.offset for r, known in zip(found.layers, index.layers, strict=True)][:4] == [
+        shift[0],
+        shift[0],
+        shift[0],
+        shift[1],
+    ]
+    assert found.metadata.offset - index.metadata.offset == shift[1]
+    # All that reads a container skips them.
+    points = ls.decode(container).points
+    assert ls.decode(bytes(out)).points.tobytes() == points.tobytes()
+    inspect(io.BytesIO(bytes(out)), max_vertices=10_000)
+    for target in (ls.Target(), ls.Target(order="level"), ls.Target(level=1)):
+        for view, known in zip(
+            follow(bytes(out), plan(found, target))[1], follow(container, plan(index, target))[1], strict=True
+        ):
+            assert view.points.tobytes() == known.points.tobytes()
+    told_elsewhere = reference.read_container(bytes(out))
+    units = len(reference.decode(told_elsewhere).units)
+    assert reference.read_index(bytes(out), told_elsewhere, units).optional == [
+        (one.kind, one.range.offset, one.range.length) for one in optional
+    ]
 
 
 def test_a_bomb_in_place_of_exactness_is_corrupt() -> None:
     container, index = contained("small")
     assert index.exactness is not None
-    payload = sections.serialize_pieces((0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
+    payload = sections.serialize_pieces(Errors(0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
     bomb = sections.section(sections.EXACTNESS, payload)
     decoder = Decoder()
     views = decoder.feed(container[: index.exactness.offset] + bomb)
@@ -375,9 +523,8 @@ def with_long_metadata(size: int) -> tuple[bytes, Index]:
     metadata = sections.section(sections.METADATA, sections.serialize_metadata({**values, "crs": "x" * missing}))
     place = replace(index.metadata, length=len(metadata))
     moved = replace(index, metadata=place, index=replace(index.index, offset=place.end))
-    last = sections.section(sections.INDEX, sections.serialize_index(moved))
-    footer = sections.serialize_footer(replace(moved.index, length=len(last)))
-    return container[: place.offset] + metadata + last + footer, moved
+    made = with_index(container, moved)
+    return container[: place.offset] + metadata + made[index.index.offset :], moved
 
 
 def test_metadata_as_long_as_they_may_be_are_read() -> None:
@@ -425,7 +572,7 @@ def test_metadata_that_are_longer_are_refused_before_they_are_read() -> None:
         Reception(ls.Target()).expect(100, (200, 50), (100, 70_000), True)
 
 
-@pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**31, 2**62])
+@pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**31, 2**62, LARGEST])
 def test_whole_numbers_come_back_and_none_is_read_past_its_limit(number: int) -> None:
     out = FieldWriter()
     out.varint(number)
@@ -438,3 +585,35 @@ def test_whole_numbers_come_back_and_none_is_read_past_its_limit(number: int) ->
         with pytest.raises(CorruptStreamError, match=f"at most {number - 1}") as caught:
             FieldReader(bytes(out.data), 5).varint(number - 1)
         assert caught.value.offset == 5
+
+
+@pytest.mark.parametrize("exponent", [-300, -20, 0, 3, 200])
+def test_errors_are_told_no_smaller_than_they_are(exponent: int) -> None:
+    for error in [0.0, *(np.random.default_rng(2).random(50) * 10.0**exponent).tolist()]:
+        out = FieldWriter()
+        out.errors(error, 2 * error)
+        out.rough_errors(error, 2 * error)
+        assert len(out.data) == 12
+        fields = FieldReader(bytes(out.data), 0)
+        assert fields.errors() == (told(error), told(2 * error))
+        assert fields.rough_errors() == (told_roughly(error), told_roughly(2 * error))
+        assert error <= told(error) <= error * (1 + 2.0**-20)
+        assert told(error) <= told_roughly(error) <= error * (1 + 2.0**-5)
+        assert told(told(error)) == told(error)
+    assert 1.7e308 < told(1.79e308) < math.inf
+    for pattern in (b"\0\0\xf0\x7f", b"\0\0\0\x80", b"\xff" * 4):
+        with pytest.raises(CorruptStreamError, match="expected errors"):
+            FieldReader(pattern + bytes(4), 0).errors()
+    with pytest.raises(CorruptStreamError, match="expected errors"):
+        FieldReader(b"\0\0\xe0\xff", 0).rough_errors()
+
+
+@pytest.mark.parametrize("number", [0.0, 1.0, -1.0, 0.1, 1857.0, 1e300, 5e-324, -0.0])
+def test_floats_come_back_without_their_last_bytes(number: float) -> None:
+    out = FieldWriter()
+    out.number(number)
+    assert len(out.data) == 1 + len(struct.pack(">d", number).rstrip(b"\0"))
+    assert math.copysign(1, FieldReader(bytes(out.data), 0).number()) == math.copysign(1, number)
+    assert FieldReader(bytes(out.data), 0).number() == number
+    with pytest.raises(CorruptStreamError, match="at most 8 bytes"):
+        FieldReader(b"\x09" + bytes(9), 0).number()

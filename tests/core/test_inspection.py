@@ -108,10 +108,10 @@ def test_what_is_rewritten_without_a_change_is_the_same(exact: bytes, near: byte
 @pytest.mark.parametrize("place", [0, 1])
 def test_forged_errors_of_layers_of_an_exact_container(exact: bytes, place: int) -> None:
     for number in range(len(index_of(exact).layers)):
-        for factor in (0.5, 1 - 1e-6):
+        for factor in (0.5, 1 - 2e-6):
             with pytest.raises(ls.CorruptStreamError, match=f"error of layer {number}|that of the layer before"):
                 inspected(with_layer_errors(exact, number, factor, place))
-        inspected(with_layer_errors(exact, 0, 1 + 1e-13, place))  # another order of adding up
+        inspected(with_layer_errors(exact, 0, 1 - 1e-13, place))  # another order of adding up
 
 
 def test_forged_errors_of_levels_of_an_exact_container(exact: bytes) -> None:
@@ -143,14 +143,14 @@ def test_an_index_that_says_something_else(exact: bytes, near: bytes) -> None:
         first = index.segments[0]
         others: list[Index] = [
             replace(index, layers=(replace(index.layers[0], rms=1e6), *index.layers[1:])),
-            replace(index, segments=(replace(first, crc=first.crc ^ 1), *index.segments[1:])),
+            replace(index, segments=(replace(first, check=first.check ^ 1), *index.segments[1:])),
             replace(index, segments=(replace(first, top=first.top + 1), *index.segments[1:])),
             replace(index, segments=index.segments[1:]),
         ]
         if index.pieces:
             number = next(k for k, piece in enumerate(index.pieces) if piece.range.length)
             pieces = list(index.pieces)
-            pieces[number] = replace(pieces[number], crc=pieces[number].crc ^ 1)
+            pieces[number] = replace(pieces[number], check=pieces[number].check ^ 1)
             others.append(replace(index, pieces=tuple(pieces)))
         for other in others:
             with pytest.raises(ls.CorruptStreamError, match=f"at byte {index.index.offset}|expected"):
@@ -161,7 +161,8 @@ def test_a_forged_or_missing_digest(exact: bytes, near: bytes) -> None:
     def set_to(value: object) -> Callable[[dict[str, Any]], None]:
         return lambda values: values.update({DIGEST: value})
 
-    for change in (set_to("0" * 64), set_to(7), set_to(["a"]), lambda values: values.pop(DIGEST)):
+    inspected(with_metadata(exact, lambda values: values.pop(DIGEST)))  # nobody has to tell it
+    for change in (set_to("0" * 64), set_to(7), set_to(["a"])):
         with pytest.raises(ls.CorruptStreamError, match="SHA-256"):
             inspected(with_metadata(exact, change))
     with pytest.raises(ls.CorruptStreamError, match="no SHA-256 of values that are not exact"):
@@ -200,7 +201,7 @@ def test_a_forged_extent_or_number_of_holes(exact: bytes, near: bytes) -> None:
 
 def test_sections_in_another_order_or_twice(exact: bytes) -> None:
     index = index_of(exact)
-    parts = [exact[a:b] for a, b in sections_of(index)]
+    parts = [exact[a:b] for a, b in sections_of(exact)]
     footer = exact[index.index.end :]
     for order in (
         [0, 1, *range(3, len(parts)), 2],

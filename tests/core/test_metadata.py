@@ -11,7 +11,7 @@ import pytest
 
 from lodestream import formats
 from lodestream.container import read_index
-from lodestream.decoder import decode
+from lodestream.decoder import Decoder, decode
 from lodestream.encoder import encode
 from lodestream.errors import FormatWarning, InputError
 from lodestream.heights import coordinates
@@ -39,6 +39,27 @@ def test_what_messagepack_cannot_hold_is_refused() -> None:
     for value in (object(), 2**70, 1j):
         with pytest.raises(InputError, match="metadata that MessagePack can hold"):
             check({"a": value})
+
+
+def test_foreign_metadata_are_passed_on_unchanged() -> None:
+    foreign = {"org.example.tool": {"list": [1, 2.5, None, b"raw"], "map": {"a": True}}, "com.example": "text"}
+    points = np.add.outer(np.arange(40.0), np.arange(50.0))
+    container = encode(Surface(points, metadata={"foreign": foreign, "geotransform": [0, 1, 0, 0, 0, 1]}))
+    decoder = Decoder()
+    view = decoder.feed(container)[-1]
+    for surface in (decoder.surface(), view.surface(2), view.window(((3, 9), (5, 7)))):
+        assert surface.metadata["foreign"] == foreign
+    again = decode(encode(decode(container)))
+    assert again.metadata["foreign"] == foreign
+    kept, dropped = fitted({"foreign": {**foreign, "large": "x" * MAX_BYTES}})
+    assert kept["foreign"] == foreign
+    assert [name for name, _ in dropped] == ["foreign large"]
+
+
+@pytest.mark.parametrize("foreign", [5, [], "org.example", {3: "a"}])
+def test_foreign_metadata_are_a_map_from_names(foreign: Any) -> None:
+    with pytest.raises(InputError, match="map from names of authors"):
+        encode(Surface(HEIGHTS, metadata={"foreign": foreign}))
 
 
 def test_the_largest_entries_go_first_and_only_as_many_as_must() -> None:

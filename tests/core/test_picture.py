@@ -58,11 +58,13 @@ def test_distances_are_those_of_the_picture(dtype: str) -> None:
                 store_values(lattice, (numbers[channel, :, : shape[1]], fraction), picture, channel)
             original = np.roll(picture, 1, axis=1)
             found = coordinate_distances([Original(original, None)], lattices, [numbers], [fraction] * geometric)
-            assert found == pytest.approx(distances(original, picture, geometric), rel=1e-12, abs=0)
-            assert coordinate_distances([Original(picture, None)], lattices, [numbers], [fraction] * geometric) == (
-                0.0,
-                0.0,
-            )
+            assert len(found) == (1 if geometric == 1 else 1 + geometric)
+            assert found[0] == pytest.approx(distances(original, picture, geometric), rel=1e-12, abs=0)
+            for channel, pair in enumerate(found[1:]):
+                expected = distances(original[..., channel], picture[..., channel], 1)
+                assert pair == pytest.approx(expected, rel=1e-12, abs=1e-150 * found[0][1])
+            same = coordinate_distances([Original(picture, None)], lattices, [numbers], [fraction] * geometric)
+            assert same == [(0.0, 0.0)] * len(found)
 
 
 def plain_distances(original: NDArray[Any], picture: NDArray[Any], counted: NDArray[np.bool_]) -> tuple[float, float]:
@@ -100,7 +102,11 @@ def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.Monke
         original = np.zeros((*shape, geometric + 1), dtype)
         original[..., :-1] = np.roll(shown, 1, axis=1)
         for mask in (None, counted):
-            expected = plain_distances(original, shown, np.ones(shape, np.bool_) if mask is None else mask)
+            known = np.ones(shape, np.bool_) if mask is None else mask
+            expected = [plain_distances(original, shown, known)]
+            if geometric > 1:
+                channels = [slice(k, k + 1) for k in range(geometric)]
+                expected += [plain_distances(original[..., own], shown[..., own], known) for own in channels]
             for at_once in (1, 16):
                 monkeypatch.setattr(picture, "_PARTS", at_once)
                 found = coordinate_distances([Original(original, mask)], lattices, [numbers], [3] * geometric)
@@ -188,10 +194,11 @@ COMPARED: dict[str, Any] = {
     "coordinates": np.zeros((2, 3, 602), np.int32),
     "rules": np.tile([0.0, 0.0, 1.0, 1.0], 2),
     "counted": np.zeros(0, np.bool_),
-    "figures": np.zeros((2, 2)),
+    "figures": np.zeros((2, 3, 2)),
     "rows": 3,
     "columns": 600,
     "channels": 3,
+    "channel": 1,
     "height": 3,
     "pitch": 602,
     "first": 0,
@@ -222,14 +229,40 @@ COMPARED: dict[str, Any] = {
         {"first": -1},
         {"first": 2, "last": 1},
         {"last": 3},
-        {"figures": np.zeros((1, 2))},
+        {"figures": np.zeros((2, 2))},
         {"figures": np.zeros(0)},
+        {"channel": -1},
+        {"channel": 2},
+        {"channel": 2**62},
+        {
+            "points": np.zeros((3, 600, 4), np.float32),
+            "channels": 4,
+            "channel": 0,
+            "coordinates": np.zeros((4, 3, 602), np.int32),
+            "rules": np.tile([0.0, 0.0, 1.0, 1.0], 4),
+            "figures": np.zeros((2, 5, 2)),
+        },
     ],
 )
 def test_distances_that_do_not_fit_are_refused(changed: dict[str, Any]) -> None:
     assert kernels.square_distances(*COMPARED.values()) == 0
     with pytest.raises(ValueError, match="do not fit"):
         kernels.square_distances(*(COMPARED | changed).values())
+
+
+@pytest.mark.parametrize("dtype", ["int16", "int64", "float32"])
+def test_a_channel_among_others_is_compared_by_itself(dtype: str) -> None:
+    numbers = coordinates((1, 20, 30))
+    points = np.random.default_rng(3).integers(-100, 100, (20, 30, 5)).astype(dtype)
+    shown = np.zeros((20, 30, 1), dtype)
+    store_values(LATTICES[5], (numbers[0, :, :30], 4), shown, 0)
+    counted = np.random.default_rng(4).random((20, 30)) < 0.5
+    for mask in (None, counted):
+        found = coordinate_distances([Original(points, mask)], [LATTICES[5]], [numbers], [4], 3)
+        chosen = np.ones((20, 30), np.bool_) if mask is None else mask
+        assert found == [pytest.approx(distances(points[..., 3][chosen][None], shown[..., 0][chosen][None], 1))]
+    nowhere = Original(points, np.zeros((20, 30), np.bool_))
+    assert coordinate_distances([nowhere], [LATTICES[5]], [numbers], [4], 3) == [(0.0, 0.0)]
 
 
 def test_attributes_have_no_part_in_distances() -> None:
@@ -239,6 +272,6 @@ def test_attributes_have_no_part_in_distances() -> None:
         store_values(LATTICES[0], (numbers[channel, :, :30], 0), points, channel)
     points[..., 3:] = 1e30
     points[4, 5, 2] += 1024.0
-    rms, worst = coordinate_distances([Original(points, None)], LATTICES[:1] * 3, [numbers], [0, 0, 0])
+    rms, worst = coordinate_distances([Original(points, None)], LATTICES[:1] * 3, [numbers], [0, 0, 0])[0]
     assert worst == pytest.approx(1024.0, rel=1e-3)
     assert rms == pytest.approx(worst / np.sqrt(600))

@@ -51,7 +51,7 @@ def surface_of(name: str) -> list[Shown]:
 
 def index_of(name: str) -> Index:
     container, decoder = decoded(name)
-    return read_index(file_of(name), container, decoder.levels.last + 1)
+    return read_index(file_of(name), container, len(decoder.units))
 
 
 def digests(blocks: list[Shown]) -> list[str]:
@@ -92,14 +92,14 @@ def test_every_layer_gives_its_reconstruction(name: str) -> None:
     last = len(container.layers)
     assert last == container.header.layers == len(expected) - (container.exactness is not None)
     for layer, wanted in zip(container.layers, expected, strict=False):
-        assert (layer.end, layer.rms, layer.maximum) == (wanted["bytes"], wanted["rms"], wanted["max"])
+        assert (layer.end, layer.errors.rms, layer.errors.maximum) == (wanted["bytes"], wanted["rms"], wanted["max"])
     afforded = max(2, AFFORDED // values_of(name))
     for count in sorted({round(1 + k * (last - 1) / (afforded - 1)) for k in range(afforded)}):
         shown = decoder.shown(count) if count < last or container.exactness else surface_of(name)
         assert digests(shown) == expected[count - 1]["sha256"], f"layer {count}"
     assert digests(surface_of(name)) == expected[-1]["sha256"]
     if container.exactness is not None:
-        assert (container.exactness.rms, container.exactness.maximum) == (expected[-1]["rms"], expected[-1]["max"])
+        assert container.exactness.errors[:2] == (expected[-1]["rms"], expected[-1]["max"])
 
 
 @golden
@@ -114,7 +114,9 @@ def test_every_level_gives_its_grids(name: str) -> None:
 @golden
 def test_the_index_finds_every_segment_of_the_layers(name: str) -> None:
     container, index = decoded(name)[0], index_of(name)
-    assert index.layer_errors == [(layer.rms, layer.maximum) for layer in container.layers]
+    assert index.layer_errors == [layer.errors for layer in container.layers]
+    complete = container.exactness or container.layers[-1]
+    assert index.level_errors[-1] == complete.errors
     for layer, entries in zip(container.layers, index.segments, strict=True):
         for segment, entry in zip(layer.segments, entries, strict=True):
             found = entry.take(file_of(name))  # which checks the segment's CRC

@@ -131,7 +131,7 @@ def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
     header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
     assert header.quantiser is not None
     payload = serialize_header(header)[10:-4]
-    place, own = 5, FieldWriter()  # after flags, type, channels, layers, tile
+    place, own = 8, FieldWriter()  # after two codecs, flags, type, channels, layers, tile
     own.varint(header.quantiser.base)
     assert payload[place : place + len(own.data)] == own.data
     other = FieldWriter()
@@ -143,3 +143,18 @@ def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
     else:
         quantiser = parse_header(changed, 0, 0).quantiser
         assert (0 if quantiser is None else quantiser.base) == base
+
+
+@pytest.mark.parametrize("shape", [(641, 1153), (321, 385), (449, 449)])
+def test_a_brief_stream_of_heights_takes_few_bytes_beside_its_segments(shape: tuple[int, int]) -> None:
+    """At most 120 before the index, and 250 of metadata and index."""
+    rows, columns = np.meshgrid(*(np.linspace(0, 9, n) for n in shape), indexing="ij")
+    ridges = 400 * np.abs(np.sin(rows + np.cos(columns))) + 90 * np.sin(3 * columns - rows) * np.cos(2 * rows)
+    ridges += 60 * np.sin(17 * rows + 5 * columns) + 40 * np.sin(23 * columns - 9 * rows)
+    points = np.rint(1200 + ridges + np.random.default_rng(6).normal(size=shape)).astype(np.int16)
+    made = ls.encode(points, rms="1e-2d")
+    index = read_index(lambda offset, length: made[offset : offset + length], len(made))
+    segments = sum(segment.range.length for segment in index.segments)
+    assert 500 < segments < 6000
+    assert index.metadata.offset - segments <= 120
+    assert index.metadata.length + index.index.length <= 250

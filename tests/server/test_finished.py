@@ -16,6 +16,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.container import describe, sections
+from lodestream.container.model import Errors
 from lodestream.container.writer import CodedLayer, write_container
 from lodestream.predictors import default_predictors
 from lodestream_server import fsck, repair, running_server, worker
@@ -205,7 +206,8 @@ def promising(rows: int, columns: int) -> bytes:
     header = replace(known, blocks=(((rows, columns), (False, False)),), exact=False, corrected=False)
     header = replace(header, predictors=default_predictors(header.layout)[np.newaxis])
     header = replace(header, empty=((2 << header.levels) - 1,))
-    return write_container(header, [CodedLayer(0.0, 0.0, [])], [(0.0, 0.0)] * (header.levels + 1), [], {}, exact=False)
+    nothing = Errors(0.0, 0.0)
+    return write_container(header, [CodedLayer(nothing, [])], [nothing] * (header.levels + 1), [], {}, exact=False)
 
 
 def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def _mend_container(data: bytes) -> bytes:
         out[end - 4 : end] = zlib.crc32(out[place : end - 4]).to_bytes(4, "little")
         place = end
     if len(out) - place == FOOTER_LENGTH:
-        out[place + 12 : place + 16] = zlib.crc32(out[place : place + 12]).to_bytes(4, "little")
+        out[place + 16 : place + 20] = zlib.crc32(out[place : place + 16]).to_bytes(4, "little")
     return bytes(out)
 
 

@@ -74,7 +74,7 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
             return file.read(length)
 
         try:
-            return describe(read_index(read, size, Capacity(args.max_vertices)))
+            return describe(read_index(read, size, Capacity(args.max_vertices)), channels=True)
         except (StreamError, TooLargeError) as error:
             cut = isinstance(error, TruncatedStreamError)
             raise named(

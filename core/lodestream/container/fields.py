@@ -1,4 +1,4 @@
-"""Numbers in bytes: little-endian, and whole numbers of any size in groups of seven bits (LEB128)."""
+"""Numbers in bytes: little-endian, whole numbers in groups of seven bits (LEB128), floats without their last bytes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,34 @@ import struct
 
 from ..errors import CorruptStreamError
 
-__all__ = ["FieldReader", "FieldWriter"]
+__all__ = ["LARGEST", "FieldReader", "FieldWriter", "told", "told_roughly"]
+
+#: The largest whole number that a field holds.
+LARGEST = 2**63 - 1
+# An error is the highest of the 63 bits below the sign of a float64, so many of them, in so many bytes.
+_TOLD, _TOLD_ROUGHLY = (31, 4), (16, 2)
+_INFINITY = 0x7FF << 52
+
+
+def told(error: float) -> float:
+    """The least number that a field of an error holds and is not below this one; at most the largest it holds."""
+    return _from_upper(_upper(error, _TOLD[0]), _TOLD[0])
+
+
+def told_roughly(error: float) -> float:
+    """As `told`, of a field of two bytes."""
+    return _from_upper(_upper(error, _TOLD_ROUGHLY[0]), _TOLD_ROUGHLY[0])
+
+
+def _upper(error: float, bits: int) -> int:
+    """The highest bits below the sign of a number of 0 or more, rounded up."""
+    pattern, shift = int.from_bytes(struct.pack(">d", error)), 63 - bits
+    return min(-(-pattern >> shift), (_INFINITY >> shift) - 1)
+
+
+def _from_upper(upper: int, bits: int) -> float:
+    (number,) = struct.unpack(">d", (upper << 63 - bits).to_bytes(8))
+    return float(number)
 
 
 class FieldWriter:
@@ -16,7 +43,7 @@ class FieldWriter:
         self.data = bytearray()
 
     def varint(self, number: int) -> None:
-        """A whole number of 0 or more: seven bits a byte, least significant first; the eighth bit: more follow."""
+        """A whole number of 0 to `LARGEST`: seven bits a byte, least significant first; the eighth bit: more follow."""
         while number > 127:
             self.data.append(number & 127 | 128)
             number >>= 7
@@ -29,6 +56,22 @@ class FieldWriter:
     def pack(self, layout: str, *numbers: float) -> None:
         """Numbers by a layout of `struct`, little-endian."""
         self.data += struct.pack("<" + layout, *numbers)
+
+    def number(self, value: float) -> None:
+        """A float64: a count of bytes, then so many of them, the highest first; those left out are 0."""
+        pattern = struct.pack(">d", value).rstrip(b"\0")
+        self.data.append(len(pattern))
+        self.data += pattern
+
+    def errors(self, *errors: float) -> None:
+        """Errors of 0 or more, rounded up to what four bytes each hold, see `told`."""
+        for error in errors:
+            self.data += _upper(error, _TOLD[0]).to_bytes(_TOLD[1], "little")
+
+    def rough_errors(self, *errors: float) -> None:
+        """Errors of 0 or more, rounded up to what two bytes each hold, see `told_roughly`."""
+        for error in errors:
+            self.data += _upper(error, _TOLD_ROUGHLY[0]).to_bytes(_TOLD_ROUGHLY[1], "little")
 
 
 class FieldReader:
@@ -47,6 +90,11 @@ class FieldReader:
         """Offset in the container of the next field."""
         return self.offset + self.place
 
+    @property
+    def left(self) -> int:
+        """Bytes that were not taken."""
+        return len(self.data) - self.place
+
     def take(self, count: int) -> memoryview:
         """The next bytes."""
         if count > len(self.data) - self.place:
@@ -61,7 +109,7 @@ class FieldReader:
         self.place += 1
         return self.data[self.place - 1]
 
-    def varint(self, limit: int) -> int:
+    def varint(self, limit: int = LARGEST) -> int:
         """A whole number that must not exceed ``limit``."""
         start, number, shift = self.at, 0, 0
         while True:
@@ -70,7 +118,7 @@ class FieldReader:
             shift += 7
             if byte < 128:
                 break
-            if shift > 63:
+            if shift == 63:
                 raise CorruptStreamError("expected a whole number of at most 9 bytes, got more", start)
         if number > limit:
             raise CorruptStreamError(f"expected a number of at most {limit}, got {number}", start)
@@ -79,6 +127,29 @@ class FieldReader:
     def unpack(self, layout: str) -> tuple[float, ...]:
         """Numbers by a layout of `struct`, little-endian."""
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def number(self) -> float:
+        """A float64 without its last bytes, see `FieldWriter.number`; it may be infinite or no number."""
+        start, count = self.at, self.byte()
+        if count > 8:
+            raise CorruptStreamError(f"expected at most 8 bytes of a float64, got {count}", start)
+        (value,) = struct.unpack(">d", bytes(self.take(count)).ljust(8, b"\0"))
+        return float(value)
+
+    def errors(self) -> tuple[float, float]:
+        """RMS and maximum error in four bytes each."""
+        return self._errors(*_TOLD)
+
+    def rough_errors(self) -> tuple[float, float]:
+        """RMS and maximum error in two bytes each."""
+        return self._errors(*_TOLD_ROUGHLY)
+
+    def _errors(self, bits: int, size: int) -> tuple[float, float]:
+        start, limit = self.at, _INFINITY >> 63 - bits
+        rms, worst = (int.from_bytes(self.take(size), "little") for _ in range(2))
+        if rms >= limit or worst >= limit:
+            raise CorruptStreamError(f"expected errors of 0 or more, got the patterns {rms:x} and {worst:x}", start)
+        return _from_upper(rms, bits), _from_upper(worst, bits)
 
     def end(self) -> None:
         """Raises `CorruptStreamError` unless every byte was taken."""

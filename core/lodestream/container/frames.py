@@ -11,9 +11,19 @@ from ..errors import CorruptStreamError, UnsupportedVersionError
 from ..metadata import check_length
 from . import sections
 
-__all__ = ["Frame", "FrameReader", "section_extent", "section_lengths", "whole_section"]
+__all__ = [
+    "Frame",
+    "FrameReader",
+    "index_extent",
+    "index_sections",
+    "section_extent",
+    "section_lengths",
+    "whole_section",
+]
 
 _START = len(sections.SIGNATURE)
+#: The kind and length of a section take at most so many bytes.
+_LONGEST_START = 10
 _KNOWN = {
     sections.HEADER,
     sections.LAYER,
@@ -22,6 +32,7 @@ _KNOWN = {
     sections.INDEX,
     sections.MASKS,
     sections.KEPT_MASKS,
+    sections.PAGES,
 }
 
 
@@ -140,6 +151,29 @@ def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | No
     if len(data) >= 10:
         raise CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", offset)
     return None
+
+
+def index_extent(data: bytes | bytearray, offset: int) -> int | None:
+    """Where the index ends that stands at the start of ``data``: its pages and its root; None: not yet to be told."""
+    pages = section_extent(data[:_LONGEST_START], offset)
+    if pages is None:
+        return None
+    root = section_extent(data[pages[1] : pages[1] + _LONGEST_START], offset + pages[1])
+    return None if root is None else pages[1] + root[1]
+
+
+def index_sections(data: bytes, offset: int) -> tuple[Frame, Frame]:
+    """The pages and the root of an index that was fetched by itself.
+
+    Raises
+    ------
+    CorruptStreamError
+        When these are not two whole sections.
+    """
+    pages = section_extent(data[:_LONGEST_START], offset)
+    end = len(data) if pages is None else pages[1]
+    root = whole_section(data[end:], offset + end, sections.INDEX)
+    return whole_section(data[:end], offset, sections.PAGES), root
 
 
 def checked(frame: bytes, kind: int, offset: int, start: int) -> Frame:

@@ -8,18 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrangement import grids_of
-from ..errors import CorruptStreamError
+from ..errors import CorruptStreamError, TooLargeError
 from ..lattice import Lattice
 from ..layout import Layout
 from ..predictors import CURVES, default_predictors, fitted_steps
 from ..quantiser import MOST_BASE, Quantiser
-from .fields import FieldReader, FieldWriter
+from . import codecs
+from .fields import LARGEST, FieldReader, FieldWriter
 from .frames import Frame
 from .model import Header
 from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
-    LARGEST_SURFACE,
+    LONGEST_AXIS,
     Extras,
     parse_arrangement,
     parse_extras,
@@ -37,6 +38,7 @@ _RULES = ("affine", "decimal")
 def serialize_header(header: Header) -> bytes:
     """Signature, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
+    codecs.serialize_codecs(out, header.codecs)
     extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
     marks = header.flat, header.exact, header.corrected, header.masked, header.arrangement is not None, bool(extras)
     out.byte(sum(1 << place for place, flag in enumerate((*header.closed, *marks)) if flag))
@@ -45,7 +47,7 @@ def serialize_header(header: Header) -> bytes:
     out.varint(header.layer_count)
     out.byte(header.tile[0] | header.tile[1] << 4)
     out.varint(0 if header.quantiser is None else header.quantiser.base)
-    out.pack("d", header.extent)
+    out.number(header.extent)
     if header.arrangement is None:
         out.varint(header.shape[0])
         out.varint(header.shape[1])
@@ -56,14 +58,16 @@ def serialize_header(header: Header) -> bytes:
         out.data += extras
     for lattice in header.lattices:
         out.byte(_RULES.index(lattice.rule))
-        out.pack("dd", lattice.origin, lattice.step)
+        out.number(lattice.origin)
+        out.number(lattice.step)
     for levels in header.empty:
         out.varint(levels)
     fitted = fitted_steps(header.layout)
     for channel, predictors in enumerate(header.predictors):
-        for level, axis in fitted:
-            if axis < CURVES or channel < header.geometric:
-                out.pack("bb", *(int(x) for x in predictors[level, axis]))
+        own = [(level, axis) for level, axis in fitted if axis < CURVES or channel < header.geometric]
+        out.varint(len(own))
+        for level, axis in own:
+            out.pack("bb", *(int(x) for x in predictors[level, axis]))
     data = SIGNATURE + section(HEADER, bytes(out.data))
     if not header.masked:
         return data
@@ -117,28 +121,32 @@ def parse_masks(header: Header, frame: Frame) -> Header:
 def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     """Header section's payload, which stands at ``offset``; the header ends at ``length``."""
     fields = FieldReader(payload, offset)
+    needed = codecs.parse_codecs(fields)
     flags, code = fields.byte(), fields.byte()
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
-    point_channels, layer_count = fields.varint(2**16), fields.varint(2**16)
+    point_channels, layer_count = fields.varint(2**16), fields.varint()
     exponents, base = fields.byte(), fields.varint(MOST_BASE)
     tile = exponents & 15, exponents >> 4
-    (extent,) = fields.unpack("d")
+    extent = fields.number()
     arrangement = None
     if flags & 64:
         blocks, arrangement = parse_arrangement(fields)
     else:
-        shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+        shape = fields.varint(), fields.varint()
         blocks = ((shape, (bool(flags & 1), bool(flags & 2))),)
     points = sum(rows * columns for (rows, columns), _ in blocks)
     extras = parse_extras(fields.take(fields.varint(len(payload))), offset, points) if flags & 128 else Extras()
     attributes = extras.attributes
     channels = point_channels + sum(kind.channels for kind in attributes)
     few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
-    if few or points * channels > LARGEST_SURFACE:
+    if few or points * channels > LARGEST:
         raise CorruptStreamError(
             f"expected points, channels and layers, got {points} x {channels}, {layer_count} layers", offset
         )
+    longest = max(length for shape, _ in blocks for length in shape)
+    if longest > LONGEST_AXIS:
+        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {longest:,}")
     # Tiles across a narrow surface would be many, and nearly empty.
     count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
     if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
@@ -148,7 +156,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     lattices = []
     for _ in range(channels):
         start, rule = fields.at, fields.byte()
-        origin, step = fields.unpack("dd")
+        origin, step = fields.number(), fields.number()
         if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
             raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
         lattices.append(Lattice(_RULES[rule], origin, step))
@@ -157,9 +165,12 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     predictors = np.stack([default_predictors(grids)] * channels)
     fitted = fitted_steps(grids)
     for channel in range(channels):
-        for level, axis in fitted:
-            if axis < CURVES or channel < min(point_channels, 3):
-                predictors[channel, level, axis] = fields.unpack("bb")
+        own = [(level, axis) for level, axis in fitted if axis < CURVES or channel < min(point_channels, 3)]
+        start, count = fields.at, fields.varint()
+        if count != len(own):
+            raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
+        for level, axis in own:
+            predictors[channel, level, axis] = fields.unpack("bb")
     if (predictors == -128).any():
         raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
     fields.end()
@@ -178,6 +189,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
         layer_count=layer_count,
+        codecs=needed,
         plane=extras.plane,
         masked=bool(flags & 32),
         quantiser=Quantiser(base) if base else None,

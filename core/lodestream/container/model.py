@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,13 @@ from ..surface import Closed
 __all__ = [
     "AttributeKind",
     "ByteRange",
+    "Errors",
     "Header",
     "Index",
     "JointChanges",
     "LayerRecord",
     "LevelRecord",
+    "OptionalSection",
     "Piece",
     "Segment",
 ]
@@ -36,7 +38,7 @@ __all__ = [
 JointChanges = tuple[tuple[Runs, Runs], tuple[Runs, Runs]]
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class ByteRange:
     """Bytes ``offset`` to ``offset + length`` of a container."""
 
@@ -47,6 +49,17 @@ class ByteRange:
     def end(self) -> int:
         """The first byte after the range."""
         return self.offset + self.length
+
+
+class Errors(NamedTuple):
+    """Root mean square and maximum of the distances of a reconstruction from the original, in the surface's unit.
+
+    ``channels`` are RMS and maximum of each channel by itself, empty where there is only one.
+    """
+
+    rms: float
+    maximum: float
+    channels: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -93,6 +106,8 @@ class Header:
         An exactness section follows the layers.
     layer_count : int
         Layers of the complete stream.
+    codecs : tuple of int
+        What is needed to decode, by rising number, see `container.codecs`.
     plane : mapping or None
         Of heights that came with the x and y of a regular lattice: what restores them, see `lodestream.heights`.
     masked : bool
@@ -130,6 +145,7 @@ class Header:
     exact: bool
     corrected: bool
     layer_count: int
+    codecs: tuple[int, ...] = ()
     plane: Mapping[str, Any] | None = None
     masked: bool = False
     hole: int = 0
@@ -255,7 +271,7 @@ class LayerRecord:
 
     ``end`` is the length of the container's prefix that ends with the layer, ``level`` the finest level with a decoded
     segment, ``rms`` and ``max_error`` the measured errors of the full-resolution picture that the layer completes, in
-    the surface's unit.
+    the surface's unit. ``channels``: see `Errors`.
     """
 
     number: int
@@ -264,13 +280,19 @@ class LayerRecord:
     level: int
     rms: float
     max_error: float
+    channels: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def errors(self) -> Errors:
+        """All of its errors."""
+        return Errors(self.rms, self.max_error, self.channels)
 
 
 @dataclass(frozen=True)
 class LevelRecord:
     """The state that holds all of the levels up to one and nothing finer; ``bytes`` is what `plan` sends for it.
 
-    ``shape`` is that of the only block's grid, None where there are several.
+    ``shape`` is that of the only block's grid, None where there are several. ``channels``: see `Errors`.
     """
 
     level: int
@@ -278,13 +300,20 @@ class LevelRecord:
     bytes: int
     rms: float
     max_error: float
+    channels: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def errors(self) -> Errors:
+        """All of its errors."""
+        return Errors(self.rms, self.max_error, self.channels)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Segment:
     """A run of ``passes`` coding passes that one tile of one channel adds in one layer.
 
-    ``top`` is the number of bit-planes of the tile, told with its first segment and repeated here.
+    ``top`` is the number of bit-planes of the tile, told with its first segment and repeated here; ``check`` is the
+    lower half of the CRC-32 of its bytes.
     """
 
     layer: int
@@ -293,15 +322,23 @@ class Segment:
     top: int
     passes: int
     range: ByteRange
-    crc: int
+    check: int
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """What corrects one channel in one window of a block; ``check`` is the lower half of the CRC-32 of its bytes."""
+
+    range: ByteRange
+    check: int
 
 
 @dataclass(frozen=True)
-class Piece:
-    """What corrects one channel in one window of a block; ``crc`` is of its bytes."""
+class OptionalSection:
+    """A section that a reader may leave alone: its kind, 128 to 255, and its place."""
 
+    kind: int
     range: ByteRange
-    crc: int
 
 
 @dataclass(frozen=True)
@@ -309,7 +346,8 @@ class Index:
     """Where everything lies in a complete container.
 
     ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``pieces`` of it stand in
-    the order of `pieces.windows`. ``size`` is the file's, ``digest`` the SHA-256 of the values where all are exact.
+    the order of `pieces.windows`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the SHA-256
+    of the values where all are exact.
     """
 
     header: Header
@@ -321,6 +359,7 @@ class Index:
     metadata: ByteRange
     index: ByteRange
     size: int
+    optional: tuple[OptionalSection, ...] = ()
     metadata_values: Mapping[str, Any] = field(default_factory=dict)
     digest: str | None = None
 

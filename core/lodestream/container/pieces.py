@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from .model import Header
 
-__all__ = ["Window", "windows"]
+__all__ = ["Window", "count_windows", "windows"]
 
 
 class Window(NamedTuple):
@@ -34,3 +34,8 @@ def windows(header: Header) -> Iterator[Window]:
                     down, across = (top, min(top + height, rows)), (left, min(left + width, columns))
                     for channel in range(header.channels):
                         yield Window(channel, block, down, across, kept)
+
+
+def count_windows(header: Header) -> int:
+    """How many windows there are, each with a piece for every channel; those of kept holes count for themselves."""
+    return sum(1 for _ in windows(header)) // header.channels

@@ -10,13 +10,14 @@ from ..capacity import Capacity
 from ..digest import DIGEST
 from ..errors import CorruptStreamError, TruncatedStreamError
 from . import headers, sections
-from .frames import FrameReader, whole_section
-from .model import ByteRange, Header, Index
+from .frames import Frame, FrameReader, index_sections, whole_section
+from .index import parse_index
+from .model import ByteRange, Header, Index, LayerRecord, LevelRecord
 
-__all__ = ["INDEX_GROWTH", "describe", "index_from", "read_index", "read_metadata", "with_level_bytes"]
+__all__ = ["INDEX_GROWTH", "describe", "index_from", "index_of", "read_index", "read_metadata"]
 
 #: How many times its bytes an index takes in memory.
-INDEX_GROWTH = 32
+INDEX_GROWTH = 64
 
 _FIRST_READ = 512
 
@@ -47,7 +48,7 @@ def read_index(read: Callable[[int, int], bytes], size: int, capacity: Capacity 
         capacity.promise(0, (), masked=0, tables=header.tables)
     tail = size - sections.FOOTER_LENGTH
     try:
-        place = sections.parse_footer(read(max(tail, 0), sections.FOOTER_LENGTH), tail)
+        place, _ = sections.parse_footer(read(max(tail, 0), sections.FOOTER_LENGTH), tail)
     except CorruptStreamError:
         raise TruncatedStreamError(f"expected a container that ends with a footer, got {size} bytes without") from None
     if capacity is not None:
@@ -88,14 +89,16 @@ def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacit
 
 
 def index_from(data: bytes, place: ByteRange, header: Header) -> Index:
-    """Index from the bytes of its section, with what `plan` sends for each level."""
-    frame = whole_section(data, place.offset, sections.INDEX)
-    index = sections.parse_index(frame.payload, frame.payload_offset, place, header)
-    return with_level_bytes(index)
+    """Index from its bytes, pages and root, with what `plan` sends for each level."""
+    return index_of(*index_sections(data, place.offset), header)
 
 
-def with_level_bytes(index: Index) -> Index:
-    """The index with each level's bytes: header and segments up to it; for the last level the complete stream."""
+def index_of(pages: Frame, root: Frame, header: Header) -> Index:
+    """Index from its two sections, with each level's bytes.
+
+    These are header and segments up to the level; for the last one the complete stream.
+    """
+    index = parse_index(pages, root, header)
     sizes = [0] * len(index.levels)
     for segment in index.segments:
         sizes[index.header.layout.tiles[segment.tile].level] += segment.range.length
@@ -113,13 +116,18 @@ def read_metadata(data: bytes, place: ByteRange) -> dict[str, Any]:
     return sections.parse_metadata(frame.payload, frame.payload_offset)
 
 
-def describe(index: Index) -> dict[str, Any]:
+def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
     """What is known of a surface, in plain values: the keys of ``lodestream info --json``.
 
     ``levels`` are the states that hold all of the levels up to one and nothing finer, ``layers`` the steps of quality
     in file order; ``bytes`` are lengths of the container's prefix (layers), of what `plan` sends (levels), and of the
-    whole file.
+    whole file. With ``channels`` each of them has RMS and maximum of every channel too, where there are several.
     """
+
+    def errors(record: LayerRecord | LevelRecord) -> dict[str, Any]:
+        own = {"channels": [list(pair) for pair in record.channels]} if channels and record.channels else {}
+        return {"rms": record.rms, "max": record.max_error, **own}
+
     header = index.header
     blocks = [{"shape": list(shape), "closed": list(closed)} for shape, closed in header.blocks]
     only = blocks[0] if len(blocks) == 1 else {"shape": None, "closed": None}
@@ -134,10 +142,9 @@ def describe(index: Index) -> dict[str, Any]:
         "dtype": header.dtype.name,
         "extent": header.extent,
         "levels": [
-            {"level": r.level, "shape": r.shape and list(r.shape), "bytes": r.bytes, "rms": r.rms, "max": r.max_error}
-            for r in index.levels
+            {"level": r.level, "shape": r.shape and list(r.shape), "bytes": r.bytes, **errors(r)} for r in index.levels
         ],
-        "layers": [{"bytes": r.end, "level": r.level, "rms": r.rms, "max": r.max_error} for r in index.layers],
+        "layers": [{"bytes": r.end, "level": r.level, **errors(r)} for r in index.layers],
         "bytes": index.size,
         "exact": header.exact,
         "sha256": index.digest,

@@ -14,12 +14,12 @@ from ..errors import CorruptStreamError
 from ..joints import check_runs
 from ..sides import Arrangement, Curve, Part, Side
 from ..surface import Closed
-from .fields import FieldReader, FieldWriter
+from .fields import LARGEST, FieldReader, FieldWriter
 from .model import AttributeKind, JointChanges
 
 __all__ = [
     "DTYPES",
-    "LARGEST_SURFACE",
+    "LONGEST_AXIS",
     "Blocks",
     "Extras",
     "parse_arrangement",
@@ -29,8 +29,8 @@ __all__ = [
 ]
 
 DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
-#: Most points that a header may promise.
-LARGEST_SURFACE = 2**31
+#: Most rows or columns of a block that kernels take. The format has no such limit.
+LONGEST_AXIS = 2**31 - 1
 _MOST_PARTS = 1 << 16
 
 Blocks = tuple[tuple[tuple[int, int], Closed], ...]
@@ -72,17 +72,22 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
     blocks = []
     points = 0
     for _ in range(_count(fields)):
-        shape = fields.varint(LARGEST_SURFACE), fields.varint(LARGEST_SURFACE)
+        shape = fields.varint(), fields.varint()
         flags = fields.byte()
         points += shape[0] * shape[1]
-        if shape[0] * shape[1] < 2 or points > LARGEST_SURFACE or flags > 3:
+        if shape[0] * shape[1] < 2 or points > LARGEST or flags > 3:
             raise CorruptStreamError(f"expected blocks of points, got {shape[0]} x {shape[1]}", start)
         blocks.append((shape, (bool(flags & 1), bool(flags & 2))))
     curves = []
     for _ in range(_count(fields, 0)):
-        number = fields.varint(4 * LARGEST_SURFACE)
+        number = fields.varint()
         curves.append(Curve(number >> 2, bool(number & 1), bool(number & 2)))
     parts = [_parse_part(fields, blocks, curves) for _ in range(_count(fields))]
+    used = {side.curve for part in parts for side in part.sides if side is not None}
+    if len(used) != len(curves):
+        raise CorruptStreamError(
+            f"expected curves that are sides of parts, got {len(curves) - len(used)} others", start
+        )
     own: list[list[Part]] = [[] for _ in blocks]
     for part in parts:
         own[part.block].append(part)

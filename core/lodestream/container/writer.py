@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from . import headers, sections
-from .model import ByteRange, Header, Index, LayerRecord, LevelRecord, Piece, Segment
+from .codecs import needed_codecs
+from .index import serialize_index
+from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, Piece, Segment
 
 __all__ = ["CodedLayer", "CodedSegment", "write_container"]
+
+
+_INDEX = sections.PAGES, sections.INDEX
 
 
 @dataclass(frozen=True)
@@ -29,15 +33,14 @@ class CodedSegment:
 class CodedLayer:
     """Segments sorted by tile and channel, and the errors measured with them."""
 
-    rms: float
-    max_error: float
+    errors: Errors
     segments: Sequence[CodedSegment]
 
 
 def write_container(
     header: Header,
     layers: Sequence[CodedLayer],
-    levels: Sequence[tuple[float, float]],
+    levels: Sequence[Errors],
     pieces: Sequence[bytes],
     metadata: Mapping[str, Any],
     *,
@@ -48,9 +51,9 @@ def write_container(
     Parameters
     ----------
     header : Header
-        Its ``exact``, ``corrected``, ``layer_count`` and ``length`` are filled in here.
+        Its ``exact``, ``corrected``, ``layer_count``, ``codecs`` and ``length`` are filled in here.
     layers : sequence of CodedLayer
-    levels : sequence of (rms, max_error)
+    levels : sequence of Errors
         One for each level.
     pieces : sequence of bytes
         Of the exactness section, in the order of `pieces.windows`; nothing, or all empty, where there is none.
@@ -59,6 +62,7 @@ def write_container(
         The complete stream restores every value bit for bit.
     """
     header = replace(header, exact=exact, corrected=any(pieces), layer_count=len(layers))
+    header = replace(header, codecs=needed_codecs(header, pieces))
     out = bytearray(headers.serialize_header(header))
     header = replace(header, length=len(out))
     records, segments, finest = [], [], 0
@@ -66,29 +70,29 @@ def write_container(
         entries = [
             sections.Entry(s.tile, s.channel, s.top if s.begins else 0, s.passes, len(s.data)) for s in layer.segments
         ]
-        table = sections.serialize_layer(layer.rms, layer.max_error, entries, header.channels)
+        table = sections.serialize_layer(layer.errors, entries, header.channels)
         body = b"".join(s.data for s in layer.segments)
         start = len(out)
         out += sections.section(sections.LAYER, table + body)
         place = len(out) - 4 - len(body)
         for s in layer.segments:
             where = ByteRange(place, len(s.data))
-            segments.append(Segment(number, s.tile, s.channel, s.top, s.passes, where, zlib.crc32(s.data)))
+            segments.append(Segment(number, s.tile, s.channel, s.top, s.passes, where, sections.check_of(s.data)))
             place += len(s.data)
             finest = max(finest, header.layout.tiles[s.tile].level)
-        records.append(LayerRecord(number, start, len(out), finest, layer.rms, layer.max_error))
+        records.append(LayerRecord(number, start, len(out), finest, *layer.errors))
     exactness, places = None, []
     if header.corrected:
         exactness = _append(out, sections.EXACTNESS, sections.serialize_pieces(levels[-1], pieces))
         place = len(out) - 4 - sum(map(len, pieces))
         for piece in pieces:
-            places.append(Piece(ByteRange(place, len(piece)), zlib.crc32(piece)))
+            places.append(Piece(ByteRange(place, len(piece)), sections.check_of(piece)))
             place += len(piece)
     where_metadata = _append(out, sections.METADATA, sections.serialize_metadata(dict(metadata)))
     index = Index(
         header,
         tuple(records),
-        tuple(LevelRecord(level, header.level_shape(level), 0, *figures) for level, figures in enumerate(levels)),
+        tuple(LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(levels)),
         tuple(segments),
         exactness,
         tuple(places),
@@ -96,8 +100,8 @@ def write_container(
         ByteRange(len(out), 0),
         0,
     )
-    where_index = _append(out, sections.INDEX, sections.serialize_index(index))
-    out += sections.serialize_footer(where_index)
+    pages, root = (_append(out, *part) for part in zip(_INDEX, serialize_index(index), strict=True))
+    out += sections.serialize_footer(pages.length + root.length, root.length)
     return bytes(out)
 
 

@@ -31,8 +31,22 @@ __all__ = [
 MAGIC = b"\xf5LODE\r\n"
 VERSION = 0
 FOOTER_MAGIC = b"LODEEND\n"
-FOOTER_LENGTH = 24
-HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS = 1, 2, 3, 4, 5, 6, 7
+FOOTER_LENGTH = 28
+HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS, PAGES = 1, 2, 3, 4, 5, 6, 7, 8
+PAGE = 256  # tiles, or windows, that a page of the index tells of
+
+
+class Errors(NamedTuple):
+    """RMS and maximum of the distances; and of each channel, if there are several."""
+
+    rms: float
+    maximum: float
+    channels: list[tuple[float, float]]
+
+
+def _read_errors(fields: Fields, channels: int) -> Errors:
+    rms, maximum = fields.error(), fields.error()
+    return Errors(rms, maximum, [(fields.rough(), fields.rough()) for _ in range(channels if channels > 1 else 0)])
 
 
 class Section(NamedTuple):
@@ -71,29 +85,28 @@ class Segment(NamedTuple):
 class Layer:
     """Section 6: its errors and segments, and where its section ends in the file."""
 
-    rms: float
-    maximum: float
+    errors: Errors
     segments: list[Segment]
     end: int
 
 
-def _read_layer(section: Section) -> Layer:
+def _read_layer(section: Section, channels: int) -> Layer:
     fields = Fields(section.payload)
-    rms, maximum = fields.f64(), fields.f64()
+    errors = _read_errors(fields, channels)
     entries = []
     unit = -1
     for _ in range(fields.varint()):
         first = fields.number("B")
-        passes, skipped = first & 7, first >> 3
+        passes, skipped = first & 7, first >> 4
         passes = 8 + fields.varint() if passes == 7 else passes + 1
-        skipped = 31 + fields.varint() if skipped == 31 else skipped
+        skipped = 15 + fields.varint() if skipped == 15 else skipped
         unit += 1 + skipped
-        size = fields.varint()
-        top = fields.number("B") if size & 1 else None
-        entries.append((unit, passes, top, size >> 1))
+        length = fields.varint()
+        top = fields.number("B") if first & 8 else None
+        entries.append((unit, passes, top, length))
     segments = [Segment(unit, passes, top, fields.take(length)) for unit, passes, top, length in entries]
     fields.finish()
-    return Layer(rms, maximum, segments, section.end)
+    return Layer(errors, segments, section.end)
 
 
 class Window(NamedTuple):
@@ -121,18 +134,17 @@ def windows(header: Header, masks: Masks) -> Iterator[Window]:
 class Exactness:
     """Section 9: the pieces as they are in the file, and the errors that remain."""
 
-    rms: float
-    maximum: float
+    errors: Errors
     pieces: list[bytes]
 
 
 def _read_exactness(payload: bytes, header: Header, masks: Masks) -> Exactness:
     fields = Fields(payload)
-    rms, maximum = fields.f64(), fields.f64()
+    errors = _read_errors(fields, header.channels)
     lengths = [fields.varint() for _ in windows(header, masks)]
     pieces = [fields.take(length) for length in lengths]
     fields.finish()
-    return Exactness(rms, maximum, pieces)
+    return Exactness(errors, pieces)
 
 
 @dataclass
@@ -165,14 +177,14 @@ def read_container(data: bytes) -> Container:
         except StreamError:
             break
         if section.kind == LAYER:
-            container.layers.append(_read_layer(section))
+            container.layers.append(_read_layer(section, header.channels))
         elif section.kind in (MASKS, KEPT_MASKS):
             container.masks = read_masks(section.payload, header.blocks, section.kind == KEPT_MASKS)
         elif section.kind == EXACTNESS:
             container.exactness = _read_exactness(section.payload, header, container.masks)
         elif section.kind == METADATA:
             container.metadata = msgpack.unpackb(section.payload)
-        elif section.kind < 128 and section.kind != INDEX:
+        elif section.kind < 128 and section.kind not in (PAGES, INDEX):
             raise UnsupportedVersionError(f"expected sections of version {VERSION}, got one of kind {section.kind}")
     return container
 
@@ -185,70 +197,143 @@ class Entry(NamedTuple):
     top: int
     start: int
     length: int
-    crc: int
+    check: int
 
     def take(self, data: bytes) -> Segment:
         """The segment or piece by itself, checked by its own CRC."""
         found = data[self.start : self.start + self.length]
-        if self.length:
-            _check_crc(found, self.crc, self.start)
+        if self.length and zlib.crc32(found) & 0xFFFF != self.check:
+            raise CorruptStreamError(f"expected bytes with the CRC ...{self.check:04x}, got others", self.start)
         return Segment(self.unit, self.passes, self.top, found)
 
 
 @dataclass(frozen=True)
 class Index:
-    """Section 11: errors and segments layer by layer, errors level by level, and the pieces of exactness."""
+    """Section 11: errors and segments layer by layer, errors level by level, and the pieces of exactness.
 
-    layer_errors: list[tuple[float, float]]
+    `optional` are kinds and places of optional sections.
+    """
+
+    layer_errors: list[Errors]
     segments: list[list[Entry]]
-    level_errors: list[tuple[float, float]]
+    level_errors: list[Errors]
     pieces: list[Entry]
+    optional: list[tuple[int, int, int]]
 
 
-def read_index(data: bytes, container: Container, levels: int) -> Index:
-    """The index of a whole file, found by its footer, with the number of levels; all places have to agree."""
+class Page(NamedTuple):
+    """A page's place in the file, and its CRC."""
+
+    start: int
+    length: int
+    crc: int
+
+
+@dataclass
+class Root:
+    """The root of the index: where the sections end, and where the pages are."""
+
+    layer_errors: list[Errors]
+    layer_ends: list[int]
+    level_errors: list[Errors]
+    exactness_end: int
+    optional: list[tuple[int, int, int]]
+    pages: list[list[Page]]
+
+
+def read_index(data: bytes, container: Container, units: int) -> Index:
+    """The index of a whole file, found by its footer, with the number of units; all places have to agree."""
+    header, masks = container.header, container.masks
     footer = Fields(data, len(data) - FOOTER_LENGTH)
-    offset, length = footer.number("Q"), footer.number("I")
+    length, root_length = footer.number("Q"), footer.number("Q")
     _check_crc(data[-FOOTER_LENGTH:-12], footer.number("I"), len(data) - FOOTER_LENGTH)
-    section = read_section(data, offset)
-    named = section.kind == INDEX and section.end == offset + length == len(data) - FOOTER_LENGTH
-    if not named or footer.rest() != FOOTER_MAGIC:
+    end = len(data) - FOOTER_LENGTH
+    pages, section = read_section(data, end - length), read_section(data, end - root_length)
+    kinds = (pages.kind, pages.end, section.kind, section.end) == (PAGES, end - root_length, INDEX, end)
+    if not kinds or footer.rest() != FOOTER_MAGIC:
         raise StreamError("expected a footer that names the index, got another")
-    position = read_section(data, len(MAGIC) + 1).end
-    if container.header.has_masks:
-        position = read_section(data, position).end
-    fields = Fields(section.payload)
-    errors, segments = [], []
+    root = _read_root(section.payload, header.channels, end - length, pages)
+    segments: list[list[Entry]] = [[] for _ in root.layer_ends]
+    size = PAGE * header.channels
+    for first, page in zip(range(0, units, size), root.pages[0], strict=True):
+        _read_segments(_open(data, page), first, min(size, units - first), root.layer_ends, segments)
+    count = sum(1 for _ in windows(header, masks)) if header.has_exactness else 0
+    pieces: list[Entry] = []
+    for first, page in zip(range(0, count, size), root.pages[1], strict=True):
+        pieces += _read_pieces(_open(data, page), min(size, count - first), root.exactness_end)
+    return Index(root.layer_errors, segments, root.level_errors, pieces, root.optional)
+
+
+def _open(data: bytes, page: Page) -> Fields:
+    payload = data[page.start : page.start + page.length]
+    _check_crc(payload, page.crc, page.start)
+    return Fields(payload)
+
+
+def _read_root(payload: bytes, channels: int, pages_start: int, section: Section) -> Root:
+    fields = Fields(payload)
+    lengths, layer_errors = [], []
     for _ in range(fields.varint()):
-        position += fields.varint()
-        errors.append((fields.f64(), fields.f64()))
-        segments.append(_placed(_read_entries(fields), position - 4))
-    level_errors = [(fields.f64(), fields.f64()) for _ in range(levels)]
-    length = fields.varint()
-    position += length
-    count = sum(1 for _ in windows(container.header, container.masks)) if length else 0
-    pieces = _placed(_read_pieces(fields, count), position - 4)
-    if position + fields.varint() != offset:
-        raise StreamError("expected lengths of sections that lead to the index, got others")
+        lengths.append(fields.varint())
+        layer_errors.append(_read_errors(fields, channels))
+    level_errors = [_read_errors(fields, channels) for _ in range(fields.varint())]
+    position = fields.varint()
+    lengths += [fields.varint(), fields.varint()]
+    optional = [(fields.number("B"), fields.varint(), fields.varint()) for _ in range(fields.varint())]
+    places = {start: length for _, start, length in optional}
+    ends = []
+    for length in lengths:
+        while length and position in places:
+            position += places.pop(position)
+        position += length
+        ends.append(position)
+    while position in places:
+        position += places.pop(position)
+    directories = [[(fields.varint(), fields.number("I")) for _ in range(fields.varint())] for _ in range(2)]
     fields.finish()
-    return Index(errors, segments, level_errors, pieces)
+    total = sum(length for directory in directories for length, _ in directory)
+    if position != pages_start or places or total != len(section.payload):
+        raise StreamError("expected lengths of sections and pages that lead to the root, got others")
+    position = section.end - 4 - total
+    pages = []
+    for directory in directories:
+        starts = accumulate((length for length, _ in directory), initial=position)
+        pages.append([Page(start, *entry) for start, entry in zip(starts, directory, strict=False)])
+        position += sum(length for length, _ in directory)
+    return Root(layer_errors, ends[:-2], level_errors, ends[-2], optional, pages)
 
 
-def _read_entries(fields: Fields) -> list[Entry]:
-    entries: list[Entry] = []
-    for _ in range(fields.varint()):
-        unit = fields.varint() + (entries[-1].unit + 1 if entries else 0)
-        entries.append(Entry(unit, fields.number("B"), fields.number("B"), 0, fields.varint(), fields.number("I")))
-    return entries
+def _read_segments(fields: Fields, first: int, units: int, ends: list[int], segments: list[list[Entry]]) -> None:
+    """The segments of a page, into the lists of their layers."""
+    starts = [end - 4 - fields.varint() for end in ends]
+    unit = 0
+    while fields.position < len(fields.data):
+        count = fields.varint()
+        if count == 0:
+            unit += 1 + fields.varint()
+            continue
+        top, layer = fields.number("B"), -1
+        for _ in range(count):
+            code = fields.number("B")
+            passes, skipped = code & 7, code >> 3
+            passes = 8 + fields.varint() if passes == 7 else passes + 1
+            layer += 1 + (31 + fields.varint() if skipped == 31 else skipped)
+            length, check = fields.varint(), fields.number("H")
+            if layer >= len(ends):
+                raise StreamError(f"expected one of {len(ends)} layers, got {layer}")
+            segments[layer].append(Entry(first + unit, passes, top, starts[layer], length, check))
+            starts[layer] += length
+        unit += 1
+    if unit > units:
+        raise StreamError(f"expected {units} units in a page, got {unit}")
 
 
-def _read_pieces(fields: Fields, count: int) -> list[Entry]:
-    lengths = (fields.varint() for _ in range(count))
-    return [Entry(-1, 0, 0, 0, length, fields.number("I") if length else 0) for length in lengths]
-
-
-def _placed(entries: list[Entry], end: int) -> list[Entry]:
-    """Entries of a section one after another, the last of which ends there."""
-    start = end - sum(entry.length for entry in entries)
-    starts = accumulate((entry.length for entry in entries), initial=start)
-    return [entry._replace(start=start) for entry, start in zip(entries, starts, strict=False)]
+def _read_pieces(fields: Fields, count: int, end: int) -> list[Entry]:
+    start = end - 4 - fields.varint()
+    pieces = []
+    for _ in range(count):
+        length = fields.varint()
+        pieces.append(Entry(-1, 0, 0, start, length, fields.number("H") if length else 0))
+        start += length
+    fields.finish()
+    return pieces

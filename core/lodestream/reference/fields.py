@@ -37,6 +37,24 @@ class Fields:
         (value,) = struct.unpack("<d", self.take(8))
         return float(value)
 
+    def short_f64(self) -> float:
+        """A binary64 of which the last bytes are left out."""
+        highest = self.take(self.number("B"))
+        if len(highest) > 8:
+            raise StreamError(f"expected at most 8 bytes of a binary64, got {len(highest)}")
+        (value,) = struct.unpack(">d", highest + bytes(8 - len(highest)))
+        return float(value)
+
+    def error(self) -> float:
+        """The upper half of a binary64."""
+        (value,) = struct.unpack("<d", bytes(4) + self.take(4))
+        return float(value)
+
+    def rough(self) -> float:
+        """Sixteen bits of a binary64, below its sign."""
+        (value,) = struct.unpack("<d", (self.number("H") << 47).to_bytes(8, "little"))
+        return float(value)
+
     def varint(self) -> int:
         """A varint: seven bits a byte, at most nine bytes."""
         value = 0

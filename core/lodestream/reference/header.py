@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from ..errors import StreamError
+from ..errors import StreamError, UnsupportedVersionError
 from .fields import Fields
 
 __all__ = ["Block", "Grid", "Header", "Lattice", "read_header"]
 
 TYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
+
+CODECS = {1, 3, 4, 5, 6}
 
 Bits = tuple[bool, ...]
 
@@ -77,7 +79,7 @@ class Lattice(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """Section 3, in the words of the page; `predictors` are the pairs in the order of the file."""
+    """Section 3, in the words of the page; `predictors` are the pairs of each channel."""
 
     flat: bool
     exact: bool
@@ -94,7 +96,7 @@ class Header:
     plane: dict[str, Any] | None
     lattices: list[Lattice]
     empty: list[int]
-    predictors: list[tuple[int, int]]
+    predictors: list[list[tuple[int, int]]]
 
     @property
     def channels(self) -> int:
@@ -149,6 +151,9 @@ def _read_block(fields: Fields) -> Block:
 def read_header(payload: bytes) -> Header:
     """The header, from the payload of its section; StreamError where its bytes end early."""
     fields = Fields(payload)
+    codecs = [fields.varint() for _ in range(fields.varint())]
+    if not CODECS.issuperset(codecs):
+        raise UnsupportedVersionError(f"expected codecs among {sorted(CODECS)}, got {codecs}")
     flags = fields.number("B")
     kind = TYPES[fields.number("B")]
     points_channels, layers = fields.varint(), fields.varint()
@@ -156,7 +161,7 @@ def read_header(payload: bytes) -> Header:
     base = fields.varint()
     if base >= 2**24:
         raise StreamError(f"expected a base below 2^24, got {base}")
-    fields.f64()  # the extent, which decoding does not use
+    fields.short_f64()  # the extent, which decoding does not use
     if flags & 64:
         blocks = [_read_block(fields) for _ in range(fields.varint())]
         grids = [_read_curve(fields) for _ in range(fields.varint())]
@@ -167,11 +172,10 @@ def read_header(payload: bytes) -> Header:
     extras = msgpack.unpackb(fields.take(fields.varint())) if flags & 128 else {}
     attributes = [Attribute(name, TYPES[number], count) for name, number, count in extras.get("attributes", [])]
     channels = range(points_channels + sum(attribute.channels for attribute in attributes))
-    lattices = [Lattice(fields.number("B") == 1, fields.f64(), fields.f64()) for _ in channels]
+    lattices = [Lattice(fields.number("B") == 1, fields.short_f64(), fields.short_f64()) for _ in channels]
     empty = [fields.varint() for _ in channels]
-    predictors = []
-    while fields.position < len(payload):
-        predictors.append((fields.number("b"), fields.number("b")))
+    predictors = [[(fields.number("b"), fields.number("b")) for _ in range(fields.varint())] for _ in channels]
+    fields.finish()
     return Header(
         flat=bool(flags & 4),
         exact=bool(flags & 8),

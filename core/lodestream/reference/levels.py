@@ -145,11 +145,12 @@ class Levels:
             self.grids.append(GridLevels(number, grid, [level[number] for level in levels], lacks))
         steps = [*product(range(1, self.last + 1), ((0, False), (1, False), (0, True)))]
         fitted = [(level, *which) for level, which in steps if self._is_fitted(level, *which)]
-        every = [(n, *step) for n in range(header.channels) for step in fitted]
-        coded = [step for step in every if step[0] < header.coordinates or not step[-1]]
-        if len(coded) != len(header.predictors):
-            raise StreamError(f"expected {len(coded)} predictors, got {len(header.predictors)}")
-        self._predictors = dict(zip(coded, header.predictors, strict=True))
+        self._predictors: dict[tuple[int, int, int, bool], Predictor] = {}
+        for channel, own in enumerate(header.predictors):
+            coded = [step for step in fitted if channel < header.coordinates or not step[-1]]
+            if len(coded) != len(own):
+                raise StreamError(f"expected {len(coded)} predictors of channel {channel}, got {len(own)}")
+            self._predictors |= {(channel, *step): pair for step, pair in zip(coded, own, strict=True)}
 
     def _is_fitted(self, level: int, axis: int, of_curves: bool) -> bool:
         axes = [grid.axes[level][axis] for grid in self.grids if grid.is_curve == of_curves]

@@ -1,0 +1,65 @@
+"""The codecs that a container needs: a reader that lacks one refuses it at its header, whatever else stands there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from ..errors import CorruptStreamError, UnsupportedVersionError
+from .fields import FieldReader, FieldWriter
+from .model import Header
+
+__all__ = ["KNOWN", "needed_codecs", "parse_codecs", "piece_codec", "serialize_codecs"]
+
+BIT_PLANES, INDICES, MASKS, DIFFERENCES, OFFSETS = 1, 3, 4, 5, 6
+#: By number, see docs/format.md, section 3.
+KNOWN = {
+    BIT_PLANES: "bit-planes",
+    INDICES: "indices of quantised coordinates",
+    MASKS: "masks",
+    DIFFERENCES: "differences",
+    OFFSETS: "offsets",
+}
+# Of a piece of exactness by its rule; raw values need none.
+_OF_RULE = (None, DIFFERENCES, DIFFERENCES, OFFSETS)
+
+
+def needed_codecs(header: Header, pieces: Iterable[bytes]) -> tuple[int, ...]:
+    """What a container of this header with these pieces of exactness needs, by rising number."""
+    needed = {codec for piece in pieces if (codec := piece_codec(piece)) is not None}
+    if header.masked:
+        needed.add(MASKS)
+    if header.quantiser is not None:
+        needed.add(INDICES)
+    return tuple(sorted(needed | {BIT_PLANES}))
+
+
+def piece_codec(piece: bytes | memoryview) -> int | None:
+    """What a piece of exactness needs; None: nothing."""
+    return _OF_RULE[piece[0] & 3] if piece else None
+
+
+def serialize_codecs(out: FieldWriter, needed: tuple[int, ...]) -> None:
+    """The list at the start of a header."""
+    out.varint(len(needed))
+    for codec in needed:
+        out.varint(codec)
+
+
+def parse_codecs(fields: FieldReader) -> tuple[int, ...]:
+    """Undo `serialize_codecs`.
+
+    Raises
+    ------
+    UnsupportedVersionError
+        When one of them is not known.
+    """
+    start = fields.at
+    needed = [fields.varint() for _ in range(fields.varint(len(fields.data)))]
+    if any(later <= earlier for earlier, later in zip([0, *needed], needed, strict=False)):
+        raise CorruptStreamError(f"expected the numbers of codecs, each above the one before, got {needed}", start)
+    for codec in needed:
+        if codec not in KNOWN:
+            raise UnsupportedVersionError(
+                f"expected codecs that this version has (1 to {max(KNOWN)}), got a container that needs codec {codec}"
+            )
+    return tuple(needed)

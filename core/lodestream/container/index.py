@@ -1,0 +1,355 @@
+"""The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and pieces.
+
+A page tells of a run of tiles, or of windows of exactness, and needs no other to be understood: who wants a part of a
+large surface reads the root and the pages of that part.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import NamedTuple
+
+from ..errors import CorruptStreamError
+from ..metadata import check_length
+from ..predictors import COEFFICIENT_BITS
+from .fields import FieldReader, FieldWriter
+from .frames import Frame
+from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Piece, Segment
+from .pieces import count_windows
+from .sections import FOOTER_LENGTH, OPTIONAL, read_errors, section_start, write_errors
+
+__all__ = ["PAGE", "PagePlace", "Root", "parse_index", "parse_root", "serialize_index"]
+
+#: Tiles, or windows of exactness, that a page tells of.
+PAGE = 256
+# In the first byte of an entry: passes - 1 and layers skipped from which on more bytes tell the rest.
+_PASSES, _SKIP = 7, 31
+_CRC = 4  # bytes at the end of a section
+
+
+def serialize_index(index: Index) -> tuple[bytes, bytes]:
+    """Payloads of the pages and of the root; levels' byte counts and shapes follow from the rest."""
+    segments, pieces = _segment_pages(index), _piece_pages(index)
+    out = FieldWriter()
+    out.varint(len(index.layers))
+    for layer in index.layers:
+        out.varint(layer.end - layer.offset)
+        write_errors(out, layer.errors)
+    out.varint(len(index.levels))
+    for level in index.levels:
+        write_errors(out, level.errors)
+    out.varint(index.header.length)
+    out.varint(index.exactness.length if index.exactness else 0)
+    out.varint(index.metadata.length)
+    out.varint(len(index.optional))
+    for optional in index.optional:
+        out.byte(optional.kind)
+        out.varint(optional.range.offset)
+        out.varint(optional.range.length)
+    for pages in (segments, pieces):
+        out.varint(len(pages))
+        for page in pages:
+            out.varint(len(page))
+            out.pack("I", zlib.crc32(page))
+    return b"".join(segments + pieces), bytes(out.data)
+
+
+def _segment_pages(index: Index) -> list[bytes]:
+    channels = index.header.channels
+    units: list[dict[int, list[Segment]]] = [{} for _ in range(_count_pages(len(index.header.layout.tiles)))]
+    rests = [0] * len(index.layers)
+    for segment in index.segments:
+        number = segment.tile * channels + segment.channel
+        units[segment.tile // PAGE].setdefault(number, []).append(segment)
+        rests[segment.layer] += segment.range.length
+    pages = []
+    for number, own in enumerate(units):
+        out = FieldWriter()
+        for rest in rests:
+            out.varint(rest)
+        unit = number * PAGE * channels
+        for place in sorted(own):
+            if place > unit:
+                out.varint(0)
+                out.varint(place - unit - 1)
+            _write_unit(out, own[place])
+            for segment in own[place]:
+                rests[segment.layer] -= segment.range.length
+            unit = place + 1
+        pages.append(bytes(out.data))
+    return pages
+
+
+def _write_unit(out: FieldWriter, segments: list[Segment]) -> None:
+    out.varint(len(segments))
+    out.byte(segments[0].top)
+    layer = -1
+    for segment in segments:
+        passes, skip = segment.passes - 1, segment.layer - layer - 1
+        out.byte(min(passes, _PASSES) | min(skip, _SKIP) << 3)
+        if passes >= _PASSES:
+            out.varint(passes - _PASSES)
+        if skip >= _SKIP:
+            out.varint(skip - _SKIP)
+        out.varint(segment.range.length)
+        out.pack("H", segment.check)
+        layer = segment.layer
+
+
+def _piece_pages(index: Index) -> list[bytes]:
+    pages, size = [], PAGE * index.header.channels
+    rest = sum(piece.range.length for piece in index.pieces)
+    for first in range(0, len(index.pieces), size):
+        out = FieldWriter()
+        out.varint(rest)
+        for piece in index.pieces[first : first + size]:
+            rest -= piece.range.length
+            out.varint(piece.range.length)
+            if piece.range.length:
+                out.pack("H", piece.check)
+        pages.append(bytes(out.data))
+    return pages
+
+
+def _count_pages(things: int) -> int:
+    return -(-things // PAGE)
+
+
+class PagePlace(NamedTuple):
+    """A page by its place in the container and its CRC-32, which stands at ``told`` of the container."""
+
+    range: ByteRange
+    crc: int
+    told: int
+
+
+@dataclass(frozen=True)
+class Root:
+    """What the root tells; of segments and pieces it names the pages only.
+
+    ``layers`` are places and errors, ``levels`` errors. ``index`` is the place of pages and root.
+    """
+
+    layers: tuple[tuple[ByteRange, Errors], ...]
+    levels: tuple[Errors, ...]
+    exactness: ByteRange | None
+    metadata: ByteRange
+    optional: tuple[OptionalSection, ...]
+    segment_pages: tuple[PagePlace, ...]
+    piece_pages: tuple[PagePlace, ...]
+    index: ByteRange
+
+
+def parse_root(frame: Frame, header: Header) -> Root:
+    """The root of the index of a container with this header, from its section.
+
+    Raises
+    ------
+    CorruptStreamError
+        When it contradicts itself or the header.
+    """
+    fields = FieldReader(frame.payload, frame.payload_offset)
+    channels = header.channels
+    layers = [(fields.varint(), read_errors(fields, channels)) for _ in range(fields.varint(len(frame.payload)))]
+    levels = [read_errors(fields, channels) for _ in range(fields.varint(len(frame.payload)))]
+    start, exactness = fields.varint(), fields.varint()
+    said = fields.at
+    metadata = fields.varint()
+    check_length(metadata, said, section=True)
+    optional = [_parse_optional(fields) for _ in range(fields.varint(len(frame.payload)))]
+    directories = [_parse_directory(fields) for _ in range(2)]
+    fields.end()
+
+    places = _Places(start, optional)
+    placed = tuple((places.next(length), errors) for length, errors in layers)
+    exact = places.next(exactness) if exactness else None
+    where = places.next(metadata)
+    pages = places.end()
+    agree = len(layers) == header.layer_count and len(levels) == header.levels + 1
+    if start != header.length or not agree or (exact is not None) != header.corrected:
+        raise CorruptStreamError("expected an index of the layers and levels of the header, got another", frame.offset)
+    length = sum(size for directory in directories for size, _, _ in directory)
+    first = pages + section_start(length)
+    if places.left or first + length + _CRC != frame.offset:
+        raise CorruptStreamError("expected sections that fill the container up to its index, got others", frame.offset)
+    counts = _count_pages(len(header.layout.tiles)), _count_pages(count_windows(header)) if exact else 0
+    found = []
+    for directory, count in zip(directories, counts, strict=True):
+        if len(directory) != count:
+            raise CorruptStreamError(f"expected {count} pages of an index, got {len(directory)}", frame.offset)
+        starts = accumulate((size for size, _, _ in directory), initial=first)
+        own = [
+            PagePlace(ByteRange(at, size), crc, told) for at, (size, crc, told) in zip(starts, directory, strict=False)
+        ]
+        first += sum(size for size, _, _ in directory)
+        found.append(tuple(own))
+    index = ByteRange(pages, frame.end - pages)
+    return Root(placed, tuple(levels), exact, where, tuple(optional), found[0], found[1], index)
+
+
+def parse_index(pages: Frame, root: Frame, header: Header) -> Index:
+    """The index of a container with this header, from its sections.
+
+    Raises
+    ------
+    CorruptStreamError
+        When they contradict each other or the header.
+    """
+    told = parse_root(root, header)
+    if pages.offset != told.index.offset or pages.end != root.offset:
+        raise CorruptStreamError("expected the pages of an index before its root, got others", pages.offset)
+    segments = _parse_segments(_pages_of(pages, told.segment_pages), header, [place for place, _ in told.layers])
+    finest, layers = 0, []
+    for number, ((place, errors), own) in enumerate(zip(told.layers, segments, strict=True)):
+        finest = max([finest, *(header.layout.tiles[segment.tile].level for segment in own)])
+        layers.append(LayerRecord(number, place.offset, place.end, finest, *errors))
+    return Index(
+        header,
+        tuple(layers),
+        tuple(LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(told.levels)),
+        tuple(segment for own in segments for segment in own),
+        told.exactness,
+        _parse_pieces(_pages_of(pages, told.piece_pages), header, told.exactness) if told.exactness else (),
+        told.metadata,
+        told.index,
+        root.end + FOOTER_LENGTH,
+        optional=told.optional,
+    )
+
+
+class _Places:
+    """Places of sections one after another, with optional ones anywhere between them."""
+
+    def __init__(self, start: int, optional: Sequence[OptionalSection]) -> None:
+        self._place, self._optional = start, list(optional)[::-1]
+
+    @property
+    def left(self) -> int:
+        """Optional sections that stand nowhere between the others."""
+        return len(self._optional)
+
+    def end(self) -> int:
+        """Where the sections end that were taken, and optional ones after them."""
+        while self._optional and self._optional[-1].range.offset == self._place:
+            self._place += self._optional.pop().range.length
+        return self._place
+
+    def next(self, length: int) -> ByteRange:
+        """The place of the next section, which is so long."""
+        place = ByteRange(self.end(), length)
+        self._place = place.end
+        return place
+
+
+def _parse_optional(fields: FieldReader) -> OptionalSection:
+    start, kind = fields.at, fields.byte()
+    place = ByteRange(fields.varint(), fields.varint())
+    if kind < OPTIONAL or place.length < 6:
+        raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", start)
+    return OptionalSection(kind, place)
+
+
+def _parse_directory(fields: FieldReader) -> list[tuple[int, int, int]]:
+    """Length and CRC-32 of each page, and where that stands."""
+    found = []
+    for _ in range(fields.varint(len(fields.data))):
+        length, told = fields.varint(), fields.at
+        (crc,) = fields.unpack("I")
+        found.append((length, int(crc), told))
+    return found
+
+
+def _pages_of(frame: Frame, places: Sequence[PagePlace]) -> list[FieldReader]:
+    """Pages out of their section, each checked by its CRC."""
+    found = []
+    for place, crc, _ in places:
+        start = place.offset - frame.payload_offset
+        page = frame.payload[start : start + place.length]
+        if zlib.crc32(page) != crc:
+            raise CorruptStreamError("expected a page that matches its CRC, got other bytes", place.offset)
+        found.append(FieldReader(page, place.offset))
+    return found
+
+
+def _parse_segments(pages: list[FieldReader], header: Header, layers: list[ByteRange]) -> list[list[Segment]]:
+    """The segments of each layer, by rising number of the unit."""
+    tiles = len(header.layout.tiles)
+    found: list[list[Segment]] = [[] for _ in layers]
+    ends = [place.end - _CRC for place in layers]
+    expected: list[int] | None = None
+    for number, fields in enumerate(pages):
+        start = fields.at
+        # Segments fill the end of a layer's section, before its CRC.
+        at = [end - fields.varint(place.length) for end, place in zip(ends, layers, strict=True)]
+        inside = all(first >= place.offset for first, place in zip(at, layers, strict=True))
+        if not inside or (expected is not None and at != expected):
+            raise CorruptStreamError("expected segments within their layers, one after another, got others", start)
+        units = (min(tiles - number * PAGE, PAGE)) * header.channels
+        _parse_units(fields, number * PAGE * header.channels, units, header.channels, at, found)
+        if any(place > end for place, end in zip(at, ends, strict=True)):
+            raise CorruptStreamError("expected segments that fill their layers, got longer ones", start)
+        expected = at
+    if expected != ends:
+        raise CorruptStreamError("expected segments that fill their layers, got shorter ones", header.length)
+    return found
+
+
+def _parse_units(
+    fields: FieldReader, first: int, units: int, channels: int, at: list[int], found: list[list[Segment]]
+) -> None:
+    """The units of a page; ``at`` is where the next segment of each layer stands."""
+    unit = 0
+    while fields.left:
+        start, count = fields.at, fields.varint(len(at))
+        if not count:
+            unit += 1 + fields.varint(units)
+            continue
+        tile, channel = divmod(first + unit, channels)
+        top, layer = fields.byte(), -1
+        left = 2 * top - 1
+        if unit >= units or not 1 <= top <= COEFFICIENT_BITS:
+            raise CorruptStreamError(f"expected one of {units} units and 1 to 28 planes, got {unit}, {top}", start)
+        for _ in range(count):
+            code = fields.byte()
+            passes, skip = (code & 7) + 1, code >> 3
+            if passes > _PASSES:
+                passes += fields.varint(2 * COEFFICIENT_BITS)
+            if skip == _SKIP:
+                skip += fields.varint(len(at))
+            layer, left = layer + 1 + skip, left - passes
+            length = fields.varint()
+            (check,) = fields.unpack("H")
+            if layer >= len(at) or left < 0 or not length:
+                raise CorruptStreamError(f"expected passes and layers of unit {first + unit}, got others", start)
+            place = ByteRange(at[layer], length)
+            found[layer].append(Segment(layer, tile, channel, top, passes, place, int(check)))
+            at[layer] += length
+        unit += 1
+    if unit > units:
+        raise CorruptStreamError(f"expected {units} units, got {unit}", fields.at)
+
+
+def _parse_pieces(pages: list[FieldReader], header: Header, exactness: ByteRange) -> tuple[Piece, ...]:
+    """The pieces of the exactness section."""
+    count = count_windows(header) * header.channels
+    found: list[Piece] = []
+    at, end = -1, exactness.end - _CRC
+    for fields in pages:
+        start = fields.at
+        # Pieces fill the end of their section, before its CRC.
+        first = end - fields.varint(exactness.length)
+        if first < exactness.offset or at not in (-1, first):
+            raise CorruptStreamError("expected pieces within their section, one after another, got others", start)
+        at = first
+        for _ in range(min(PAGE * header.channels, count - len(found))):
+            length = fields.varint(exactness.length)
+            (check,) = fields.unpack("H") if length else (0,)
+            found.append(Piece(ByteRange(at, length), int(check)))
+            at += length
+        fields.end()
+    if at != end:
+        raise CorruptStreamError("expected pieces that fill their section, got others", exactness.offset)
+    return tuple(found)
