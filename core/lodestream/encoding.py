@@ -247,21 +247,25 @@ class Encoding:
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Figures]]:
-        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
-        canvases = self._canvases()
+        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one after it."""
+        canvases, start, announced = self._canvases(), initial_state(self.header), self._all_passes()
         kept: list[State] = []
         figures: list[Figures] = []
         for state in states:
-            announced = state < self._all_passes()
-            shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
+            complete = state is states[-1]
+            shown = state if complete else np.where(state < announced, state, start)
             measured = self._figures(shown.astype(np.int8), canvases)
-            while figures and measured[0] > figures[-1][0]:
-                kept.pop()
-                figures.pop()
+            if complete:
+                while figures and measured[0] > figures[-1][0]:
+                    kept.pop()
+                    figures.pop()
+            elif figures and measured[0] > figures[-1][0]:
+                continue
             kept.append(state)
             figures.append(measured)
-        del canvases
-        pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
+        # The canvases hold the complete picture of the coordinates.
+        pictures: list[Picture] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(self.geometric)]
+        pictures += [self._picture(number, states[-1]) for number in range(self.geometric, len(self.channels))]
         self._last = to_values(self.header, pictures, self.layout.levels)
         return kept, figures
 

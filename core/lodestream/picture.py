@@ -128,6 +128,8 @@ def coordinate_distances(
         chosen = slice(None) if original.counted is None else original.counted
         points = original.points[..., : len(lattices)]
         compared.append((points[chosen], picture[chosen]))
+    if all(np.array_equal(*pair) for pair in compared):
+        return 0.0, 0.0
     if len(compared) == 1 and compared[0][0].ndim == 3:
         return distances(*compared[0], len(lattices))
     points, picture = (np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2))
