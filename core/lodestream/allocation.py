@@ -1,12 +1,15 @@
 """Which bits go into which layer: in order of what they do to the error for each byte.
 
 Every tile of every channel is a list of coding passes, each with a cost in bits and a gain in squared error. Passes are
-sorted by gain for each bit (on the convex hull of each tile, so that a poor pass before a good one does not hide it),
-parents never after their children; layers cut this order at bytes evenly spaced in the logarithm.
+grouped into *steps*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
+that a step is worth the segment that it takes. Steps are sorted by gain for each bit, parents never after their
+children; layers cut this order so that one is at most `_GROWTH` times as long as the one before.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +17,26 @@ from numpy.typing import NDArray
 
 from .layout import Layout
 
-__all__ = ["MOST_LAYERS", "TileCurve", "assign_layers", "hull_slopes"]
+__all__ = ["TileCurve", "assign_layers", "step_slopes"]
 
-MOST_LAYERS = 24
-_FIRST_LAYER = 48  # bytes of coefficients in the first layer
-_LEAST_GROWTH = 1.3
-_LEAST_LAYER = 160  # bytes: a layer's frame takes about 30
-_LAST_LOSSY = 0.92
-# Of streams made for one error; one of fewer bytes is one layer.
+#: A segment takes so many bits besides its passes: in the layer's table, in the index, and to start and end a coder.
+_SEGMENT = 96.0
+#: Two steps are one where as two they save less than this share of the tile's bits so far, or than a segment takes;
+#: early in the stream, where many segments are in the same layer anyway, less than a share of the stream's bits.
+_SHARE_OF_TILE = 0.06
+_SHARE_OF_STREAM = 0.02
+#: What a step adds to a layer besides its passes, in bytes.
+_ENTRY = 5
+#: By how much the bytes grow from layer to layer, at least and at most, where there are more than so many ...
+_GROWTH = 1.12, 1.147
+_OFTEN = 3800
+#: ... and before: a layer's frame takes about 50 bytes with its share of the index, which counts there.
+_EARLY_GROWTH = 1.3, 1.5
+_EARLY_STEP = 160
+_FIRST_LAYER = 48  # bytes of coefficients, at least where there are more layers
+# Of streams made for one error; one of fewer bytes than the first is one layer.
 _BRIEF = 6000
-_FEWEST = 3
+_FEWEST, _MOST = 3, 24
 _SECOND = 16.0  # times the first layer
 _BYTES_FOR_A_LAYER = 12000
 
@@ -46,17 +59,37 @@ class TileCurve:
     gains: NDArray[np.float64]
 
 
-def hull_slopes(curve: TileCurve) -> NDArray[np.float64]:
-    """Gain for each bit of every pass, on the upper convex hull: it never rises towards later passes."""
-    hull: list[tuple[float, float, int]] = []  # bits, gain, passes
+def step_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope: 0.0) -> NDArray[np.float64]:
+    """Gain for each bit of every pass, the same for all passes of a step; it falls from step to step.
+
+    Two steps that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
+    where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): ``worth(s)``, and a share of
+    the tile's bits so far.
+    """
+    steps: list[tuple[float, float, int]] = []  # bits, gain, passes
+    known = 0.0
     for bits, gain in zip(curve.bits[::-1], curve.gains[::-1], strict=True):
         step = (max(float(bits), 1e-9), max(float(gain), 0.0), 1)
-        while hull and step[1] * hull[-1][0] >= hull[-1][1] * step[0]:
-            last = hull.pop()
+        known += step[0]
+        while steps:
+            last = steps[-1]
+            saved = last[1] * step[0] - step[1] * last[0]
+            if saved > 0 and saved >= max(worth(last[1] / last[0]), _SHARE_OF_TILE * known) * (last[1] + step[1]):
+                break
+            steps.pop()
             step = (step[0] + last[0], step[1] + last[1], step[2] + last[2])
-        hull.append(step)
-    slopes = [gain / bits for bits, gain, passes in hull for _ in range(passes)]
+        steps.append(step)
+    slopes = [gain / bits for bits, gain, passes in steps for _ in range(passes)]
     return np.array(slopes[::-1])
+
+
+def _worth(curves: list[TileCurve]) -> Callable[[float], float]:
+    """What two steps must save to be two, in bits, by the slope of the first; see `_SHARE_OF_STREAM`."""
+    slopes = np.concatenate([step_slopes(curve) for curve in curves])
+    order = np.argsort(-slopes, kind="stable")
+    falling = (-slopes[order]).tolist()
+    known = np.cumsum(np.concatenate([curve.bits for curve in curves])[order]).tolist()
+    return lambda slope: min(_SEGMENT, _SHARE_OF_STREAM * known[min(bisect_left(falling, -slope), len(known) - 1)])
 
 
 def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
@@ -78,28 +111,31 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: b
         Passes that remain after the layer.
     """
     top = np.zeros((len(layout.tiles), channels), np.int8)
-    slopes: dict[tuple[int, int], NDArray[np.float64]] = {}
-    for curve in curves:
-        top[curve.tile, curve.channel] = len(curve.bits)
-        slopes[curve.tile, curve.channel] = hull_slopes(curve)
+    if not curves:
+        return [top]
+    worth = _worth(curves)
+    slopes = {(curve.tile, curve.channel): step_slopes(curve, worth) for curve in curves}
     _lift_parents(slopes, layout)
-    known = {(curve.tile, curve.channel): curve for curve in curves}
-    order = sorted(
-        (-float(slope), tile, -number, channel)
-        for (tile, channel), passes in slopes.items()
-        for number, slope in enumerate(passes)
-    )
-    sizes = np.cumsum([known[tile, channel].bits[-number] / 8 for _, tile, number, channel in order])
-    gains = np.cumsum([known[tile, channel].gains[-number] for _, tile, number, channel in order])
-    ends = _layer_ends(sizes, gains, few)
-    states, state = [], top.copy()
-    start = 0
-    for end in ends:
-        for _, tile, number, channel in order[start:end]:
-            state[tile, channel] = -number
-        states.append(state.copy())
+    counts = [curve.bits.size for curve in curves]
+    tile = np.repeat([curve.tile for curve in curves], counts)
+    channel = np.repeat([curve.channel for curve in curves], counts)
+    number = np.concatenate([np.arange(count) for count in counts])
+    slope = np.concatenate([slopes[curve.tile, curve.channel] for curve in curves])
+    order = np.lexsort((channel, -number, tile, -slope))
+    tile, channel, number, slope = tile[order], channel[order], number[order], slope[order]
+    stays = (tile[1:] == tile[:-1]) & (channel[1:] == channel[:-1]) & (slope[1:] == slope[:-1])
+    last = np.append(~stays, True)
+    sizes = np.cumsum(np.concatenate([curve.bits for curve in curves])[order] / 8 + _ENTRY * last)
+    gains = np.cumsum(np.concatenate([curve.gains for curve in curves])[order])
+    for curve in curves:
+        top[curve.tile, curve.channel] = curve.bits.size
+    states, state, start = [], top, 0
+    for end in _layer_ends(sizes, gains, last, few):
+        state = state.copy()
+        np.minimum.at(state, (tile[start:end], channel[start:end]), number[start:end].astype(np.int8))
+        states.append(state)
         start = end
-    return states or [top]
+    return states
 
 
 def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: Layout) -> None:
@@ -116,55 +152,45 @@ def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: La
         parent[:] = np.maximum.accumulate(parent)
 
 
-def _targets(first: float, last: float) -> NDArray[np.float64]:
-    """Bytes after each layer but the complete one, evenly spaced in the logarithm where layers are worth a table."""
-    growth = _LEAST_GROWTH
-    while True:
-        targets = [first]
-        while targets[-1] < last:
-            targets.append(max(targets[-1] * growth, targets[-1] + _LEAST_LAYER))
-        if len(targets) < MOST_LAYERS:
-            break
-        growth **= 1.02
-    if len(targets) > 1:
-        # Whole steps rarely end at the last one: all shrink a little.
-        scale = np.log(last / first) / np.log(targets[-1] / first)
-        return np.asarray(first * np.power(np.array(targets) / first, scale))
-    return np.array(targets)
-
-
-def _few_targets(first: float, last: float) -> NDArray[np.float64]:
-    """Bytes after each layer but the complete one, where that is what was asked for."""
-    count = min(max(int(last / _BYTES_FOR_A_LAYER), _FEWEST), MOST_LAYERS)
-    return np.append(first, np.geomspace(min(_SECOND * first, last), last, count - 1)[:-1])
-
-
-def _layer_ends(sizes: NDArray[np.float64], gains: NDArray[np.float64], few: bool) -> list[int]:
+def _layer_ends(
+    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool
+) -> list[int]:
     """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
 
-    Within a bit-plane the error falls faster at first than later, so some places between passes are better to stop at
-    than others. A layer ends at the best place around its share of the bytes: where the error lies furthest below a
-    line, in the logarithms of both, from one end of the neighbourhood to the other.
+    Found from the end to the start, each within a range of bytes that the next one allows. It is the place after the
+    `last` pass of a step, if there is one, where the error lies furthest below a line, in the logarithms of both, from
+    one end of the range to the other: within a bit-plane the error falls faster at first than later.
     """
-    if sizes.size == 0:
-        return []
-    total = float(sizes[-1])
-    if few and total < _BRIEF:
+    if few and float(sizes[-1]) < _BRIEF:
         return [sizes.size]
-    first = min(_FIRST_LAYER, total)
-    # The last lossy picture should not be far from the end, also where the last bits lower the error steeply.
-    targets = _few_targets(first, total) if few else _targets(first, max(first, _LAST_LOSSY * total))
-    borders = np.sqrt(targets[1:] * targets[:-1])
-    starts = np.searchsorted(sizes, borders)
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
     lengths = np.log(np.maximum(sizes, 1.0))
-    ends = []
-    for target, start, stop in zip(targets, [0, *starts], [*starts, sizes.size - 1], strict=True):
-        middle = int(np.searchsorted(sizes, target * (1 - 1e-12)))
-        start, stop = min(start, middle), min(max(stop, middle + 1), sizes.size)
+    ends = [sizes.size - 1]
+    while True:
+        end = ends[-1]
+        low, high = _range_before(float(sizes[end]), float(sizes[-1]), few)
+        if end == 0 or high < _FIRST_LAYER:
+            break
+        start = min(int(np.searchsorted(sizes, low)), end - 1)
+        stop = min(max(int(np.searchsorted(sizes, high, side="right")), start + 1), end)
+        places = np.arange(start, stop)
+        if last[start:stop].any():
+            places = places[last[start:stop]]
         run = lengths[stop - 1] - lengths[start]
         slope = (errors[stop - 1] - errors[start]) / run if run > 0 else 0.0
-        place = start + int(np.argmin(errors[start:stop] - slope * lengths[start:stop]))
-        ends.append((place if start > 0 and stop < sizes.size - 1 else middle) + 1)
-    ends.append(sizes.size)
-    return [int(end) for end in np.unique(np.minimum(ends, sizes.size))]
+        ends.append(int(places[np.argmin(errors[places] - slope * lengths[places])]))
+    return [end + 1 for end in reversed(ends)]
+
+
+def _range_before(size: float, total: float, few: bool) -> tuple[float, float]:
+    """Bytes, at least and at most, after the layer before one that ends at ``size``."""
+    if few:
+        second = _SECOND * _FIRST_LAYER
+        count = min(max(int(total / _BYTES_FOR_A_LAYER), _FEWEST), _MOST)
+        growth = max(total / second, 1.0) ** (1 / (count - 2))
+        if size > second * growth**0.5:
+            return size / growth**1.5, size / growth**0.5
+        return (_FIRST_LAYER, _FIRST_LAYER) if size > second / 2 else (0.0, 0.0)
+    if size > _OFTEN * _GROWTH[1]:
+        return size / _GROWTH[1], size / _GROWTH[0]
+    return min(size / _EARLY_GROWTH[1], size - _EARLY_STEP), min(size / _EARLY_GROWTH[0], size - _EARLY_STEP / 2)

@@ -273,21 +273,26 @@ class Encoding:
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Errors]]:
-        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one before."""
-        canvases = self._canvases()
+        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one after it."""
+        canvases, start, announced = self._canvases(), initial_state(self.header), self._all_passes()
         kept: list[State] = []
         errors: list[Errors] = []
         for state in states:
-            announced = state < self._all_passes()
-            shown = state if state is states[-1] else np.where(announced, state, initial_state(self.header))
+            complete = state is states[-1]
+            shown = state if complete else np.where(state < announced, state, start)
             measured = self._errors(shown.astype(np.int8), canvases)
-            while errors and measured.rms > errors[-1].rms:
-                kept.pop()
-                errors.pop()
+            if complete:
+                while errors and measured.rms > errors[-1].rms:
+                    kept.pop()
+                    errors.pop()
+            elif errors and measured.rms > errors[-1].rms:
+                continue
             kept.append(state)
             errors.append(measured)
-        del canvases
-        pictures = [self._picture(number, states[-1]) for number in range(len(self.channels))]
+        # The canvases hold the complete picture of the coordinates, unless attributes took their place.
+        shared = self.geometric if len(self.channels) == self.geometric else 0
+        pictures: list[Picture] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
+        pictures += [self._picture(number, states[-1]) for number in range(shared, len(self.channels))]
         self._last = to_values(self.header, pictures, self.layout.levels)
         return kept, errors
 

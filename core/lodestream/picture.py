@@ -188,6 +188,8 @@ def coordinate_distances(
             store_values(lattice, (place[number, :, :columns], fraction), picture, number)
         chosen = slice(None) if original.counted is None else original.counted
         compared.append((original.points[..., channel:last][chosen], picture[chosen]))
+    if all(np.array_equal(*pair) for pair in compared):
+        return [(0.0, 0.0)] * _kinds(len(lattices))
     if len(compared) == 1 and compared[0][0].ndim == 3:
         points, picture = compared[0]
     else:

@@ -181,6 +181,27 @@ def test_errors_never_rise_from_layer_to_layer_and_end_at_nothing(name: str) -> 
         assert name == "precision"
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.rint(10 * terrain((300, 280))).astype(np.int32),
+        terrain((280, 300), 1).astype(np.float32),
+        np.rint(2**14 * torus(300, 200)) / 2**14 + np.random.default_rng(0).normal(0, 1e-3, (300, 200, 3)),
+        np.cumsum(np.cumsum(np.random.default_rng(1).integers(-9, 10, (257, 200)), axis=0), axis=1).astype(np.int16),
+    ],
+    ids=["metres", "float32", "xyz", "walk"],
+)
+def test_stops_come_often(points: NDArray[Any]) -> None:
+    """Above 4 kB a layer ends at most 15 % after the last one, or adds a single pass."""
+    index = index_of(ls.encode(points))
+    ends = [layer.end for layer in index.layers]
+    assert ends[-1] > 30_000
+    added = [[segment.passes for segment in index.segments if segment.layer == n] for n in range(len(ends))]
+    steps = [(n, ends[n] / ends[n - 1]) for n in range(1, len(ends)) if ends[n - 1] > 4096]
+    assert [(n, growth, added[n]) for n, growth in steps if growth > 1.15 and added[n] != [1]] == []
+    assert np.mean([growth for _, growth in steps]) > 1.08
+
+
 @pytest.mark.parametrize("name", SAMPLES)
 def test_framing_costs_little(name: str) -> None:
     """Header and tables: 700 bytes and 1 % of any prefix for one channel."""
