@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
 from .lattice import Lattice
 from .picture import coordinate_distances
-from .piece_coder import as_returned, encode_pieces
+from .piece_coder import as_returned, encode_pieces, piece_size
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
 from .quantiser import Quantiser
@@ -96,6 +97,8 @@ class Encoding:
         self.progress(0.4)
         states, figures = self._measured(states)
         self.progress(0.7)
+        coefficients = sum(float(curve.bits.sum()) for curve in curves) / 8
+        self.header = replace(self.header, piece=piece_size(prepared, self.header, self._last, coefficients))
         pieces, exact, lossless = encode_pieces(prepared, self.header, self._last)
         levels = self._level_figures((0.0, 0.0) if exact else figures[-1])
         self.progress(0.8)
@@ -120,6 +123,7 @@ class Encoding:
             extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
             tile=self.layout.tile,
+            piece=prepared.pieces[-1],
             exact=False,
             corrected=False,
             layer_count=0,
