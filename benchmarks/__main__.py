@@ -9,7 +9,7 @@ import platform
 import sys
 from importlib.metadata import version
 
-SECTIONS = ("start", "transform", "solver", "rate", "coder", "memory", "meshes", "blocks", "formats")
+SECTIONS = ("start", "transform", "solver", "rate", "windows", "coder", "memory", "meshes", "blocks", "formats")
 
 # Before numpy is loaded: every figure is of one core.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

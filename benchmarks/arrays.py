@@ -64,8 +64,11 @@ def load() -> tuple[Array, ...]:
 
 
 @functools.cache
-def fractal(side: int = 4097, share: float = 0.5) -> NDArray[np.float64]:
-    """Terrain-like heights of any size, whole numbers of 16 bits: octaves of noise, each of a share of the height."""
+def fractal(side: int = 4097, share: float = 0.5, rounded: bool = True) -> NDArray[np.float64]:
+    """Terrain-like heights of any size, from 0 to 65535: octaves of noise, each of a share of the height.
+
+    ``rounded``: to whole numbers.
+    """
     rng = np.random.default_rng(2002)
     heights = np.zeros((2, 2))
     amplitude = 1.0
@@ -77,5 +80,5 @@ def fractal(side: int = 4097, share: float = 0.5) -> NDArray[np.float64]:
         heights = finer + amplitude * rng.standard_normal(finer.shape)
         amplitude *= share
     heights = heights[:side, :side] - heights[:side, :side].min()
-    scaled: NDArray[np.float64] = np.rint(heights * (65535 / heights.max()))
-    return scaled
+    scaled: NDArray[np.float64] = heights * (65535 / heights.max())
+    return np.rint(scaled, out=scaled) if rounded else scaled

@@ -1,5 +1,4 @@
-"""Streams over slow and distant links: what comes after a stop, how long the first and the good pictures take, and
-what a window costs.
+"""Streams over slow and distant links: what comes after a stop, and how long the first and the good pictures take.
 
 The links are emulated by a proxy on this machine (`tests.links`): half the round trip either way, and so many bytes a
 second towards the client, in packets of 1,400 bytes, with 64 KiB of queue. Times run from the TCP connection on.
@@ -8,7 +7,6 @@ second towards the client, in packets of 1,400 bytes, with 64 KiB of queue. Time
 from __future__ import annotations
 
 import asyncio
-import math
 import statistics
 import tempfile
 import time
@@ -19,13 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 
 import lodestream as ls
-from lodestream.container import read_index
 from lodestream.messages import MAX_CREDIT
-from lodestream.plan import plan
-from lodestream.selection import wish_of
 from lodestream_client import aio, sync
 from lodestream_server import running_server
 from tests.links import Fault, Link
@@ -38,9 +32,6 @@ ROUND_TRIP = 0.1
 RATES: dict[str, float | None] = {"64 kbit/s": 8e3, "256 kbit/s": 32e3, "10 Mbit/s": 1.25e6, "unlimited": None}
 REPEATS = 3
 DEMS: tuple[str, ...] = ("jacksboro", "bigtujunga")
-WINDOW = 0.05
-PLACES = 20
-SIDES = {2049: 0.25, 4097: 0.15}
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,6 @@ def main() -> None:
         first_table({"fractal": large, **dems})
         for name, served in dems.items():
             error_table(arrays[name], served)
-    window_table()
 
 
 def serve(server: str, points: Any) -> Served:
@@ -183,45 +173,6 @@ async def pull(url: str, target: ls.Target, rms: float, transport: Any) -> float
             if view.rms <= rms:
                 break
         return time.monotonic() - started
-
-
-def window_table() -> None:
-    """What of a container a window needs, at places that are spread at random."""
-    rows = []
-    for side, aim in SIDES.items():
-        points = fractal(side).astype(np.int32)
-        container = ls.encode(points)
-        shares = sorted(window_share(points, container, corner) for corner in corners(side))
-        found = [f"{share:.1%}" for share in (statistics.median(shares), shares[0], shares[-1])]
-        rows.append([f"{side} x {side}", f"{len(container):,}", *found, f"{aim:.0%}"])
-    head = ["integers", "bytes", "median", "least", "most", "aim"]
-    table(f"Share of the container for a window of {WINDOW:.0%} of the area, of {PLACES} places", head, rows)
-    note(
-        "All bytes count: header, index, segments, metadata. The points of the window equal those of the complete "
-        "surface."
-    )
-
-
-def window_share(points: Any, container: bytes, corner: tuple[int, int]) -> float:
-    """The share of its bytes that a container is asked for; the window is checked."""
-    length = window_side(len(points))
-    (top, left), (bottom, right) = corner, (corner[0] + length, corner[1] + length)
-    target = ls.Target(region=((top, bottom), (left, right)))
-    chosen = plan(read_index(lambda offset, size: container[offset : offset + size], len(container)), target)
-    decoder = ls.Decoder(wish_of(target))
-    for place in chosen.slices:
-        decoder.feed_at(place.offset, container[place.offset : place.end])
-    assert np.array_equal(decoder.surface().points, points[top:bottom, left:right])
-    return sum(place.length for place in chosen.slices) / len(container)
-
-
-def window_side(side: int) -> int:
-    return round(side * math.sqrt(WINDOW))
-
-
-def corners(side: int) -> list[tuple[int, int]]:
-    found = np.random.default_rng(5).integers(0, side - window_side(side) + 1, (PLACES, 2))
-    return [(int(row), int(column)) for row, column in found]
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +19,7 @@ from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
 from .lattice import Lattice
 from .picture import Original, coordinate_distances, other_originals
-from .piece_coder import as_returned, encode_pieces
+from .piece_coder import as_returned, encode_pieces, piece_size
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
 from .quantiser import Quantiser
@@ -97,6 +98,8 @@ class Encoding:
         self.progress(0.4)
         states, errors = self._measured(states)
         self.progress(0.7)
+        coefficients = sum(float(curve.bits.sum()) for curve in curves) / 8
+        self.header = replace(self.header, piece=piece_size(prepared, self.header, self._last, coefficients))
         pieces, exact = encode_pieces(prepared, self.header, self._last)
         lossless = all(exact)
         levels = self._level_errors(_remaining(errors[-1], exact, self.geometric))
@@ -122,6 +125,7 @@ class Encoding:
             extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
             tile=self.layout.tile,
+            piece=prepared.pieces[-1],
             exact=False,
             corrected=False,
             layer_count=0,

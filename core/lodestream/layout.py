@@ -22,8 +22,6 @@ __all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bound
 
 #: Layouts, and tables of their tiles, that are remembered: that of a surface in hand is asked for again and again.
 REMEMBERED = 4
-#: Small grids share their tiles as long as they have no more points together.
-GROUP_POINTS = 1 << 16
 
 Sides = tuple[bool, bool, bool, bool]
 _NONE: Sides = (False, False, False, False)
@@ -205,6 +203,7 @@ class Layout:
         Grids that have a tile in common have one at the coarser levels too.
         """
         groups = [[number] for number in range(len(self.grids))]
+        most = 4 << sum(self.tile)  # points of a tile's three bands, and of the nodes under them
         levels = [groups]
         for level in range(self.levels, 0, -1):
             merged: list[list[int]] = []
@@ -213,7 +212,7 @@ class Layout:
                 shapes = [self.shape(number, level) for number in group]
                 points = sum(rows * columns for rows, columns in shapes)
                 joins = merged and self.grids[group[0]].curve == self.grids[merged[-1][0]].curve
-                if joins and (self.grids[group[0]].curve or size + points <= GROUP_POINTS):
+                if joins and (self.grids[group[0]].curve or size + points <= most):
                     merged[-1] = merged[-1] + group
                     size += points
                 else:

@@ -18,6 +18,7 @@ PATTERNS, DECIMALS = 1, 2
 MOST_DECIMALS = 15
 _LARGEST_WHOLE = 2.0**53
 _SAMPLE = 64
+_POWERS = np.array([10.0**places for places in range(MOST_DECIMALS + 1)])
 
 _Ints = NDArray[np.int64]
 
@@ -74,14 +75,17 @@ def decimal_places(values: NDArray[Any]) -> int | None:
     """The fewest decimal places that give all of the values, shape (value,), bit for bit; None if there are none."""
     if values.dtype.kind != "f" or not values.size:
         return None
-    sample = values[:: max(1, values.size // _SAMPLE)]
-    for places in range(MOST_DECIMALS + 1):
-        if _are_decimals(sample, places):
-            return places if _are_decimals(values, places) else None
-    return None
+    every = np.arange(MOST_DECIMALS + 1)
+    some = every[_are_decimals(values[:: max(1, values.size // _SAMPLE)], every)]
+    return int(some[0]) if some.size and _are_decimals(values, some[:1])[0] else None
 
 
-def _are_decimals(values: NDArray[Any], places: int) -> bool:
-    line = to_line(DECIMALS, places, values)[0]
+def _are_decimals(values: NDArray[Any], places: _Ints) -> NDArray[np.bool_]:
+    """Whether so many decimal places give all of the values; bool, of the shape of ``places``."""
+    scales = _POWERS[places, np.newaxis]
     unsigned = f"u{values.dtype.itemsize}"
-    return np.array_equal(from_line(DECIMALS, places, line, values.dtype).view(unsigned), values.view(unsigned))
+    with np.errstate(over="ignore"):
+        whole = np.rint(np.clip(values.astype(np.float64) * scales, -_LARGEST_WHOLE, _LARGEST_WHOLE))
+        # A zero without its sign, as a whole number has none.
+        again = ((whole + 0.0) / scales).astype(values.dtype)
+    return np.asarray((again.view(unsigned) == values.view(unsigned)).all(axis=1))

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrangement import grids_of, shared_points
-from .container.headers import TILE_BITS
 from .container.model import AttributeKind, JointChanges
 from .heights import to_heights
 from .joints import Groups
@@ -28,6 +27,13 @@ from .target import Tolerance
 from .transform import allocate
 
 __all__ = ["Precisions", "Preparation", "given_channel"]
+
+#: Coefficients of a tile in a band, and points of a piece of exactness, as exponents of two.
+TILE_BITS, PIECE_BITS = 12, 12
+#: The same for surfaces of at most so many points, where these take many bytes each.
+_SMALL_TILE, _SMALL_PIECE, _SMALL = 11, 10, 1 << 19
+#: Where no window is wanted, or small pieces would take many more bytes.
+_WHOLE_TILE, _WHOLE_PIECE = 14, 16
 
 #: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
 _FINEST, _COARSEST = 128, 8
@@ -67,6 +73,8 @@ class Preparation:
     rms : float or None
         Largest root mean square error of a stream that is made for it.
     layout : Layout
+    pieces : list of (int, int)
+        Exponents of two: what may be the rows and columns of a piece of exactness, the smallest first.
     arrangement : Arrangement or None
         None where the surface is one block that shares no side.
     parts : tuple of Part
@@ -109,11 +117,14 @@ class Preparation:
         if self.arrangement is None:
             shape = first.shape
             self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
-            self.tile = tile_exponents(shape)
-            self.layout = Layout.single(shape, first.closed, self.tile)
+            small = self._takes_small_tiles()
+            self.layout = Layout.single(shape, first.closed, tile_exponents(shape, small))
+            self.pieces = piece_exponents(shape, small)
         else:
-            self.parts, self.tile = self.arrangement.parts, (TILE_BITS // 2, TILE_BITS // 2)
-            self.layout = Layout(grids_of(self.arrangement), self.tile)
+            # It is never read in windows: tiles and pieces may be as large as costs the fewest bytes.
+            self.parts = self.arrangement.parts
+            self.layout = Layout(grids_of(self.arrangement), _square(_WHOLE_TILE))
+            self.pieces = [_square(_WHOLE_PIECE)]
         masks = [block.mask for block in surface.blocks]
         self.originals = originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks)
         self.joint_changes = self._joint_changes()
@@ -205,6 +216,12 @@ class Preparation:
                     curve = arrays[side.curve][:, 0]
                     line[:] = curve[::-1] if side.reversed else curve
 
+    def _takes_small_tiles(self) -> bool:
+        """Whether the surface has few points, of many bytes each: floats on no lattice."""
+        few = math.prod(self.surface.blocks[0].shape) <= _SMALL
+        whole = self.precision is None and self.rms is None
+        return few and whole and self.surface.dtype.kind == "f" and find_lattice(self._valid) is None
+
     def _arranged(self) -> Arrangement | None:
         blocks = self.surface.blocks
         if self.geometric == 1 or (len(blocks) == 1 and not _may_share(blocks[0], self.arrays[0][0])):
@@ -253,13 +270,33 @@ class Preparation:
 _LONGEST_RULES = 16
 
 
-def tile_exponents(shape: tuple[int, int]) -> tuple[int, int]:
-    """Tiles are square, unless the surface is so narrow that longer ones hold more of it."""
-    rows = TILE_BITS // 2
-    while rows > 1 and min(shape) <= 1 << rows:
-        rows -= 1
-    exponents = rows, TILE_BITS - rows
-    return exponents if shape[0] <= shape[1] else exponents[::-1]
+def tile_exponents(shape: tuple[int, int], small: bool = False) -> tuple[int, int]:
+    """Rows and columns of a tile, as exponents of two, for a surface of one grid: in nodes, half of the points.
+
+    ``small``: of a surface that takes small tiles, since a window needs a larger share of it.
+    """
+    return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, _SMALL_TILE if small else TILE_BITS)
+
+
+def piece_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
+    """Rows and columns that pieces of exactness of a surface of one grid may have, as exponents of two.
+
+    The smallest first; ``small`` as in `tile_exponents`.
+    """
+    sizes = [_SMALL_PIECE] * small + [PIECE_BITS, _WHOLE_PIECE]
+    return [_fitting(*shape, bits) for bits in sizes]
+
+
+def _square(bits: int) -> tuple[int, int]:
+    return bits // 2, bits - bits // 2
+
+
+def _fitting(rows: int, columns: int, bits: int) -> tuple[int, int]:
+    """A square, or something longer where that holds more of what is narrow."""
+    short, long = _square(bits)
+    while short > 1 and 2 * min(rows, columns) <= 1 << short:
+        short, long = short - 1, long + 1
+    return (short, long) if rows <= columns else (long, short)
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:

@@ -91,7 +91,7 @@ def restored(header: Header, region: Region) -> Region:
     """What has to be decoded for a region of the only block: a piece of exactness restores all of its own window."""
     if not header.corrected:
         return region
-    sizes = [2 << exponent for exponent in header.tile]
+    sizes = [1 << exponent for exponent in header.piece]
     rows, columns = (
         (start // size * size, min(-(-stop // size) * size, length))
         for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)

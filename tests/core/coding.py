@@ -85,6 +85,7 @@ def header_for(layout: Layout, channels: int) -> Header:
         extent=1.0,
         empty=(0,) * channels,
         tile=layout.tile,
+        piece=(6, 6),
         exact=False,
         corrected=False,
         layer_count=1,

@@ -69,6 +69,7 @@ def lying_header(shape: tuple[int, int], channels: int = 1, **changes: Any) -> b
     out.varint(channels)
     out.varint(changes.get("layers", 1))
     out.byte(changes.get("tile", 7 | 7 << 4))
+    out.byte(changes.get("piece", 6 | 6 << 4))
     out.varint(changes.get("base", 0))
     out.number(changes.get("extent", 1.0))
     for number in shape:
@@ -142,6 +143,13 @@ def test_random_access_refuses_what_is_damaged_or_cut(name: str) -> None:
         index_of(container + b"\0")
 
 
+@pytest.mark.parametrize("sizes", [{}, {"tile": 4 | 4 << 4, "piece": 8 | 8 << 4}, {"tile": 15 | 1 << 4}])
+def test_a_header_that_does_not_lie_is_read(sizes: dict[str, int]) -> None:
+    decoder = Decoder()
+    decoder.feed(lying_header((5, 5), **sizes))
+    assert decoder.header is not None
+
+
 @pytest.mark.parametrize(
     ("header", "words"),
     [
@@ -160,6 +168,12 @@ def test_random_access_refuses_what_is_damaged_or_cut(name: str) -> None:
         (lying_header((5, 5), dtype=10), "a type below 10"),
         (lying_header((5, 5), tile=0), "expected tiles"),
         (lying_header((5, 5), tile=14), "expected tiles"),
+        (lying_header((5, 5), tile=3 | 4 << 4), "expected tiles"),
+        (lying_header((5, 5), tile=9 | 8 << 4), "expected tiles"),
+        (lying_header((5, 5), piece=12), "expected pieces"),
+        (lying_header((5, 5), piece=3 | 4 << 4), "expected pieces"),
+        (lying_header((5, 5), piece=9 | 8 << 4), "expected pieces"),
+        (lying_header((2**30, 1), piece=1 | 8 << 4), "expected pieces"),
         (lying_header((5, 5), rule=2), "expected a lattice"),
         (lying_header((5, 5), step=0.0), "expected a lattice"),
         (lying_header((5, 5), step=-1.0), "expected a lattice"),

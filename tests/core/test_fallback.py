@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream import capacity
+from lodestream import capacity, preparation
 from lodestream.capacity import Capacity
 from lodestream.inspection import inspect
 from lodestream.plan import plan
@@ -151,6 +151,23 @@ def test_the_reference_and_the_kernels_agree(
     surface: ls.Surface, options: dict[str, str], layer: int, level: int
 ) -> None:
     agree_on(ls.encode(surface, **options), layer, level)  # type: ignore[arg-type]
+
+
+@settings(max_examples=20)
+@given(st.tuples(st.integers(2, 60), st.integers(2, 200)), st.booleans(), st.integers(0, 2**32), st.integers(0))
+def test_they_agree_on_tiles_and_pieces_of_any_size(
+    shape: tuple[int, int], floats: bool, seed: int, layer: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    heights = np.cumsum(rng.normal(size=shape), axis=1)
+    tile, piece = ((short, 8 + int(rng.integers(0, 3)) - short) for short in map(int, rng.integers(1, 7, 2)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparation, "tile_exponents", lambda *_: tile)
+        patch.setattr(preparation, "piece_exponents", lambda *_: [piece])
+        data = ls.encode(heights.astype(np.float32) if floats else np.rint(9 * heights).astype(np.int16))
+    header = index_of(data).header
+    assert (header.tile, header.piece) == (tile, piece)
+    agree_on(data, layer, header.levels)
 
 
 def outcome(data: bytes) -> list[str | list[bytes]]:

@@ -5,13 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import lodestream as ls
 from lodestream.errors import InputError
 from lodestream.layout import Layout, tile_bounds
-from lodestream.preparation import tile_exponents
+from lodestream.preparation import piece_exponents, tile_exponents
 from lodestream.tiles import TileTable, gather
 
 from . import lifting_reference as reference
 from .coding import shapes_of
+from .surfaces import index_of
 
 closures = st.tuples(st.booleans(), st.booleans())
 layouts = st.builds(
@@ -117,10 +119,33 @@ def test_the_last_tile_takes_up_to_half_a_tile_with_it() -> None:
 
 @pytest.mark.parametrize(
     ("shape", "tile"),
-    [((5000, 5000), (7, 7)), ((129, 4000), (7, 7)), ((128, 4000), (6, 8)), ((1, 9), (1, 13)), ((900, 3), (13, 1))],
+    [((5000, 5000), (6, 6)), ((65, 4000), (6, 6)), ((64, 4000), (5, 7)), ((1, 9), (1, 11)), ((900, 3), (11, 1))],
 )
 def test_tiles_of_narrow_surfaces_are_long(shape: tuple[int, int], tile: tuple[int, int]) -> None:
     assert tile_exponents(shape) == tile
+
+
+@pytest.mark.parametrize(
+    ("shape", "pieces"),
+    [
+        ((5000, 5000), [(6, 6), (8, 8)]),
+        ((33, 4000), [(6, 6), (6, 10)]),
+        ((32, 4000), [(5, 7), (5, 11)]),
+        ((900, 1), [(11, 1), (15, 1)]),
+    ],
+)
+def test_pieces_of_narrow_surfaces_are_long(shape: tuple[int, int], pieces: list[tuple[int, int]]) -> None:
+    assert piece_exponents(shape) == pieces
+
+
+def test_small_surfaces_take_small_tiles_where_points_have_many_bytes() -> None:
+    assert tile_exponents((512, 512), small=True) == (5, 6)
+    assert piece_exponents((512, 512), small=True) == [(5, 5), (6, 6), (8, 8)]
+    noise = np.random.default_rng(4).normal(size=(70, 150)).astype(np.float32)
+    for values, tile in ((noise, (5, 6)), (np.rint(100 * noise), (6, 6)), (noise > 0, (6, 6))):
+        container = ls.encode(values.astype(np.float32 if values.dtype == bool else values.dtype))
+        assert index_of(container).header.tile == tile
+    assert index_of(ls.encode(noise, precision=1e-3)).header.tile == (6, 6)
 
 
 def test_an_empty_grid_is_refused() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
+from lodestream import preparation
 from lodestream.container import read_index
 from lodestream.container.model import Index
 from lodestream.layout import Layout
@@ -96,6 +97,37 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
         assert view.points.shape == window.points.shape
     if region == REGIONS[0] and kind in ("integers", "floats", "holes"):
         assert decoder.bytes < 0.9 * len(container)
+
+
+SIZES = [((4, 4), (4, 4)), ((1, 7), (9, 7)), ((3, 6), (7, 1)), ((8, 8), (5, 3))]
+
+
+@pytest.mark.parametrize(("tile", "piece"), SIZES, ids=repr)
+@pytest.mark.parametrize("kind", ["integers", "floats", "holes"])
+def test_tiles_and_pieces_of_any_size_are_read(
+    kind: str, tile: tuple[int, int], piece: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preparation, "tile_exponents", lambda *_: tile)
+    monkeypatch.setattr(preparation, "piece_exponents", lambda *_: [piece])
+    surface = encoded(kind)[0]
+    container = ls.encode(surface)
+    header = index_of(container).header
+    assert (header.tile, header.piece) == (tile, piece)
+    assert np.array_equal(ls.decode(container).points, surface.points, equal_nan=True)
+    for region in REGIONS:
+        window = received(container, ls.Target(region=region)).surface()
+        assert np.array_equal(window.points, cut(surface, region)[0], equal_nan=True)
+
+
+@pytest.mark.parametrize("shape", [(3, 9000), (9000, 3)])
+def test_several_narrow_blocks_are_read(shape: tuple[int, int]) -> None:
+    rows, columns = np.indices(shape).astype(float)
+    points = np.stack([columns, rows, np.sin(columns / 50)], axis=2)
+    shift = np.array([0, 0, 9])
+    blocks = [ls.Block(points), ls.Block(points + shift), ls.Block(np.swapaxes(points, 0, 1) - shift)]
+    container = ls.encode(ls.Surface(blocks=blocks))
+    for block, found in zip(blocks, ls.decode(container).blocks, strict=True):
+        np.testing.assert_array_equal(found.points, block.points)
 
 
 @settings(max_examples=80, deadline=None)

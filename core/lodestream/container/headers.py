@@ -16,7 +16,7 @@ from ..quantiser import MOST_BASE, Quantiser
 from . import codecs
 from .fields import LARGEST, FieldReader, FieldWriter
 from .frames import Frame
-from .model import Header
+from .model import Header, count_rectangles
 from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
@@ -28,10 +28,10 @@ from .shape import (
     serialize_extras,
 )
 
-__all__ = ["TILE_BITS", "parse_header", "parse_masks", "serialize_header"]
+__all__ = ["parse_header", "parse_masks", "serialize_header"]
 
-#: Rows of a tile times columns, as an exponent of two.
-TILE_BITS = 14
+#: Rows of a tile, or of a piece of exactness, times columns, as exponents of two.
+_LEAST_BITS, _MOST_BITS = 8, 16
 _RULES = ("affine", "decimal")
 
 
@@ -45,7 +45,8 @@ def serialize_header(header: Header) -> bytes:
     out.byte(DTYPES.index(header.dtype))
     out.varint(header.point_channels)
     out.varint(header.layer_count)
-    out.byte(header.tile[0] | header.tile[1] << 4)
+    for exponents in (header.tile, header.piece):
+        out.byte(exponents[0] | exponents[1] << 4)
     out.varint(0 if header.quantiser is None else header.quantiser.base)
     out.number(header.extent)
     if header.arrangement is None:
@@ -126,8 +127,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
     point_channels, layer_count = fields.varint(2**16), fields.varint()
-    exponents, base = fields.byte(), fields.varint(MOST_BASE)
-    tile = exponents & 15, exponents >> 4
+    tile, piece = _exponents(fields.byte()), _exponents(fields.byte())
+    base = fields.varint(MOST_BASE)
     extent = fields.number()
     arrangement = None
     if flags & 64:
@@ -147,10 +148,15 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     longest = max(length for shape, _ in blocks for length in shape)
     if longest > LONGEST_AXIS:
         raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {longest:,}")
-    # Tiles across a narrow surface would be many, and nearly empty.
-    count = sum(max(1, rows >> tile[0]) * max(1, columns >> tile[1]) for (rows, columns), _ in blocks)
-    if sum(tile) != TILE_BITS or min(tile) < 1 or count > 64 + len(blocks) + (points >> (TILE_BITS - 3)):
-        raise CorruptStreamError(f"expected tiles of 2**14 coefficients, got exponents {tile[0]} and {tile[1]}", offset)
+    for name, exponents in (("tiles", tile), ("pieces", piece)):
+        # Across a narrow surface long ones would be many, and nearly empty.
+        many = count_rectangles(blocks, exponents) > 64 + len(blocks) + (points >> max(exponents))
+        if many or not _LEAST_BITS <= sum(exponents) <= _MOST_BITS or min(exponents) < 1:
+            raise CorruptStreamError(
+                f"expected {name} of 2**{_LEAST_BITS} to 2**{_MOST_BITS} that fit the surface, "
+                f"got exponents {exponents[0]} and {exponents[1]}",
+                offset,
+            )
     if not (math.isfinite(extent) and extent >= 0):
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = []
@@ -186,6 +192,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         extent=extent,
         empty=empty,
         tile=tile,
+        piece=piece,
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
         layer_count=layer_count,
@@ -196,3 +203,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         joint_changes=extras.joint_changes,
         length=length,
     )
+
+
+def _exponents(byte: int) -> tuple[int, int]:
+    return byte & 15, byte >> 4

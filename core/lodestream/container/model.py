@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ __all__ = [
     "OptionalSection",
     "Piece",
     "Segment",
+    "count_rectangles",
 ]
 
 #: To the points at one place, and to those that are one vertex; as `joints.Change.runs` has them.
@@ -76,6 +77,11 @@ class AttributeKind:
         return max(self.components, 1)
 
 
+def count_rectangles(blocks: Sequence[tuple[tuple[int, int], Closed]], exponents: tuple[int, int]) -> int:
+    """About how many rectangles, with rows and columns of these exponents of two, the blocks are cut into."""
+    return sum(max(1, rows >> exponents[0]) * max(1, columns >> exponents[1]) for (rows, columns), _ in blocks)
+
+
 @dataclass(frozen=True)
 class Header:
     """What is needed to draw.
@@ -100,6 +106,8 @@ class Header:
         For each channel the levels, as bits, that have no coefficient other than 0.
     tile : (int, int)
         Exponents of two: rows and columns of a tile, in coefficients of one band.
+    piece : (int, int)
+        Exponents of two: rows and columns of points of a piece of the exactness section.
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
@@ -142,6 +150,7 @@ class Header:
     extent: float
     empty: tuple[int, ...]
     tile: tuple[int, int]
+    piece: tuple[int, int]
     exact: bool
     corrected: bool
     layer_count: int
@@ -223,9 +232,10 @@ class Header:
 
     @property
     def tables(self) -> int:
-        """About how many tiles all channels have, and blocks: told without laying them out."""
-        tiles = sum(max(1, r >> self.tile[0]) * max(1, c >> self.tile[1]) for (r, c), _ in self.blocks)
-        return (16 + len(self.blocks) + 2 * tiles) * self.channels
+        """About how many tiles and pieces all channels have, and blocks: told without laying them out."""
+        tiles, pieces = (count_rectangles(self.blocks, exponents) for exponents in (self.tile, self.piece))
+        pieces *= self.corrected * (1 + any(self.kept))
+        return (16 + len(self.blocks) + 2 * tiles + pieces) * self.channels
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:

@@ -23,10 +23,9 @@ class Window(NamedTuple):
 def windows(header: Header) -> Iterator[Window]:
     """All pieces in the order of the file: block by block, row by row of windows, channel by channel.
 
-    A window has twice the rows and columns of a tile: about the points that a tile of the finest level makes. A block
-    of which holes are kept has as many pieces again, in the same order, of these.
+    A block of which holes are kept has as many pieces again, in the same order, of these.
     """
-    height, width = (2 << exponent for exponent in header.tile)
+    height, width = (1 << exponent for exponent in header.piece)
     for block, ((rows, columns), _) in enumerate(header.blocks):
         for kept in (False, True) if header.kept and header.kept[block] else (False,):
             for top in range(0, rows, height):

@@ -121,7 +121,7 @@ class Window(NamedTuple):
 
 def windows(header: Header, masks: Masks) -> Iterator[Window]:
     """The windows of all pieces, in the order of section 9."""
-    down, along = (2 ** (t + 1) for t in header.tile)
+    down, along = (2**p for p in header.piece)
     for number, block in enumerate(header.blocks):
         for kept in (False, True) if masks.kept[number].any() else (False,):
             for top in range(0, block.rows, down):

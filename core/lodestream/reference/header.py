@@ -89,6 +89,7 @@ class Header:
     points_channels: int
     layers: int
     tile: tuple[int, int]
+    piece: tuple[int, int]
     base: int  # 0 where coordinates are not quantised
     blocks: list[Block]
     grids: list[Grid]  # curves first
@@ -157,7 +158,7 @@ def read_header(payload: bytes) -> Header:
     flags = fields.number("B")
     kind = TYPES[fields.number("B")]
     points_channels, layers = fields.varint(), fields.varint()
-    tile = fields.number("B")
+    tile, piece = fields.number("B"), fields.number("B")
     base = fields.varint()
     if base >= 2**24:
         raise StreamError(f"expected a base below 2^24, got {base}")
@@ -185,6 +186,7 @@ def read_header(payload: bytes) -> Header:
         points_channels=points_channels,
         layers=layers,
         tile=(tile & 15, tile >> 4),
+        piece=(piece & 15, piece >> 4),
         base=base,
         blocks=blocks,
         grids=grids,

@@ -11,7 +11,6 @@ from .header import Block, Grid, Header
 
 __all__ = ["Axis", "GridLevels", "Levels", "Predictor"]
 
-GROUP_POINTS = 2**16
 FITTED = 24
 
 Predictor = tuple[int, int]
@@ -128,6 +127,7 @@ class Levels:
 
     def __init__(self, header: Header) -> None:
         self.held = _common_ends(header.grids)
+        self._group_points = 2 ** (sum(header.tile) + 2)
         levels = [
             [
                 [Axis(grid.shape[k], grid.closed[k], grid.stops[k], grid.clamped[2 * k : 2 * k + 2]) for k in (0, 1)]
@@ -168,7 +168,7 @@ class Levels:
         for level in range(self.last, 0, -1):
             groups: list[list[GridLevels]] = []
             for group in levels[0]:
-                if groups and _belong_together([*groups[-1], *group], level):
+                if groups and _belong_together([*groups[-1], *group], level, self._group_points):
                     groups[-1] += group
                 else:
                     groups.append(list(group))
@@ -176,7 +176,7 @@ class Levels:
         return [[self.grids], *levels[:-1]]
 
 
-def _belong_together(grids: list[GridLevels], level: int) -> bool:
+def _belong_together(grids: list[GridLevels], level: int, most: int) -> bool:
     if grids[0].is_curve or grids[-1].is_curve:
         return grids[-1].is_curve
-    return sum(math.prod(grid.shape(level)) for grid in grids) <= GROUP_POINTS
+    return sum(math.prod(grid.shape(level)) for grid in grids) <= most
