@@ -22,8 +22,8 @@ import numpy as np
 
 import lodestream as ls
 from lodestream import formats
-from lodestream.container import Header as ContainerHeader
 from lodestream.container import FrameReader, headers, read_index, sections
+from lodestream.container import Header as ContainerHeader
 from lodestream.container.frames import section_extent
 from lodestream.container.index import parse_root
 from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
