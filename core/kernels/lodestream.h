@@ -116,7 +116,7 @@ LODE_API int64_t lode_square_distances(const void *points, int64_t points_count,
                                        int64_t last);
 
 #define LODE_PART_ROWS 128
-#define LODE_PART_COLUMNS 512
+#define LODE_PART_COLUMNS 256
 
 /* holes.c -------------------------------------------------------------------------------------------------------- */
 

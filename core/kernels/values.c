@@ -16,10 +16,9 @@
 
 enum {
     TOGETHER = 512,   /* values worked on together */
-    SIDE_BY_SIDE = 4, /* parts whose rows are read from end to end: memory comes faster so */
+    SIDE_BY_SIDE = 8, /* parts whose rows are read from end to end: memory comes faster so */
     WIDEST = SIDE_BY_SIDE * LODE_PART_COLUMNS,
-    MOST_KINDS =
-        4, /* of figures of one part: of the distances and of three channels; they take the room of four parts */
+    MOST_KINDS = 4, /* of figures of one part: of the distances and of three channels; they share the room */
     RULE_NUMBERS = 4,
 };
 
@@ -355,7 +354,8 @@ int64_t lode_square_distances(const void *points, int64_t points_count, int64_t 
                                     compared,    height,      pitch};
     for (int64_t part = first; part < last;) {
         int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
-        int64_t parts = least(least(across - part % across, last - part), kinds > 1 ? 1 : SIDE_BY_SIDE);
+        int64_t parts =
+            least(least(across - part % across, last - part), kinds > 1 ? SIDE_BY_SIDE / MOST_KINDS : SIDE_BY_SIDE);
         part_figures(&comparison, top, least(top + LODE_PART_ROWS, rows), left,
                      least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * kinds * part);
         part += parts;

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping
 from numpy.typing import ArrayLike
 
 from . import metadata
+from .container.shape import LONGEST_AXIS
 from .encoding import Encoding, UnreachableError
-from .errors import FormatWarning, OptionError
+from .errors import FormatWarning, OptionError, TooLargeError
 from .library import require
 from .losses import at_holes
 from .preparation import Preparation
@@ -59,6 +60,8 @@ def encode(
     InputError
         If the surface cannot be encoded, or not with this precision, or if its metadata are larger than
         `lodestream.metadata.MAX_BYTES`.
+    TooLargeError
+        If a block has more rows or columns than kernels can count.
     OptionError
         If there is no attribute of a given name, or both a precision and an error are given.
     UnavailableError
@@ -68,6 +71,9 @@ def encode(
     if not isinstance(surface, Surface):
         surface = Surface(surface)
     metadata.check(surface.metadata)
+    most = max(length for block in surface.blocks for length in block.shape)
+    if most > LONGEST_AXIS:
+        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {most:,}")
     rising = _rising(progress or (lambda fraction: None))
     precisions = {name: _tolerance(wanted) for name, wanted in (attribute_precision or {}).items()}
     unknown = [name for name in precisions if name not in surface.blocks[0].attributes]

@@ -29,6 +29,8 @@ from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
 from .tiles import Tiles, TileTable, gather
 from .transform import PADDING, forward, synthesis_norms
+from .window_errors import KIND as WINDOW_ERRORS
+from .window_errors import is_divided, layer_codes, no_errors, serialize_window_errors
 
 __all__ = ["Encoding", "UnreachableError"]
 
@@ -38,6 +40,9 @@ _ROUNDING = 0.2
 
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
+
+#: The share of the bytes that errors of windows may take.
+_WINDOWS_SHARE = 0.005
 
 State = NDArray[np.int8]
 
@@ -108,7 +113,8 @@ class Encoding:
         if lossless:
             metadata[DIGEST] = values_digest(as_returned(prepared.given, self.header.hole))
         coded = self._coded(states, errors)
-        return write_container(self.header, coded, levels, pieces, metadata, exact=lossless)
+        optional = self._optional(coded, pieces)
+        return write_container(self.header, coded, levels, pieces, metadata, exact=lossless, optional=optional)
 
     def _header(self) -> Header:
         prepared, surface = self.prepared, self.prepared.surface
@@ -234,18 +240,23 @@ class Encoding:
     def _tables_of_channels(self) -> list[TileTable]:
         return [self._table(number) for number in range(len(self.channels))]
 
-    def _distances(self, state: State, canvases: list[NDArray[np.int32]]) -> list[tuple[float, float]]:
+    def _distances(
+        self, state: State, canvases: list[NDArray[np.int32]], cells: list[NDArray[np.float64]] | None = None
+    ) -> list[tuple[float, float]]:
         """Errors of what a receiver shows in this state: of the distances and, if there are several, of coordinates."""
         fractions = []
         for number in range(self.geometric):
             places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
             fractions.append(self._picture(number, state, places)[1])
         lattices = self.lattices[: self.geometric]
-        return coordinate_distances(self.prepared.originals, lattices, canvases[self._curves_first :], fractions)
+        shown = canvases[self._curves_first :]
+        return coordinate_distances(self.prepared.originals, lattices, shown, fractions, cells=cells)
 
-    def _errors(self, state: State, canvases: list[NDArray[np.int32]]) -> Errors:
+    def _errors(
+        self, state: State, canvases: list[NDArray[np.int32]], cells: list[NDArray[np.float64]] | None = None
+    ) -> Errors:
         """Errors of what a receiver shows in this state, as a container tells them."""
-        distances, *found = self._distances(state, canvases)
+        distances, *found = self._distances(state, canvases, cells)
         if len(self.lattices) > 1:
             found = found or [distances]
             for number, (originals, component) in enumerate(self._others, self.geometric):
@@ -281,24 +292,46 @@ class Encoding:
         canvases, start, announced = self._canvases(), initial_state(self.header), self._all_passes()
         kept: list[State] = []
         errors: list[Errors] = []
+        codes: list[NDArray[np.uint8] | None] = []
+        self._window_codes = codes
         for state in states:
             complete = state is states[-1]
             shown = state if complete else np.where(state < announced, state, start)
-            measured = self._errors(shown.astype(np.int8), canvases)
+            cells: list[NDArray[np.float64]] = []
+            measured = self._errors(shown.astype(np.int8), canvases, cells)
             if complete:
                 while errors and measured.rms > errors[-1].rms:
                     kept.pop()
                     errors.pop()
+                    codes.pop()
             elif errors and measured.rms > errors[-1].rms:
                 continue
             kept.append(state)
             errors.append(measured)
+            codes.append(self._codes(measured, cells))
         # The canvases hold the complete picture of the coordinates, unless attributes took their place.
         shared = self.geometric if len(self.channels) == self.geometric else 0
         pictures: list[Picture] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
         pictures += [self._picture(number, states[-1]) for number in range(shared, len(self.channels))]
         self._last = to_values(self.header, pictures, self.layout.levels)
         return kept, errors
+
+    def _codes(self, errors: Errors, cells: list[NDArray[np.float64]]) -> NDArray[np.uint8] | None:
+        """Errors of the cells of a layer, where there are several and they can be told."""
+        if self.prepared.arrangement is not None or not is_divided(self.header):
+            return None
+        if not errors.maximum:
+            return no_errors(self.header)
+        return layer_codes(cells[0], self.header) if cells else None
+
+    def _optional(self, coded: list[CodedLayer], pieces: list[bytes]) -> dict[int, bytes]:
+        """Errors of windows, if they take little of the bytes."""
+        codes = [known for known in self._window_codes if known is not None]
+        if len(codes) < len(coded):
+            return {}
+        payload = serialize_window_errors(codes)
+        total = sum(len(s.data) for layer in coded for s in layer.segments) + sum(map(len, pieces))
+        return {WINDOW_ERRORS: payload} if len(payload) < _WINDOWS_SHARE * total else {}
 
     def _level_errors(self, last: Errors) -> list[Errors]:
         """Errors of the states that hold all levels up to one; the last of them is the complete surface."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .container import headers, sections
 from .container.fields import told, told_roughly
 from .container.frames import Frame, section_extent, whole_section
-from .container.model import ByteRange, Errors, Header, Index, LayerRecord, Piece, Segment
+from .container.model import ByteRange, Errors, Header, Index, LayerRecord, OptionalSection, Piece, Segment
 from .decoder import Decoder
 from .errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
 from .heights import to_xyz
@@ -25,6 +25,8 @@ from .picture import Original, coordinate_distances, originals_of, other_origina
 from .reconstruction import Picture, Reconstruction, initial_state
 from .seams import restore
 from .surface import Surface
+from .window_errors import CELL, WindowErrors, layer_codes, parse_window_errors
+from .window_errors import KIND as WINDOW_ERRORS
 
 __all__ = ["Inspection", "inspect"]
 
@@ -69,6 +71,8 @@ class _Found:
     exactness: ByteRange | None = None
     remaining: Errors | None = None
     metadata: ByteRange | None = None
+    optional: list[OptionalSection] = field(default_factory=list)
+    windows: WindowErrors | None = None
     tops: dict[tuple[int, int], int] = field(default_factory=dict)  # of tiles and channels that have been named
 
 
@@ -124,7 +128,7 @@ def inspect(
     progress(_DECODED)
     _check_metadata(decoder, decoder.index, surface)
     if decoder.index.header.exact:
-        _check_errors(decoder, decoder.index, surface, progress)
+        _check_errors(decoder, decoder.index, surface, found.windows, progress)
     progress(1.0)
     return Inspection(decoder.index, decoder.index.header.exact)
 
@@ -180,6 +184,10 @@ def _note(found: _Found, frame: Frame, header: Header) -> None:
         found.pieces = [Piece(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in pieces]
     elif frame.kind == sections.METADATA:
         found.metadata = place
+    elif frame.kind >= sections.OPTIONAL:
+        found.optional.append(OptionalSection(frame.kind, place))
+        if frame.kind == WINDOW_ERRORS:
+            found.windows = parse_window_errors(frame.payload, frame.payload_offset, header)
 
 
 def _note_layer(found: _Found, frame: Frame, header: Header) -> None:
@@ -229,6 +237,7 @@ def _compare(index: Index, found: _Found) -> None:
         ("segment", index.segments, found.segments),
         ("piece", index.pieces, found.pieces),
         ("section", (index.exactness, index.metadata), (found.exactness, found.metadata)),
+        ("optional section", index.optional, found.optional),
     )
     for word, named, real in pairs:
         wrong = [k for k, (a, b) in enumerate(zip(named, real, strict=False)) if a != b]
@@ -283,14 +292,23 @@ def _check_metadata(decoder: Decoder, index: Index, complete: Surface) -> None:
             ) from None
 
 
-def _check_errors(decoder: Decoder, index: Index, surface: Surface, progress: Callable[[float], None]) -> None:
+def _check_errors(
+    decoder: Decoder,
+    index: Index,
+    surface: Surface,
+    windows: WindowErrors | None,
+    progress: Callable[[float], None],
+) -> None:
     """Draw each layer and level, and refuse errors that are not theirs."""
     ruler = _Ruler(index.header, decoder.view()._reconstruction, surface)
     last, count = len(index.layers) - 1, len(index.layers) + index.header.levels
     for record, view in zip(index.layers, decoder.layers, strict=False):
         # What the last layer does not name has no coefficient but 0.
         state = view._state if record.number < last else np.zeros_like(view._state)
-        _agree(record.errors, ruler.errors(state), f"layer {record.number}", record.offset)
+        cells: list[NDArray[np.float64]] = []
+        _agree(record.errors, ruler.errors(state, cells), f"layer {record.number}", record.offset)
+        if windows is not None and index.header.arrangement is None and cells:
+            _bound(windows, cells[0], record)
         progress(_DECODED + (1 - _DECODED) * (record.number + 1) / count)
     for known in index.levels[:-1]:
         state = initial_state(index.header)
@@ -311,6 +329,17 @@ def _agree(said: Errors, found: Errors, what: str, offset: int) -> None:
                 raise CorruptStreamError(f"expected the RMS and maximum error of {what}, {wanted}, got {got}", offset)
 
 
+def _bound(windows: WindowErrors, cells: NDArray[np.float64], layer: LayerRecord) -> None:
+    """Refuse errors of windows that are smaller than what was measured, as far as cells are the same."""
+    known = layer_codes(cells, windows.header)
+    if windows.cell != CELL or known is None:
+        return
+    if (windows.codes[:, layer.number] > known).any():
+        raise CorruptStreamError(
+            f"expected bounds of the errors of windows in layer {layer.number}, got smaller ones", 0
+        )
+
+
 class _Ruler:
     """Measures pictures as the encoder does: on lattice coordinates, each vertex once, holes left out."""
 
@@ -325,15 +354,16 @@ class _Ruler:
         self._originals = originals_of(header.arrangement, [own[0] for own in arrays], masks)
         self._others = other_originals(header.arrangement, arrays, masks, header.geometric)
 
-    def errors(self, state: NDArray[np.int8]) -> Errors:
-        """Errors of the full-resolution picture of a state, exactness aside."""
+    def errors(self, state: NDArray[np.int8], cells: list[NDArray[np.float64]] | None = None) -> Errors:
+        """Errors of the full-resolution picture of a state, exactness aside; ``cells``: see `coordinate_distances`."""
         header, known = self._header, self._reconstruction
 
         def picture(channel: int) -> Picture:
             return known.picture(known.length, state, header.levels, channel)
 
         pictures = [picture(channel) for channel in range(header.geometric)]
-        distances, *found = self._compared(self._originals, header.lattices[: header.geometric], pictures)
+        lattices = header.lattices[: header.geometric]
+        distances, *found = self._compared(self._originals, lattices, pictures, cells=cells)
         if header.channels > 1:
             found = found or [distances]
             for number, (originals, component) in enumerate(self._others, header.geometric):
@@ -342,10 +372,15 @@ class _Ruler:
         return Errors(*distances, tuple(found))
 
     def _compared(
-        self, originals: list[Original], lattices: Sequence[Lattice], pictures: list[Picture], component: int = 0
+        self,
+        originals: list[Original],
+        lattices: Sequence[Lattice],
+        pictures: list[Picture],
+        component: int = 0,
+        cells: list[NDArray[np.float64]] | None = None,
     ) -> list[tuple[float, float]]:
         curves = len(self._header.layout.grids) - len(self._header.parts)
         parts = range(len(self._header.parts))
         coordinates = [np.stack([grids[curves + k] for grids, _ in pictures]) for k in parts]
         fractions = [fraction for _, fraction in pictures]
-        return coordinate_distances(originals, lattices, coordinates, fractions, component)
+        return coordinate_distances(originals, lattices, coordinates, fractions, component, cells)

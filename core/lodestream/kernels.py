@@ -277,7 +277,7 @@ MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
 
 # values.c
-PART_ROWS, PART_COLUMNS = 128, 512
+PART_ROWS, PART_COLUMNS = 128, 256
 store_values = Kernel("store_values", reads_plane(_I32), writes_values(), *[INTEGER] * 5, *[REAL] * 3)
 square_distances = Kernel(
     "square_distances", reads_values(), reads(_I32), reads(_F64), reads(_BOOL), writes(_F64), *[INTEGER] * 8

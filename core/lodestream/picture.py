@@ -150,6 +150,7 @@ def coordinate_distances(
     coordinates: Sequence[NDArray[np.int32]],
     fractions: Sequence[int],
     channel: int = 0,
+    cells: list[NDArray[np.float64]] | None = None,
 ) -> list[tuple[float, float]]:
     """`distances` between points and the values of lattice coordinates.
 
@@ -162,6 +163,9 @@ def coordinate_distances(
         Coordinates stand over two to this power.
     channel : int
         The first of the points' channels that are compared.
+    cells : list, optional
+        Is given, for each part, sums and largest of the squared distances in cells of `kernels.PART_ROWS` x
+        `kernels.PART_COLUMNS` points, float64, shape (row of cells, column of cells, 2), unless they are out of range.
 
     Returns
     -------
@@ -174,9 +178,11 @@ def coordinate_distances(
     if dtype.kind == "f" or dtype.itemsize < 8:
         rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
         parts = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
-        worst = [max(part[1][kind] for part in parts) for kind in range(_kinds(len(lattices)))]
+        worst = [max(float(part[..., kind, 1].max()) for part in parts) for kind in range(_kinds(len(lattices)))]
         if 1e-250 < worst[0] < 1e250:
-            totals = [math.fsum(part[0][kind] for part in parts) for kind in range(len(worst))]
+            if cells is not None:
+                cells += [part[..., 0, :] for part in parts]
+            totals = [math.fsum(math.fsum(part[..., k, 0].flat) for part in parts) for k in range(len(worst))]
             return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
     # Integers that float64 cannot tell apart, or squares that it cannot hold.
     compared = []
@@ -208,14 +214,17 @@ def _kinds(channels: int) -> int:
 
 def _distances(
     original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64], channel: int
-) -> tuple[list[float], list[float]]:
-    """Sums and largest of the squared distances of one part, see `kernels.square_distances`."""
+) -> NDArray[np.float64]:
+    """Sums and largest of the squared distances of one part, float64, shape (row, column, kind, 2).
+
+    See `kernels.square_distances`.
+    """
     rows, columns, channels = original.points.shape
-    count = -(-rows // kernels.PART_ROWS) * -(-columns // kernels.PART_COLUMNS)
-    figures = np.empty((count, _kinds(len(rules)), 2))
+    down, across = -(-rows // kernels.PART_ROWS), -(-columns // kernels.PART_COLUMNS)
+    figures = np.empty((down, across, _kinds(len(rules)), 2))
     counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
     arrays = original.points, coordinates, rules, counted, figures
     shapes = rows, columns, channels, channel, *coordinates.shape[1:]
-    for first in range(0, count, _PARTS):
-        kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, count))
-    return [math.fsum(own) for own in figures[..., 0].T], figures[..., 1].max(axis=0).tolist()
+    for first in range(0, down * across, _PARTS):
+        kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, down * across))
+    return figures

@@ -15,6 +15,7 @@ from lodestream.digest import DIGEST
 
 __all__ = [
     "index_of",
+    "payload_of",
     "rewritten",
     "sections_of",
     "unchanged",

@@ -307,3 +307,10 @@ def test_a_level_surface_of_many_points(precision: float | None) -> None:
     container = ls.encode(points, precision)
     assert np.array_equal(ls.decode(container).points, points)
     assert len(container) < 400
+
+
+def test_axes_that_are_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lodestream.encoder.LONGEST_AXIS", 10)
+    ls.encode(np.zeros((10, 4)))
+    with pytest.raises(ls.TooLargeError, match="at most 10 rows and columns of a block, got 11"):
+        ls.encode(np.zeros((4, 11)))

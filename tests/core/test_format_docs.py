@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from lodestream import window_errors
 from lodestream.container import sections
 from lodestream.lifting import TAPS
 from lodestream.reference.range_coder import LOGISTIC
@@ -21,6 +22,11 @@ def numbers_after(words: str, count: int) -> list[int]:
 def test_the_page_has_the_tables_of_the_code() -> None:
     assert numbers_after("    L = ", 33) == LOGISTIC == tables.LOGISTIC
     assert numbers_after("    h = ", len(TAPS)) == [int(tap) for tap in TAPS]
+
+
+def test_the_page_has_the_steps_of_the_errors_of_windows() -> None:
+    assert numbers_after("    T = ", 8) == list(window_errors._STEPS)
+    assert all(0 <= step - 65536 * 2 ** (-k / 8) < 1 for k, step in enumerate(window_errors._STEPS))
 
 
 def test_the_page_has_the_version_and_the_magic_of_the_code() -> None:

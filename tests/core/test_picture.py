@@ -194,7 +194,7 @@ COMPARED: dict[str, Any] = {
     "coordinates": np.zeros((2, 3, 602), np.int32),
     "rules": np.tile([0.0, 0.0, 1.0, 1.0], 2),
     "counted": np.zeros(0, np.bool_),
-    "figures": np.zeros((2, 3, 2)),
+    "figures": np.zeros((3, 3, 2)),
     "rows": 3,
     "columns": 600,
     "channels": 3,
@@ -202,7 +202,7 @@ COMPARED: dict[str, Any] = {
     "height": 3,
     "pitch": 602,
     "first": 0,
-    "last": 2,
+    "last": 3,
 }
 
 
@@ -228,8 +228,8 @@ COMPARED: dict[str, Any] = {
         {"counted": np.zeros(3 * 599, np.bool_)},
         {"first": -1},
         {"first": 2, "last": 1},
-        {"last": 3},
-        {"figures": np.zeros((2, 2))},
+        {"last": 4},
+        {"figures": np.zeros((3, 2))},
         {"figures": np.zeros(0)},
         {"channel": -1},
         {"channel": 2},
@@ -240,7 +240,7 @@ COMPARED: dict[str, Any] = {
             "channel": 0,
             "coordinates": np.zeros((4, 3, 602), np.int32),
             "rules": np.tile([0.0, 0.0, 1.0, 1.0], 4),
-            "figures": np.zeros((2, 5, 2)),
+            "figures": np.zeros((3, 5, 2)),
         },
     ],
 )

@@ -22,9 +22,10 @@ import numpy as np
 
 import lodestream as ls
 from lodestream import formats
+from lodestream.container import FrameReader, headers, read_index, sections
 from lodestream.container import Header as ContainerHeader
-from lodestream.container import read_index
 from lodestream.container.frames import section_extent
+from lodestream.container.index import parse_root
 from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
 from lodestream.errors import FormatWarning, InputError, LodestreamError, StreamError, UnsupportedVersionError
 from lodestream.messages import Bye, Credit, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
@@ -159,7 +160,7 @@ def _containers() -> tuple[bytes, ...]:
 
 
 def _mend_container(data: bytes) -> bytes:
-    """Every section's CRC as it should be, as far as the sections can be followed, and that of the footer."""
+    """Every section's CRC as it should be, as far as the sections can be followed, that of pages and of the footer."""
     out, place = bytearray(data), len(SIGNATURE)
     while len(out) - place > FOOTER_LENGTH:
         try:
@@ -173,7 +174,25 @@ def _mend_container(data: bytes) -> bytes:
         place = end
     if len(out) - place == FOOTER_LENGTH:
         out[place + 16 : place + 20] = zlib.crc32(out[place : place + 16]).to_bytes(4, "little")
+    _mend_pages(out)
     return bytes(out)
+
+
+def _mend_pages(out: bytearray) -> None:
+    """The CRC of each page of the index, and then that of its root, as far as the root can be read."""
+    try:
+        frames = {frame.kind: frame for frame in FrameReader().feed(bytes(out))}
+        first, last = frames[sections.HEADER], frames[sections.INDEX]
+        header = headers.parse_header(first.payload, first.payload_offset, first.end)
+        for kind in {sections.MASKS, sections.KEPT_MASKS} & frames.keys():
+            header = headers.parse_masks(header, frames[kind])
+        root = parse_root(last, header)
+    except (StreamError, InputError, KeyError):
+        return
+    for page in (*root.segment_pages, *root.piece_pages):
+        crc = zlib.crc32(out[page.range.offset : page.range.end])
+        out[page.told : page.told + 4] = crc.to_bytes(4, "little")
+    out[last.end - 4 : last.end] = zlib.crc32(out[last.offset : last.end - 4]).to_bytes(4, "little")
 
 
 def _container(data: bytes) -> bool:

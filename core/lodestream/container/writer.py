@@ -9,7 +9,7 @@ from typing import Any
 from . import headers, sections
 from .codecs import needed_codecs
 from .index import serialize_index
-from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, Piece, Segment
+from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Piece, Segment
 
 __all__ = ["CodedLayer", "CodedSegment", "write_container"]
 
@@ -45,6 +45,7 @@ def write_container(
     metadata: Mapping[str, Any],
     *,
     exact: bool,
+    optional: Mapping[int, bytes] | None = None,
 ) -> bytes:
     """Put a container together.
 
@@ -60,6 +61,8 @@ def write_container(
     metadata : mapping
     exact : bool
         The complete stream restores every value bit for bit.
+    optional : mapping of int to bytes, optional
+        Payloads of optional sections by their kinds.
     """
     header = replace(header, exact=exact, corrected=any(pieces), layer_count=len(layers))
     header = replace(header, codecs=needed_codecs(header, pieces))
@@ -89,6 +92,7 @@ def write_container(
             places.append(Piece(ByteRange(place, len(piece)), sections.check_of(piece)))
             place += len(piece)
     where_metadata = _append(out, sections.METADATA, sections.serialize_metadata(dict(metadata)))
+    others = tuple(OptionalSection(kind, _append(out, kind, payload)) for kind, payload in (optional or {}).items())
     index = Index(
         header,
         tuple(records),
@@ -99,6 +103,7 @@ def write_container(
         where_metadata,
         ByteRange(len(out), 0),
         0,
+        optional=others,
     )
     pages, root = (_append(out, *part) for part in zip(_INDEX, serialize_index(index), strict=True))
     out += sections.serialize_footer(pages.length + root.length, root.length)
