@@ -1,8 +1,7 @@
 """Clients of a Lodestream server: streams, uploads, and the command line.
 
 The functions are asynchronous; `lodestream_client.sync` has the same names for programs without an event loop. Names
-are loaded when they are first used, so that the command line starts quickly, and the compiler of the kernels comes in
-with the first stream.
+are loaded when they are first used, so that the command line starts quickly.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ except ImportError:  # run by hand, where hatchling need not be
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 try:
-    from lodestream.library import KERNELS, NATIVE, fingerprint, library_name, wide_name
+    from lodestream.library import KERNELS, NATIVE, fingerprint, is_cut_off, library_name, wide_name
 finally:
     del sys.path[0]
 
@@ -185,8 +185,8 @@ def libraries(folder: Path, machine: str | None = None) -> list[Path]:
 
 
 def is_current(target: Path) -> bool:
-    """Whether a library was made from these sources."""
-    return target.exists() and str(fingerprint()).encode() in target.read_bytes()
+    """Whether a library was made from these sources, and is whole."""
+    return target.exists() and str(fingerprint()).encode() in target.read_bytes() and not is_cut_off(target)
 
 
 class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without types where it is not installed

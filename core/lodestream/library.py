@@ -13,7 +13,17 @@ from pathlib import Path
 
 from .errors import UnavailableError
 
-__all__ = ["KERNELS", "NATIVE", "fingerprint", "library", "library_name", "require", "why_missing", "wide_name"]
+__all__ = [
+    "KERNELS",
+    "NATIVE",
+    "fingerprint",
+    "is_cut_off",
+    "library",
+    "library_name",
+    "require",
+    "why_missing",
+    "wide_name",
+]
 
 #: Where the library stands, and where its sources stand in a working tree.
 NATIVE = Path(__file__).with_name("native")
@@ -68,6 +78,8 @@ def _load_from(path: Path) -> ctypes.CDLL | str:
         found = f"found those of other platforms: {', '.join(others)}" if others else "found none"
         return f"expected the compiled kernels of this platform, {path.name}; {found}: {remedy}"
     try:
+        if is_cut_off(path):
+            raise OSError("its end is missing")
         loaded = ctypes.CDLL(str(path))
         loaded.lode_sources.restype = ctypes.c_char_p
         made_from = loaded.lode_sources().decode()
@@ -76,6 +88,17 @@ def _load_from(path: Path) -> ctypes.CDLL | str:
     if wanted and made_from != wanted:
         return f"expected kernels compiled from the sources beside them ({wanted}), got {made_from}: {remedy}"
     return loaded
+
+
+def is_cut_off(path: Path) -> bool:
+    """Whether the end of a library is missing, as after a copy onto a full disk: to load it would end the process."""
+    with path.open("rb") as file:
+        head = file.read(64)
+        length = file.seek(0, 2)
+    if head[:5] != b"\x7fELF\x02":  # of 64 bits
+        return False
+    table, size, count = (int.from_bytes(head[at:end], sys.byteorder) for at, end in ((40, 48), (58, 60), (60, 62)))
+    return table + size * count > length  # the table of sections comes last
 
 
 def why_missing() -> str | None:

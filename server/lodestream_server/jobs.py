@@ -110,7 +110,7 @@ class Builder:
     Attributes
     ----------
     ready : bool
-        Whether the kernels are compiled.
+        Whether the process that builds come from has loaded what they need.
     fork_server : ForkServer
         The fork server of the build processes; others may use it until this is closed.
     """

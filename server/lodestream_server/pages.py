@@ -65,13 +65,13 @@ async def healthz() -> Response:
     "/readyz",
     summary="Ready",
     responses={
-        200: examples.answer("The kernels are compiled", {"status": "ready", "confinement": "landlock+seccomp"}),
+        200: examples.answer("Builds can begin", {"status": "ready", "confinement": "landlock+seccomp"}),
         503: examples.answer("Not yet", {"status": "starting", "confinement": None}),
     },
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Whether the kernels are compiled. Before that the server works, but the first build waits for them.
+    """Whether the process that builds come from has loaded what they need. Before that uploads wait, all else works.
 
     ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``.
     """

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field, field_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    NoDecode,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-)
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lodestream.capacity import memory_limit
 
 from .bounds import Bounds
-from .table import FORMATS, PREFIX, TABLE
+from .table import FORMATS, TABLE
 
 __all__ = ["Settings"]
 
@@ -35,33 +29,25 @@ _LEAST_LEVEL_MEMORY = 1 << 30
 _LEAST_BUILD_MEMORY = 512 << 20
 
 
-class _Environment(EnvSettingsSource):
-    """The environment, as far as the operator's settings go."""
-
-    def __call__(self) -> dict[str, Any]:
-        """Values by name."""
-        return {name: value for name, value in super().__call__().items() if name in TABLE}
-
-
-class Settings(BaseSettings, Bounds):
+class Settings(Bounds):
     """Settings of a server.
 
     Those of `lodestream_server.table` can also be set by environment variables with the prefix ``LODESTREAM_``; the
     others are its `Bounds`.
     """
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid", env_ignore_empty=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     host: str = _field("host")
     port: int = _field("port")
     data: Path = _field("data")
     root_path: str = _field("root_path")
-    trusted_proxies: Annotated[tuple[str, ...], NoDecode] = _field("trusted_proxies")
+    trusted_proxies: tuple[str, ...] = _field("trusted_proxies")
     insecure: bool = _field("insecure")
     token_file: Path | None = _field("token_file")
     public_reads: bool = _field("public_reads")
-    origins: Annotated[tuple[str, ...], NoDecode] = _field("origins")
-    formats: Annotated[tuple[str, ...], NoDecode] = _field("formats")
+    origins: tuple[str, ...] = _field("origins")
+    formats: tuple[str, ...] = _field("formats")
     upload_bytes: int = _field("upload_bytes")
     keep_free: int | None = _field("keep_free")
     workers: int = _field("workers")
@@ -69,17 +55,12 @@ class Settings(BaseSettings, Bounds):
     log_format: str = _field("log_format")
     log_level: str = _field("log_level")
 
+    @model_validator(mode="before")
     @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Ask whoever makes a server, then the environment."""
-        return init_settings, _Environment(settings_cls)
+    def _completed(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """What whoever makes a server says, then the environment, where an empty variable counts as none."""
+        variables = {name: os.environ.get(setting.variable) for name, setting in TABLE.items()}
+        return {name: text for name, text in variables.items() if text} | given
 
     @field_validator(*TABLE, mode="before")
     @classmethod

@@ -229,6 +229,16 @@ def test_what_cannot_be_loaded_is_refused(native: Path, content: bytes) -> None:
     assert "cannot be loaded" in refused()
 
 
+@pytest.mark.skipif(OURS[:5] != b"\x7fELF\x02", reason="libraries have another form here")
+@pytest.mark.parametrize("length", [10, 63, 64, 1000, len(OURS) // 2, len(OURS) - 1])
+def test_a_library_that_was_cut_off_is_refused_and_made_again(native: Path, length: int) -> None:
+    (native / library.library_name()).write_bytes(OURS)
+    assert build.is_current(native / library.library_name())
+    (native / library.library_name()).write_bytes(OURS[:length])
+    assert "cannot be loaded" in refused()
+    assert not build.is_current(native / library.library_name())
+
+
 def test_a_library_of_other_sources_is_refused_with_the_remedy(native: Path) -> None:
     assert OURS.count(CURRENT) == 1
     (native / library.library_name()).write_bytes(OURS.replace(CURRENT, b"0123456789abcdef"))
@@ -283,9 +293,10 @@ def test_the_library_for_wider_registers_is_loaded_where_they_are_there() -> Non
 
 
 @pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
-def test_a_second_library_that_cannot_be_loaded_is_done_without(native: Path) -> None:
+@pytest.mark.parametrize("content", [b"no library", OURS[:-1]])
+def test_a_second_library_that_cannot_be_loaded_is_done_without(native: Path, content: bytes) -> None:
     (native / library.library_name()).write_bytes(OURS)
-    (native / str(library.wide_name())).write_bytes(b"no library")
+    (native / str(library.wide_name())).write_bytes(content)
     assert library.why_missing() is None
     assert Path(library.library()._name).name == library.library_name()
 

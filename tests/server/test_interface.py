@@ -65,7 +65,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         running_server(tmp_path_factory.mktemp("data"), workers=1, upload_bytes=1 << 20) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
     ):
-        eventually(lambda: http.get("/readyz").status_code == 200, "warm kernels")
+        eventually(lambda: http.get("/readyz").status_code == 200, "the server to be ready")
         yield Server(url, http, push(http, npy(hills(40, 30))))
 
 

@@ -200,7 +200,7 @@ def test_every_get_has_its_head(http: httpx.Client) -> None:
 
 def test_what_the_server_says_of_itself(http: httpx.Client) -> None:
     assert http.get("/healthz").json()["status"] == "ok"
-    eventually(lambda: http.get("/readyz").status_code == 200, "warm kernels")
+    eventually(lambda: http.get("/readyz").status_code == 200, "the server to be ready")
     page = http.get("/")
     assert page.headers["content-type"].startswith("text/html")
     assert "docs" in page.text

@@ -22,8 +22,7 @@ from ..commands.interrupts import raising
 
 __all__ = ["own_server"]
 
-# Compiling the kernels for the first time takes most of this.
-_READY_SECONDS = 300.0
+_READY_SECONDS = 300.0  # of a slow machine: a second or two otherwise
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 10.0
 _LOG_TAIL = 2000
