@@ -22,7 +22,7 @@ from .storage import Storage
 if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
 
-__all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes", "read_from"]
+__all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes"]
 
 # An index holds a record per segment, and whoever makes a container may make many: so many are kept when nobody has the
 # container open any more, as long as they take no more bytes than this.
@@ -43,7 +43,7 @@ class OpenContainer:
 
     def read(self, place: ByteRange) -> bytes:
         """Read a slice; fewer bytes if the file ends. May be called from any thread."""
-        return read_from(self.file.fileno(), place.offset, place.length)
+        return _read_from(self.file.fileno(), place.offset, place.length)
 
     def read_at_once(self, place: ByteRange) -> bytes | None:
         """Read a slice if that needs no disk access; None if it would, or if the system cannot tell."""
@@ -179,7 +179,11 @@ def index_memory(file: BinaryIO) -> int:
 
     tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
     try:
+<<<<<<< HEAD
         return INDEX_GROWTH * parse_footer(read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
+=======
+        return INDEX_GROWTH * parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail).length
+>>>>>>> w-testtime
     except CorruptStreamError:
         return 0
 
@@ -194,10 +198,10 @@ def _read_index(file: BinaryIO) -> Index:
     from lodestream.container import read_index
 
     handle = file.fileno()
-    return read_index(partial(read_from, handle), os.fstat(handle).st_size)
+    return read_index(partial(_read_from, handle), os.fstat(handle).st_size)
 
 
-def read_from(handle: int, offset: int, length: int) -> bytes:
+def _read_from(handle: int, offset: int, length: int) -> bytes:
     """Read bytes of a file, fewer if it ends; repeats reads that the system cuts short."""
     data = bytearray()
     while len(data) < length:

@@ -29,6 +29,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from inspect import signature
 from operator import attrgetter
 from pathlib import Path
@@ -99,6 +100,7 @@ def main() -> None:
     with _ending_with(parent):
         problem = _preload(sys.argv[2]) if sys.argv[2] else None
     _say(control, {"problem": problem})
+    _adapter(_Request)  # which takes longer to make than most calls
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     _Server(control).run()
@@ -238,7 +240,7 @@ def _answer(answer: int, text: bytes) -> NoReturn:
 def _call(text: bytes) -> bytes:
     # Not every exception survives the way between processes: its name and its text do.
     try:
-        request = TypeAdapter(_Request).validate_json(text)
+        request: _Request = _adapter(_Request).validate_json(text)
         function = resolve(request.function)
         args = _arguments(function, request.args)
         _limit(request.allowed)
@@ -255,11 +257,16 @@ def _call(text: bytes) -> bytes:
         return json.dumps({"raised": raised}).encode()
 
 
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
 def _arguments(function: Callable[..., Any], values: list[Any]) -> list[Any]:
     """What a function takes, of JSON's values."""
     hints = get_type_hints(function)
     kinds = [hints.get(name, Any) for name in signature(function).parameters]
-    return [TypeAdapter(kind).validate_python(value) for kind, value in zip(kinds, values, strict=False)]
+    return [_adapter(kind).validate_python(value) for kind, value in zip(kinds, values, strict=False)]
 
 
 def _limit(allowed: Allowed) -> None:

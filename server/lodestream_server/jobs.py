@@ -46,7 +46,7 @@ from . import results, worker
 from .access import key_of
 from .durable import discard, make_folder
 from .problems import FullError, MissingError
-from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError
+from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError, reason_of
 from .records import Record, State
 from .settings import Settings
 from .shares import Turns
@@ -423,7 +423,7 @@ class Builder:
             # No folder could be made, or no process started.
             return _not_now(error)
         if isinstance(result, worker.Refused):
-            return worker.Refused(results.reason_of(result.reason), result.final)
+            return worker.Refused(reason_of(result.reason), result.final)
         return result
 
     async def _keep(self, record: Record, job: worker.Job, built: worker.Built) -> worker.Refused | None:

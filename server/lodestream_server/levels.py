@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -27,8 +26,7 @@ from lodestream.errors import (
 )
 from lodestream.formats import formats
 
-from .containers import read_from
-from .results import reason_of
+from .processes import reason_of
 
 if TYPE_CHECKING:
     from lodestream import Surface
@@ -130,12 +128,16 @@ def _decode(job: LevelJob) -> Surface:
     from lodestream.plan import plan
 
     with job.container.open("rb") as file:
-        handle = file.fileno()
-        index = read_index(partial(read_from, handle), os.fstat(handle).st_size)
+
+        def read(offset: int, length: int) -> bytes:
+            file.seek(offset)
+            return file.read(length)
+
+        index = read_index(read, os.fstat(file.fileno()).st_size)
         chosen = plan(index, Target(level=job.level))
         decoder = Decoder(level=job.level)
         for place in (*chosen.before, *chosen.ranges, *chosen.after):
-            decoder.feed_at(place.offset, read_from(handle, place.offset, place.length))
+            decoder.feed_at(place.offset, read(place.offset, place.length))
     return decoder.surface(job.level)
 
 

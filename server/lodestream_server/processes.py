@@ -33,7 +33,16 @@ from lodestream.errors import LodestreamError
 
 from .forkserver import Allowed
 
-__all__ = ["Allowed", "Call", "ForkServer", "Pool", "ProcessDiedError", "UnforeseenError", "WrongAnswerError"]
+__all__ = [
+    "Allowed",
+    "Call",
+    "ForkServer",
+    "Pool",
+    "ProcessDiedError",
+    "UnforeseenError",
+    "WrongAnswerError",
+    "reason_of",
+]
 
 # A process may die between the last look at it and the call; one that dies again and again has another reason.
 _STARTS: Final = 3
@@ -44,6 +53,7 @@ _LAST_SECONDS = 5.0
 _LONGEST_ANSWER = 256 << 10
 _LONGEST_MESSAGE = 64 << 10
 _LONGEST_KIND = 100
+_LONGEST_REASON = 2000
 
 # What processes that read strangers' files find in their environment: no secret of whoever started the server.
 _ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
@@ -532,3 +542,9 @@ def _result(function: Callable[..., Any], answer: bytes) -> Any:
 
 def _printable(text: str) -> str:
     return "".join(character if character.isprintable() or character == "\n" else "?" for character in text)
+
+
+def reason_of(text: str) -> str:
+    """A reason given by a process, as one printable line of limited length."""
+    words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
+    return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

@@ -15,19 +15,17 @@ from typing import TYPE_CHECKING, Any
 from lodestream.errors import CorruptStreamError, InputError, StreamError, TooLargeError
 
 from . import containers, finished
-from .processes import WrongAnswerError
+from .processes import WrongAnswerError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from .worker import Built
 
-__all__ = ["check", "reason_of"]
+__all__ = ["check"]
 
 # An index holds a record per segment, a few megabytes for the largest surfaces; masks take a bit a vertex at most.
 _MOST_AT_ONCE = 256 << 20
-
-_LONGEST_REASON = 2000
 
 
 def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
@@ -88,9 +86,3 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
             return finished.checked(index, info)
         except (InputError, StreamError) as error:
             raise WrongAnswerError(reason_of(str(error))) from None
-
-
-def reason_of(text: str) -> str:
-    """A reason given by a process, as one printable line of limited length."""
-    words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
-    return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

@@ -172,17 +172,26 @@ class Refused:
 
 
 def preload() -> None:
-    """Import what builds need, so that a process that is forked for one has it at once.
+    """Import what builds and levels need, so that a process that is forked for one has it at once.
+
+    The libraries that read some formats are not among it: a process imports those when it comes to such a file.
 
     Raises
     ------
     UnavailableError
         When the compiled kernels cannot be loaded.
     """
+    import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
+
+    import lodestream.decoder
     import lodestream.encoder
+    import lodestream.formats
     import lodestream.inspection
-    import lodestream.mesh.recognise  # noqa: F401
+    import lodestream.mesh.recognise
+    import lodestream.plan  # noqa: F401
     from lodestream.library import library
+
+    from . import levels  # noqa: F401
 
     library()
 

@@ -1,20 +1,13 @@
-"""A server in a process of its own: to kill it, to measure it, to look at what is left in it.
-
-``python -m tests.server.programs SETTINGS`` is that process. It prints its address, then answers each line of its
-standard input with a line that says what is in it.
-"""
+"""A server in a process of its own (`alone`): to kill it, to measure it, to look at what is left in it."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import gc
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +60,7 @@ class Server:
     def __init__(self, data: Path, wrapper: Sequence[str] = (), **settings: Any) -> None:
         self.log = data.with_name(f"{data.name}.log")
         chosen = {"host": "127.0.0.1", "port": 0, "workers": 1, "data": str(data), **settings}
-        command = [*wrapper, sys.executable, "-m", "tests.server.programs", json.dumps(chosen)]
+        command = [*wrapper, sys.executable, "-m", "tests.server.alone", json.dumps(chosen)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -153,40 +146,3 @@ def alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def _within() -> dict[str, Any]:
-    gc.collect()
-    tasks, sockets, files = 0, 0, []
-    for loop in [item for item in gc.get_objects() if isinstance(item, asyncio.AbstractEventLoop)]:
-        if loop.is_running():
-            tasks += len(asyncio.all_tasks(loop))
-    for link in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):
-            target = str(link.readlink())
-            sockets += target.startswith("socket:")
-            if any(f"/{name}/" in target for name in ("containers", "incoming", "uploads", "work", "records")):
-                files.append(target)
-    return {"tasks": tasks, "sockets": sockets, "files": files}
-
-
-def _answer() -> None:
-    for _ in sys.stdin:
-        print(json.dumps(_within()), flush=True)
-
-
-def main() -> None:
-    """Serve until told to end."""
-    from lodestream_server import Settings
-    from lodestream_server.logs import configure
-    from lodestream_server.running import serve_alone
-
-    settings = Settings(**json.loads(sys.argv[1]))
-    configure(settings.log_format, settings.log_level)
-    # Its own standard input: a process that it spawns must not read from it.
-    threading.Thread(target=_answer, daemon=True).start()
-    serve_alone(settings, lambda address: print(address, flush=True))
-
-
-if __name__ == "__main__":
-    main()

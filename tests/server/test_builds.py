@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -340,3 +343,25 @@ def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -
 
     asyncio.run(cancelled())
     assert not folder.exists()
+
+
+def test_what_builds_and_levels_import_is_there_before_they_begin(tmp_path: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from lodestream_server import forkserver, worker
+worker.preload()
+from lodestream_server.levels import LevelJob, MadeLevel, make_level
+before = set(sys.modules)
+job = worker.Job((Path("a.npy"),), "a.npy", None, "0.1", None, "auto", {}, 10_000, Path("built"))
+assert isinstance(worker.build(job), worker.Built)
+assert isinstance(make_level(LevelJob(job.container, 0, "ply", Path("level"), 10_000)), MadeLevel)
+print(*sorted(set(sys.modules) - before), "fastapi" in sys.modules)
+"""
+    (tmp_path / "a.npy").write_bytes(npy(hills()))
+    for name in ("built", "level"):
+        (tmp_path / name).mkdir()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
