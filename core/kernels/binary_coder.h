@@ -126,24 +126,6 @@ LODE_INLINE int code_bit(bool reads, struct coder *coder, int bit, int32_t *cont
     return bit;
 }
 
-/* The same of a bit that decides which way is taken: what follows need not wait for it. */
-LODE_INLINE int code_guessed_bit(bool reads, struct coder *coder, int bit, int32_t *context) {
-    uint32_t bound = bound_of(coder, *context);
-    if (reads ? coder->low < bound : bit) {
-        coder->width = bound;
-        *context = context_after(*context, 1);
-        if (coder->width < NARROWEST)
-            coder_shift(reads, coder);
-        return 1;
-    }
-    coder->width -= bound;
-    coder->low = reads ? coder->low - bound : coder->low + bound;
-    *context = context_after(*context, 0);
-    if (coder->width < NARROWEST)
-        coder_shift(reads, coder);
-    return 0;
-}
-
 /* Code a bit that is as likely 0 as 1, without a context. */
 LODE_INLINE int code_raw_bit(bool reads, struct coder *coder, int bit) {
     bit = coder_narrow(reads, coder, bit, (coder->width >> 16) << 15);

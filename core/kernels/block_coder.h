@@ -184,7 +184,7 @@ LODE_INLINE void code_row(bool reads, enum pass pass, struct coder *coder, const
         left &= left - 1;
         if (zeros & own) {
             int slot = row.near[grown >> j >> 1 & 1][j] + row.far[grown >> j & 1][j];
-            bit = code_guessed_bit(reads, coder, bit, model + (pass == LOWEST ? LOWEST_PLANE + 2 * slot + odd : slot));
+            bit = code_bit(reads, coder, bit, model + (pass == LOWEST ? LOWEST_PLANE + 2 * slot + odd : slot));
             if (bit) {
                 ones |= own;
                 grown |= own << 2;

@@ -145,6 +145,18 @@ def test_calls_that_are_cut_short_go_on_where_they_stopped(trellis: bool, budget
     assert np.array_equal(results[0][1], results[1][1])
 
 
+def test_a_run_is_checked_when_it_is_its_turn() -> None:
+    shape = (30, 30)
+    table = a_table(shape)
+    arrays, data = Arrays(table, False), np.zeros(100, np.uint8)
+    runs = np.array([arrays.run(0, 3, 0, 0, 50), arrays.run(1, 3, 0, 60, 50)])
+    state = np.zeros(kernels.PASSES_STATE, np.int64)
+    own = arrays.known, arrays.sign, arrays.flags, arrays.early, np.zeros(0, np.int32), arrays.models, data, np.zeros(0)
+    assert kernels.passes(True, False, table.bands, runs, *own, state, 1) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.passes(True, False, table.bands, runs, *own, state, 1 << 30)
+
+
 def a_call(**changes: Any) -> int:
     """Read a tile, with something else than what fits: fields of its last band or of the run, sizes, or the state."""
     table = a_table((20, 20))
