@@ -3,8 +3,7 @@
  *
  * A context is an int32: its probability of a 1 over 2^20, and in the lowest 8 bits its adaptation count, 1 to 127.
  * After each bit the probability moves towards 0 or 2^20 - 1 by the part RATES of the distance, and the count grows by
- * 1. Two contexts are mixed in the logistic domain: the probability is SQUASH of the sum of both STRETCH, each times
- * its weight; each weight then grows by its STRETCH times the prediction error.
+ * 1.
  *
  * Everything is an integer, and right shifts of negative ones round down, as every compiler here does.
  *
@@ -23,14 +22,7 @@
 #define LODE_INLINE static inline __attribute__((always_inline))
 #define SELDOM(condition) __builtin_expect(condition, 0)
 
-enum {
-    /* A context at the start: a probability of one half, and an adaptation count of 1. */
-    UNKNOWN_CONTEXT = (1 << 27) | 1,
-    /* Either weight of a mixture at the start, over 2^16. */
-    FIRST_WEIGHT = 1 << 15,
-    HEAVIEST = 1 << 18,
-    MOST_ADAPTED = 127,
-};
+enum { MOST_ADAPTED = 127 };
 
 #define WIDEST UINT32_C(0xFFFFFFFF)
 #define NARROWEST (UINT32_C(1) << 24)
@@ -58,12 +50,9 @@ LODE_INLINE struct coder coder_start(bool reads, uint8_t *data, int64_t size) {
     return coder;
 }
 
-/* Whether a coder and its weights that a caller has kept since the last call are such as a call leaves behind: from any
- * others it might run forever, or back out of its bytes. Contexts may hold anything. */
-static inline bool coder_can_go_on(bool reads, const struct coder *coder, const int32_t *weights, int64_t count) {
-    for (int64_t i = 0; i < count; i++)
-        if (weights[i] < -HEAVIEST || weights[i] > HEAVIEST)
-            return false;
+/* Whether a coder that a caller has kept since the last call is such as a call leaves behind: from any other it might
+ * run forever, or back out of its bytes. Contexts may hold anything. */
+static inline bool coder_can_go_on(bool reads, const struct coder *coder) {
     return coder->width >= NARROWEST && coder->low <= (reads ? coder->width - 1 : 2 * (uint64_t)WIDEST) &&
            coder->place >= 0 && coder->place <= INT64_MAX / 2;
 }
@@ -137,65 +126,12 @@ LODE_INLINE int code_bit(bool reads, struct coder *coder, int bit, int32_t *cont
     return bit;
 }
 
-LODE_INLINE int32_t weight_after(int32_t weight, int32_t stretch, int32_t error) {
-    return seldom_clamped(weight + ((stretch * error + 16384) >> 15), -HEAVIEST, HEAVIEST);
-}
-
-/* Two contexts and their weights. */
-struct mixture {
-    int32_t *first, *second, *weights;
-};
-
-/* What a mixture says: the inputs of both contexts, and the probability of a 1 over 2^16. */
-struct opinion {
-    int32_t x, y, chance;
-};
-
-LODE_INLINE struct opinion opinion_of(const struct mixture *mixture) {
-    int32_t x = STRETCH[(*mixture->first >> 16) & 4095], y = STRETCH[(*mixture->second >> 16) & 4095];
-    /* Weights of at most 2^18, inputs of less than 2^11. */
-    int32_t sum = (mixture->weights[0] * x + mixture->weights[1] * y) >> 16;
-    return (struct opinion){x, y, SQUASH[(seldom_clamped(sum, -2047, 2047) + 2048) & 4095]};
-}
-
-/* Adapt all of a mixture to a bit, and move on. */
-LODE_INLINE void mixture_learns(bool reads, struct coder *coder, const struct mixture *mixture,
-                                const struct opinion *opinion, int bit) {
-    int32_t error = bit * 65536 - opinion->chance;
-    mixture->weights[0] = weight_after(mixture->weights[0], opinion->x, error);
-    mixture->weights[1] = weight_after(mixture->weights[1], opinion->y, error);
-    *mixture->first = context_after(*mixture->first, bit);
-    *mixture->second = context_after(*mixture->second, bit);
+/* Code a bit that is as likely 0 as 1, without a context. */
+LODE_INLINE int code_raw_bit(bool reads, struct coder *coder, int bit) {
+    bit = coder_narrow(reads, coder, bit, (coder->width >> 16) << 15);
     if (coder->width < NARROWEST)
         coder_shift(reads, coder);
-}
-
-/* Code one bit in two contexts, mixed with two weights; all four adapt. */
-LODE_INLINE int code_mixed_bit(bool reads, struct coder *coder, int bit, int32_t *first, int32_t *second,
-                               int32_t *weights) {
-    struct mixture mixture = {first, second, weights};
-    struct opinion opinion = opinion_of(&mixture);
-    bit = coder_narrow(reads, coder, bit, (coder->width >> 16) * (uint32_t)opinion.chance);
-    mixture_learns(reads, coder, &mixture, &opinion, bit);
     return bit;
-}
-
-/* The same of a bit that can be guessed, or that decides anyway which way is taken: what follows need not wait for it.
- */
-LODE_INLINE int code_guessed_bit(bool reads, struct coder *coder, int bit, int32_t *first, int32_t *second,
-                                 int32_t *weights) {
-    struct mixture mixture = {first, second, weights};
-    struct opinion opinion = opinion_of(&mixture);
-    uint32_t bound = (coder->width >> 16) * (uint32_t)opinion.chance;
-    if (reads ? coder->low < bound : bit) {
-        coder->width = bound;
-        mixture_learns(reads, coder, &mixture, &opinion, 1);
-        return 1;
-    }
-    coder->width -= bound;
-    coder->low = reads ? coder->low - bound : coder->low + bound;
-    mixture_learns(reads, coder, &mixture, &opinion, 0);
-    return 0;
 }
 
 /* Write the fewest bytes that name a number in the interval, without zeros at the end; the length, at least 1, or

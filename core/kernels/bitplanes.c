@@ -7,28 +7,24 @@
 #include "block_coder.h"
 #include "logarithm.h"
 
-_Static_assert(LODE_MODEL == TRELLIS_ACROSS && LODE_TRELLIS_MODEL == TRELLIS_END, "models as lodestream.h has them");
+_Static_assert(LODE_MODEL == CONTEXTS && LODE_TRELLIS_MODEL == TRELLIS_CONTEXTS, "models as lodestream.h has them");
 
 /* Code the blocks of a band, from number `first` on, until all are done or so many coefficients were looked at as
  * `budget` says, which becomes less; the first block that is not done. */
 LODE_INLINE int64_t code_blocks(bool reads, enum pass pass, struct coder *kept, const struct tiles *tiles,
                                 const struct band *band, int64_t first, int plane, int *state, int64_t *budget) {
     struct coder coder = *kept;
-    int32_t *model_weights = tiles->model + (pass == LOWEST ? TRELLIS_WEIGHTS : WEIGHTS), weights[8];
-    int count = pass == LOWEST ? 8 : 4, own_state = *state;
-    for (int i = 0; i < count; i++)
-        weights[i] = clamped(model_weights[i], -HEAVIEST, HEAVIEST);
+    int own_state = *state;
     int64_t down = (band->rows + BLOCK - 1) / BLOCK, number = first, spent = 0;
     for (; number < down * band->across && spent < *budget; number++) {
         int64_t row = number / band->across, top = row * BLOCK, left = (number - row * band->across) * BLOCK;
         int64_t rows = band->rows - top, columns = band->columns - left;
+        own_state = left == 0 ? 0 : own_state;
         struct block block = {top, left, rows < BLOCK ? rows : BLOCK, columns < BLOCK ? columns : BLOCK,
                               band->flags + number + row};
-        code_block(reads, pass, &coder, tiles, band, &block, plane, weights, &own_state);
-        spent += tiles->flags[block.flag] == SOME_FOUND ? BLOCK * BLOCK : BLOCK;
+        code_block(reads, pass, &coder, tiles, band, &block, plane, &own_state);
+        spent += tiles->flags[block.flag] ? BLOCK * BLOCK : BLOCK;
     }
-    for (int i = 0; i < count; i++)
-        model_weights[i] = weights[i];
     *kept = coder;
     *state = own_state;
     *budget -= spent;
@@ -131,7 +127,7 @@ static bool code_run(bool reads, bool trellis, struct coder *coder, const struct
         int plane = (int)(number >> 1);
         enum pass pass = number & 1 ? FIRST : trellis && plane == 0 ? LOWEST : SECOND;
         bool skipped = trellis && number == 1;
-        for (; at->band < run->bands && !skipped; at->band++, at->block = 0, at->trellis = 0) {
+        for (; at->band < run->bands && !skipped; at->band++, at->block = 0) {
             struct band band = band_of(bands + (run->band + at->band) * BAND_FIELDS);
             at->block = BLOCKS_OF[reads][pass](coder, tiles, &band, at->block, plane, &at->trellis, budget);
             if (at->block < (band.rows + BLOCK - 1) / BLOCK * band.across)
@@ -153,7 +149,7 @@ static bool go_on(bool reads, const struct run *run, const struct position *at, 
     coder->width = (uint32_t)state[AT_WIDTH];
     coder->place = state[AT_PLACE];
     return at->passes >= 0 && at->band >= 0 && at->block >= 0 && (uint64_t)state[AT_WIDTH] <= WIDEST &&
-           coder_can_go_on(reads, coder, 0, 0);
+           coder_can_go_on(reads, coder);
 }
 
 int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
@@ -166,19 +162,16 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
         early_count != known_count || (!reads && truth_count != known_count) || models_count % model ||
         state_count != LODE_PASSES_STATE || state[AT_RUN] < 0 || state[AT_RUN] > all || budget < 1)
         return LODE_REFUSED;
-    for (int64_t number = state[AT_RUN]; number < all; number++) {
-        struct run run = run_of(runs + number * LODE_RUN_FIELDS);
-        if (!run_fits(&run, bands_count / BAND_FIELDS, models_count / model, data_count, costs_count))
-            return LODE_REFUSED;
-        for (int64_t band = run.band; band < run.band + run.bands; band++)
-            if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
-                return LODE_REFUSED;
-    }
     struct position at = {state[AT_RUN], state[AT_PASSES], state[AT_BAND], state[AT_BLOCK],
                           (int)(state[AT_TRELLIS] & (TRELLIS_STATES - 1))};
     for (; at.run < all && budget > 0; at = (struct position){at.run + 1, 0, 0, 0, 0}) {
         int64_t *fields = runs + at.run * LODE_RUN_FIELDS;
         struct run run = run_of(fields);
+        if (!run_fits(&run, bands_count / BAND_FIELDS, models_count / model, data_count, costs_count))
+            return LODE_REFUSED;
+        for (int64_t band = run.band; band < run.band + run.bands; band++)
+            if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
+                return LODE_REFUSED;
         struct tiles tiles = {(uint32_t *)known, sign, flags, early, truth, models + run.model * model};
         struct coder coder;
         if (!go_on(reads, &run, &at, state, data, &coder))
@@ -200,16 +193,4 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
     state[AT_BLOCK] = at.block;
     state[AT_TRELLIS] = at.trellis;
     return at.run;
-}
-
-int64_t lode_new_models(int64_t trellis, int32_t *models, int64_t models_count) {
-    int64_t size = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL;
-    if (models_count % size)
-        return LODE_REFUSED;
-    for (int64_t i = 0; i < models_count; i++) {
-        int64_t slot = i % size;
-        bool weight = (slot >= WEIGHTS && slot < TRELLIS_ACROSS) || slot >= TRELLIS_WEIGHTS;
-        models[i] = weight ? FIRST_WEIGHT : UNKNOWN_CONTEXT;
-    }
-    return 0;
 }

@@ -1,4 +1,5 @@
-/* A block of 8 x 8 coefficients in one pass of the embedded coder (docs/format.md, "Passes" and "Numbers of contexts").
+/* A block of 8 x 8 coefficients in one pass of the sequential coder (docs/format.md, "Passes" and "Contexts of a
+ * unit").
  *
  * What contexts see is summed up for a row of the block before the row is coded; only what its own bits add follows
  * from coefficient to coefficient.
@@ -12,22 +13,15 @@
 
 enum {
     KINDS = 4,
-    /* Contexts, and the weights behind them: across, around, signs, flags. */
-    ACROSS_OF_CLASS = 5 * 5 * KINDS,
-    AROUND = 4 * ACROSS_OF_CLASS,
-    AROUND_OF_CLASS = 7 * 6,
-    SIGNS = AROUND + 2 * AROUND_OF_CLASS,
-    FLAGS = SIGNS + 9 * KINDS,
-    WEIGHTS = FLAGS + 27,
-    /* Of a trellis, those of the lowest plane: across and around for either quantiser and classes 0 and 1. */
-    TRELLIS_ACROSS = WEIGHTS + 4,
-    TRELLIS_AROUND = TRELLIS_ACROSS + 2 * 2 * ACROSS_OF_CLASS,
-    TRELLIS_WEIGHTS = TRELLIS_AROUND + 2 * 2 * AROUND_OF_CLASS,
-    TRELLIS_END = TRELLIS_WEIGHTS + 8,
+    /* The contexts of a unit: significance, first refinement, signs, flags. */
+    FIRST_REFINEMENT = 3 * 3 * 4,
+    SIGNS = FIRST_REFINEMENT + 1,
+    FLAGS = SIGNS + 15,
+    CONTEXTS = FLAGS + 27,
+    /* Of a trellis, those of the lowest plane: significance, first and later refinement, for either quantiser. */
+    LOWEST_PLANE = CONTEXTS,
+    TRELLIS_CONTEXTS = LOWEST_PLANE + 2 * (FIRST_REFINEMENT + 2),
     MOST_PASSES = 2 * 28,
-    /* Of a block's flags: whether a coefficient is significant, or all are. */
-    SOME_FOUND = 1,
-    ALL_FOUND = 2,
 };
 
 /* A first pass; a second one; the only one of the lowest plane of indices. */
@@ -46,15 +40,17 @@ struct band {
     int row_shift, column_shift, kind;
 };
 
-/* One row of a block on its way. */
-struct visit {
-    uint32_t left, seen; /* a bit for each coefficient that is still to be visited, that was or is to be */
-    uint32_t zeros;      /* in first passes, the insignificant ones */
-    uint32_t bits;       /* writing, those of the plane */
-    int64_t at;          /* where the first coefficient stands */
+/* A block of a band. */
+struct block {
+    int64_t top, left, rows, columns, flag;
 };
 
-LODE_INLINE uint32_t magnitude(int32_t value) {
+/* What is around a block, from a margin before its first row and column on, and around its parents. */
+struct surroundings {
+    units_t units, parents;
+};
+
+static inline uint32_t magnitude(int32_t value) {
     uint32_t sign = value < 0 ? UINT32_MAX : 0;
     return ((uint32_t)value ^ sign) - sign;
 }
@@ -62,94 +58,35 @@ LODE_INLINE uint32_t magnitude(int32_t value) {
 static const uint32_t PLACES[BLOCK] = {1, 2, 4, 8, 16, 32, 64, 128};
 
 /* Bits of a plane of eight coefficients. */
-LODE_INLINE uint32_t plane_bits(const int32_t *truth, int plane) {
+static inline uint32_t plane_bits(const int32_t *truth, int plane) {
     uint32_t bits = 0;
     for (int j = 0; j < BLOCK; j++)
         bits |= (0 - (magnitude(truth[j]) >> plane & 1)) & PLACES[j];
     return bits;
 }
 
-LODE_INLINE void add_known(uint32_t *known, uint32_t bits, int plane) {
+static inline void add_known(uint32_t *known, uint32_t bits, int plane) {
     for (int j = 0; j < BLOCK; j++)
         known[j] += ((bits & PLACES[j]) == PLACES[j] ? UINT32_C(1) : 0) << plane;
+}
+
+/* The state of the trellis after so many indices of 0: after four it is the same again. */
+static inline int after_zeros(int state, int64_t count) {
+    for (int64_t i = 0; i < (count & 3); i++)
+        state = TRANSITIONS[state][0];
+    return state;
 }
 
 LODE_INLINE void code_sign(bool reads, struct coder *coder, const struct tiles *tiles, const struct band *band,
                            int64_t at) {
     int8_t *sign = tiles->sign + at;
     int x = clamped(sign[-1] + sign[1], -1, 1), y = clamped(sign[-band->stride] + sign[band->stride], -1, 1);
-    int bit = reads ? 0 : tiles->truth[at] < 0;
-    bit = code_bit(reads, coder, bit, &tiles->model[SIGNS + KINDS * (3 * (x + 1) + y + 1) + band->kind]);
+    int sum = band->kind == 2 ? 3 * y + x : 3 * x + y, flip = sum < 0;
+    int32_t *context = tiles->model + SIGNS + 3 * (flip ? -sum : sum) + (band->kind > 1 ? band->kind - 1 : 0);
+    int bit = reads ? 0 : (tiles->truth[at] < 0) ^ flip;
+    bit = code_bit(reads, coder, bit, context) ^ flip;
     *sign = (int8_t)(1 - 2 * bit);
 }
-
-/* Code a row whose visited coefficients are all of the classes 2 and 3; its bits. */
-LODE_INLINE uint32_t refine_row(bool reads, struct coder *coder, const struct tiles *tiles, const struct band *band,
-                                const struct row *row, const struct visit *visit) {
-    int32_t *across = tiles->model + band->kind;
-    uint32_t ones = 0; /* one place up */
-    for (uint32_t left = visit->left; left; left &= left - 1) {
-        int j = __builtin_ctz(left);
-        int32_t slot = row->across[j] + 5 * (int32_t)((ones & row->room) >> j & 1);
-        int bit = code_bit(reads, coder, (int)(visit->bits >> j & 1), across + KINDS * slot);
-        ones |= (uint32_t)bit << j << 1;
-    }
-    return ones >> 1;
-}
-
-/* Code any row; its bits. `state` is that of the trellis. */
-LODE_INLINE uint32_t code_row(bool reads, enum pass pass, struct coder *coder, const struct tiles *tiles,
-                              const struct band *band, const struct row *row, struct visit *visit, int32_t *weights,
-                              int *state) {
-    int32_t *model = tiles->model;
-    uint32_t ones = 0; /* one place up */
-    while (visit->left) {
-        int j = __builtin_ctz(visit->left), own = pass == FIRST ? 0 : row->own[j], bit = (int)(visit->bits >> j & 1);
-        visit->left &= visit->left - 1;
-        int32_t slot = KINDS * (row->across[j] + 5 * (int32_t)((ones & row->room) >> j & 1)) + band->kind;
-        if (own > 1) {
-            bit = code_bit(reads, coder, bit, model + slot);
-            ones |= (uint32_t)bit << j << 1;
-        } else {
-            int odd = pass == LOWEST ? ODD[*state] : 0;
-            int32_t *across = model + slot, *around = model + AROUND, *pair = weights + 4 * odd;
-            if (pass == LOWEST) {
-                across += TRELLIS_ACROSS + 2 * ACROSS_OF_CLASS * odd;
-                around += TRELLIS_AROUND - AROUND + 2 * AROUND_OF_CLASS * odd;
-            }
-            around += row->around[j] + RING[SEVENTEEN[row->far[j]] + row->sides[j] + 2 * (2 * ones >> j & 1)];
-            if (own == 1) {
-                bit = code_mixed_bit(reads, coder, bit, across, around, pair + 2);
-                ones |= (uint32_t)bit << j << 1;
-            } else {
-                bit = code_guessed_bit(reads, coder, bit, across, around, pair);
-                if (bit) {
-                    ones |= UINT32_C(2) << j;
-                    code_sign(reads, coder, tiles, band, visit->at + j);
-                    if (pass == FIRST) {
-                        visit->left |= visit->zeros & UINT32_C(2) << j;
-                        visit->seen |= visit->zeros & UINT32_C(2) << j;
-                    }
-                }
-            }
-        }
-        if (pass == LOWEST)
-            *state = TRANSITIONS[*state][bit];
-    }
-    return ones >> 1;
-}
-
-/* The state of the trellis after so many indices of 0: after four it is the same again. */
-static int after_zeros(int state, int64_t count) {
-    for (int64_t i = 0; i < (count & 3); i++)
-        state = TRANSITIONS[state][0];
-    return state;
-}
-
-/* A block of a band. */
-struct block {
-    int64_t top, left, rows, columns, flag;
-};
 
 /* Code whether a block gets a significant coefficient, which has none so far. */
 LODE_INLINE int code_flag(bool reads, struct coder *coder, const struct tiles *tiles, const struct band *band,
@@ -175,110 +112,126 @@ LODE_INLINE int code_flag(bool reads, struct coder *coder, const struct tiles *t
     return code_bit(reads, coder, seen >> plane != 0, &tiles->model[slot]);
 }
 
-/* Sum up what is around a row, the i-th with the margin, before its bits. */
-LODE_INLINE void see_row(enum pass pass, struct surroundings *s, const struct tiles *tiles, const struct band *band,
-                         const struct block *block, int64_t i, int plane, struct row *row) {
-    if (!s->around) {
-        int64_t first = block->top >> band->row_shift, last = (block->top + block->rows - 1) >> band->row_shift;
-        int64_t corner = band->parent + (first - 1) * band->parent_stride + (block->left >> band->column_shift) - 1;
-        see_around(s, block->rows);
-        load_units(tiles->known + corner, band->parent_stride, last - first + 3, plane, MOST_OF_PARENTS, s->parents);
-    }
-    int64_t parent_row = ((block->top + i - MARGIN) >> band->row_shift) - (block->top >> band->row_shift);
-    eight_t around = families(s, parent_row);
-    if (band->column_shift)
-        around = band->column_shift == NO_PARENT ? repeated(around) : doubled(around);
-    if (pass != FIRST)
-        around += AROUND_OF_CLASS * (s->own[i] >> 1 & EACH);
-    put_eight(row->around, around);
-    put_eight(row->far, s->far[i - 2] + s->far[i + 2]);
-    put_eight(row->sides, s->sides[i - 1] + s->sides[i + 1] + 2 * s->sides[i]);
+/* Look at a block, and at what is around its parents. */
+static inline void see_block(struct surroundings *s, const struct tiles *tiles, const struct band *band,
+                             const struct block *block, int plane) {
+    const uint32_t *own = tiles->known + band->offset + block->top * band->stride + block->left;
+    load_units(own - MARGIN * band->stride - MARGIN, band->stride, block->rows + 2 * MARGIN, plane, MOST, s->units);
+    int64_t first = block->top >> band->row_shift, last = (block->top + block->rows - 1) >> band->row_shift;
+    const uint32_t *parent = tiles->known + band->parent + (first - 1) * band->parent_stride;
+    load_units(parent + (block->left >> band->column_shift) - 1, band->parent_stride, last - first + 3, plane,
+               MOST_BESIDE_PARENT, s->parents);
 }
 
-/* Code the row of a block that has so many columns, the i-th with the margin. */
-LODE_INLINE void visit_row(bool reads, enum pass pass, struct coder *coder, const struct tiles *tiles,
-                           const struct band *band, const struct block *block, struct surroundings *s, int64_t i,
-                           int plane, int32_t *weights, int *state) {
-    int64_t at = band->offset + (block->top + i - MARGIN) * band->stride + block->left;
-    uint32_t inside = (UINT32_C(1) << block->columns) - 1;
-    struct visit visit = {0, 0, 0, 0, at};
+/* Numbers of a row's contexts of significance: of each coefficient a part by its neighbours in the row and the column,
+ * and a part by what is further off. Either is known for both cases, that of a coefficient before it in the row, at
+ * distance one or two, a bit of this plane makes the unit one more, or not. */
+struct row {
+    uint8_t near[2][BLOCK], far[2][BLOCK];
+};
+
+/* What comes from the parents of a row of the block. */
+static inline eight_t parents_of(const struct surroundings *s, const struct band *band, const struct block *block,
+                                 int64_t row) {
+    int64_t parent = ((block->top + row) >> band->row_shift) - (block->top >> band->row_shift);
+    eight_t sum = parent_sum(s->parents[parent + 1] + 1);
+    return band->column_shift == 0 ? sum : band->column_shift == 1 ? doubled(sum) : repeated(sum);
+}
+
+static inline struct row see_row(const struct surroundings *s, const struct band *band, const struct block *block,
+                                 int64_t number) {
+    const uint8_t *units = s->units[number + MARGIN] + MARGIN;
+    uint64_t across = band->kind == 2 ? 4 : 12, down = 16 - across;
+    eight_t two = beside(units, 1), column = down * class_of_two(upright(units, 1));
+    eight_t sum = further(units) + parents_of(s, band, block, number);
     struct row row;
+    for (uint64_t more = 0; more < 2; more++) {
+        put_eight(row.near[more], across * class_of_two(two + more * EACH) + column);
+        put_eight(row.far[more], class_of_further(sum + 2 * more * EACH));
+    }
+    return row;
+}
+
+/* Code a row of a block; `state` is that of the trellis. */
+LODE_INLINE void code_row(bool reads, enum pass pass, struct coder *coder, const struct tiles *tiles,
+                          const struct band *band, const struct block *block, struct surroundings *s, int64_t number,
+                          int plane, int *state) {
+    int64_t at = band->offset + (block->top + number) * band->stride + block->left;
+    uint8_t *units = s->units[number + MARGIN] + MARGIN;
+    eight_t before = eight_at(units);
+    /* A bit for each coefficient: those to be visited, insignificant ones, and those refined before. */
+    uint32_t left = (UINT32_C(1) << block->columns) - 1, zeros = left & ~bits_of(reaching(before, 1));
+    uint32_t refined = bits_of(reaching(before, MOST));
     if (pass == FIRST) {
-        visit.zeros = ~(s->found[i] >> 1) & inside;
-        visit.left = to_visit_first(s, i, visit.zeros);
+        left = zeros;
+        if (left)
+            left &= bits_of(reaching(beside(units, 1) + upright(units, 1) + corners(units), 1));
     } else if (pass == SECOND) {
         eight_t unlike = eight_at(tiles->early + at) ^ (uint64_t)(plane + 1) * EACH;
-        visit.left = bits_of(reaching(unlike & 127 * EACH, 1)) & inside;
-    } else {
-        visit.left = inside;
+        left &= bits_of(reaching(unlike & 127 * EACH, 1));
     }
-    if (visit.left == 0)
+    if (left == 0)
         return;
-    visit.seen = visit.left;
-    if (!reads)
-        visit.bits = plane_bits(tiles->truth + at, plane);
-    eight_t side = eight_at(s->units[i] + 1) + eight_at(s->units[i] + 3), full = reaching(side, 4);
-    eight_t across = 5 * at_most(side, 4) + at_most(s->own[i - 1] + s->own[i + 1], 4);
-    row.room = ~bits_of(full);
-    uint32_t low = UINT32_MAX; /* coefficients of the classes 0 and 1 */
-    if (pass != FIRST) {
-        eight_t two = reaching(s->own[i], 4), own = reaching(s->own[i], 2) + two + reaching(s->own[i], 8);
-        put_eight(row.own, own);
-        across += 25 * own;
-        low = ~bits_of(two);
+    struct row row;
+    if (left & zeros)
+        row = see_row(s, band, block, number);
+    int32_t *model = tiles->model;
+    uint32_t bits = reads ? 0 : plane_bits(tiles->truth + at, plane), visited = left;
+    uint32_t ones = 0, grown = 0; /* the latter two places up */
+    while (left) {
+        int j = __builtin_ctz(left), odd = pass == LOWEST ? ODD[*state] : 0, bit = (int)(bits >> j & 1);
+        uint32_t own = UINT32_C(1) << j;
+        left &= left - 1;
+        if (zeros & own) {
+            int slot = row.near[grown >> j >> 1 & 1][j] + row.far[grown >> j & 1][j];
+            bit = code_bit(reads, coder, bit, model + (pass == LOWEST ? LOWEST_PLANE + 2 * slot + odd : slot));
+            if (bit) {
+                ones |= own;
+                grown |= own << 2;
+                code_sign(reads, coder, tiles, band, at + j);
+                if (pass == FIRST) {
+                    left |= zeros & own << 1;
+                    visited |= zeros & own << 1;
+                }
+            }
+        } else if (pass != FIRST) {
+            if (refined & own) {
+                bit = pass == LOWEST
+                          ? code_bit(reads, coder, bit, model + LOWEST_PLANE + 2 * (FIRST_REFINEMENT + 1) + odd)
+                          : code_raw_bit(reads, coder, bit);
+            } else {
+                bit = code_bit(reads, coder, bit,
+                               model + (pass == LOWEST ? LOWEST_PLANE + 2 * FIRST_REFINEMENT + odd : FIRST_REFINEMENT));
+                grown |= (uint32_t)bit << j << 2;
+            }
+            ones |= (uint32_t)bit << j;
+        }
+        if (pass == LOWEST)
+            *state = TRANSITIONS[*state][bit];
     }
-    put_eight(row.across, across);
-    uint32_t ones;
-    if (pass == LOWEST || visit.left & low) {
-        see_row(pass, s, tiles, band, block, i, plane, &row);
-        ones = code_row(reads, pass, coder, tiles, band, &row, &visit, weights, state);
-    } else {
-        ones = refine_row(reads, coder, tiles, band, &row, &visit);
-    }
-    add_bits(s, i, ones);
+    put_eight(units, before + ones_of(grown >> 2));
     add_known(tiles->known + at, ones, plane);
     if (pass == FIRST) {
-        s->found[i] |= ones << 1;
-        eight_t seen = ones_of(visit.seen), marks = eight_at(tiles->early + at);
+        eight_t seen = ones_of(visited), marks = eight_at(tiles->early + at);
         put_eight(tiles->early + at, (marks & ~(255 * seen)) + (uint64_t)(plane + 1) * seen);
     }
 }
 
-/* Whether all coefficients of a block are significant. */
-static bool all_found(const struct surroundings *s, const struct block *block) {
-    uint32_t inside = ((UINT32_C(1) << block->columns) - 1) << 1, found = inside;
-    for (int64_t i = MARGIN; i < block->rows + MARGIN; i++)
-        found &= s->found[i];
-    return found == inside;
-}
-
 /* Code a block. */
 LODE_INLINE void code_block(bool reads, enum pass pass, struct coder *coder, const struct tiles *tiles,
-                            const struct band *band, const struct block *block, int plane, int32_t *weights,
-                            int *state) {
+                            const struct band *band, const struct block *block, int plane, int *state) {
     uint8_t *flag = tiles->flags + block->flag;
-    if (pass == FIRST && *flag != SOME_FOUND)
-        return;
+    if (!*flag && pass != FIRST)
+        *flag = (uint8_t)code_flag(reads, coder, tiles, band, block, plane);
     if (!*flag) {
-        if (!code_flag(reads, coder, tiles, band, block, plane)) {
-            if (pass == LOWEST)
-                *state = after_zeros(*state, block->rows * block->columns);
-            return;
-        }
-        *flag = SOME_FOUND;
+        if (pass == LOWEST)
+            *state = after_zeros(*state, block->rows * block->columns);
+        return;
     }
     struct surroundings s;
-    see_block(&s, tiles->known + band->offset + block->top * band->stride + block->left, band->stride, block->rows,
-              plane);
-    if (pass == FIRST) {
-        see_found(&s, block->rows);
-        if (all_found(&s, block)) {
-            *flag = ALL_FOUND;
-            return;
-        }
-    }
-    for (int64_t i = MARGIN; i < block->rows + MARGIN; i++)
-        visit_row(reads, pass, coder, tiles, band, block, &s, i, plane, weights, state);
+    see_block(&s, tiles, band, block, plane);
+    for (int64_t row = 0; row < block->rows; row++)
+        code_row(reads, pass, coder, tiles, band, block, &s, row, plane, state);
 }
 
 #endif

@@ -153,7 +153,7 @@ int64_t lode_differences(int64_t reads, const int64_t *line, int64_t line_count,
         memory_count != 3 * LODE_DIFFERENCES_MEMORY || used_count != 2)
         return LODE_REFUSED;
     for (int i = 0; i < LODE_DIFFERENCES_MODEL; i++)
-        model[i] = UNKNOWN_CONTEXT;
+        model[i] = LODE_NEW_CONTEXT;
     memset(memory, 0, (size_t)memory_count * sizeof *memory);
     struct coder coder = coder_start(reads, data, data_count);
     struct store store = {0, 0, 0, stored, stored_count};

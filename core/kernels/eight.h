@@ -63,14 +63,4 @@ static inline eight_t repeated(eight_t numbers) {
     return first * EACH;
 }
 
-/* What numbers add to their neighbours at distance one, or two; symmetric, so that the order of bytes does not matter.
- */
-static inline eight_t beside(eight_t numbers) {
-    return (numbers << 8) + (numbers >> 8);
-}
-
-static inline eight_t further(eight_t numbers) {
-    return (numbers << 16) + (numbers >> 16);
-}
-
 #endif

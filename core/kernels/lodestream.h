@@ -61,8 +61,8 @@ LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t ro
 /* Code groups `first` to `last` - 1 of a mask of `rows` x `columns` points: LODE_MASK_GROUP points of a row, fewer at
  * its end, in raster order.
  *
- * field:  flat, (rows + 2) x (columns + 6): two rows before and three columns at either side are zeros; 1 is valid.
- * model:  LODE_MASK_MODEL contexts and weights; begun where `first` is 0.
+ * field:  flat, (rows + 2) x (columns + 4): two rows before and two columns at either side are zeros; 1 is valid.
+ * model:  LODE_MASK_MODEL contexts; begun where `first` is 0.
  * data:   writing, at least 64 + 2 rows columns bytes; reading, all there are, those missing count as zeros.
  * state:  four numbers that are handed on from call to call, as the model is; others are refused.
  * Returns the bytes written or looked at so far, all of them once the last group is coded.
@@ -72,7 +72,7 @@ LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t
                            int64_t *state, int64_t state_count);
 
 #define LODE_MASK_GROUP 16
-#define LODE_MASK_MODEL ((1 << 16) + (1 << 10) + 4 + 2)
+#define LODE_MASK_MODEL ((1 << 10) + 4)
 
 /* values.c ------------------------------------------------------------------------------------------------------- */
 
@@ -170,7 +170,7 @@ LODE_API int64_t lode_classify(const int64_t *bands, int64_t bands_count, const 
                                const int32_t *coefficients, int64_t coefficients_count, double *relative,
                                int64_t relative_count, int8_t *classes, int64_t classes_count);
 
-/* The cheapest indices of some bands, each from state 0 of the trellis on.
+/* The cheapest indices of some bands, each row of blocks from state 0 of the trellis on.
  *
  * relative, classes: as `lode_classify` makes them.
  * bits:   (2, LODE_CLASSES, LODE_INDICES): what an index takes without its sign, by quantiser and class; the last one
@@ -309,7 +309,7 @@ LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const in
  * flags:    of blocks, 0 as long as no coefficient is known to be significant.
  * early:    1 + the plane in whose first pass a coefficient was coded last, or 0.
  * truth:    writing, the coefficients with their signs; reading, empty.
- * models:   LODE_MODEL or, of a trellis, LODE_TRELLIS_MODEL contexts and weights each, see `lode_new_models`.
+ * models:   LODE_MODEL or, of a trellis, LODE_TRELLIS_MODEL contexts each, at first LODE_NEW_CONTEXT.
  * costs:    empty; or the bits that were written when each pass had ended, by its number.
  * state:    LODE_PASSES_STATE numbers, zeros at first, handed on from call to call.
  * budget:   about so many coefficients are looked at in a call, at least one block.
@@ -327,11 +327,10 @@ LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *band
 #define LODE_RUN_START 5
 #define LODE_RUN_LENGTH 6
 #define LODE_PASSES_STATE 8
-#define LODE_MODEL 551
-#define LODE_TRELLIS_MODEL 1127
-
-/* Models before their tiles' first passes. Returns 0. */
-LODE_API int64_t lode_new_models(int64_t trellis, int32_t *models, int64_t models_count);
+#define LODE_MODEL 79
+#define LODE_TRELLIS_MODEL 155
+/* A context at the start: a probability of one half, and an adaptation count of 1. */
+#define LODE_NEW_CONTEXT ((1 << 27) | 1)
 
 /* gains.c -------------------------------------------------------------------------------------------------------- */
 

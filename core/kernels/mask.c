@@ -1,18 +1,15 @@
 /* Masks of surfaces with holes, without loss (docs/format.md, "Masks").
  *
- * Points are coded in raster order, each by the mean of two models in the logistic domain: one that sees the ten
- * nearest points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that surrounds
- * a group of sixteen points in a row is equal, one bit says whether they are equal to that too.
+ * Points are coded in raster order, each in the context of the ten nearest points before it. Where all that surrounds a
+ * group of sixteen points in a row is equal, one bit says whether they are equal to that too.
  */
 #include "binary_coder.h"
 
 enum {
     GROUP = LODE_MASK_GROUP,
     ABOVE = 2,
-    BESIDE = 3,
-    NEAR = 1 << 16,            /* first of the contexts that see ten points */
-    GROUPS = NEAR + (1 << 10), /* first of those of groups: by their surroundings and the last group's answer */
-    WEIGHTS = GROUPS + 4,
+    BESIDE = 2,
+    GROUPS = 1 << 10, /* first of the contexts of groups: by their surroundings and the last group's answer */
 };
 
 /* Groups of a row; the last one may be shorter. */
@@ -30,23 +27,19 @@ static int surroundings(const uint8_t *at, int64_t stride, int64_t count) {
 
 LODE_INLINE void code_points(bool reads, struct coder *coder, uint8_t *at, int64_t stride, int64_t count,
                              int32_t *model) {
-    /* Seven points of the row above and five of the one above that move on with the point. */
+    /* Five points of the row above, three of the one above that and two before, which move on with the point. */
     const uint8_t *up = at - stride, *far_up = at - 2 * stride;
-    int32_t above = 0, further = 0, before = 0;
-    for (int64_t j = -3; j < 3; j++)
-        above = 2 * above + up[j];
+    int32_t above = 0, further = 0, before = 2 * at[-2] + at[-1];
     for (int64_t j = -2; j < 2; j++)
+        above = 2 * above + up[j];
+    for (int64_t j = -1; j < 1; j++)
         further = 2 * further + far_up[j];
-    for (int64_t j = -4; j < 0; j++)
-        before = 2 * before + at[j];
     for (int64_t j = 0; j < count; j++) {
-        above = (above << 1 | up[j + 3]) & 127;
-        further = (further << 1 | far_up[j + 2]) & 31;
-        int32_t wide = further << 11 | above << 4 | before;
-        int32_t near = NEAR + ((further >> 1 & 7) << 7 | (above >> 1 & 31) << 2 | (before & 3));
-        int bit = code_mixed_bit(reads, coder, at[j] != 0, &model[wide], &model[near], &model[WEIGHTS]);
+        above = (above << 1 | up[j + 2]) & 31;
+        further = (further << 1 | far_up[j + 1]) & 7;
+        int bit = code_bit(reads, coder, at[j] != 0, &model[further << 7 | above << 2 | before]);
         at[j] = (uint8_t)bit;
-        before = (before << 1 | bit) & 15;
+        before = (before << 1 | bit) & 3;
     }
 }
 
@@ -87,13 +80,13 @@ int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, i
         return LODE_REFUSED;
     struct coder coder = {(uint64_t)state[0], (uint32_t)state[1], state[2], data, data_count};
     int answer = state[3] & 1;
-    if (first > 0 && ((uint64_t)state[1] > WIDEST || !coder_can_go_on(reads, &coder, model + WEIGHTS, 2)))
+    if (first > 0 && ((uint64_t)state[1] > WIDEST || !coder_can_go_on(reads, &coder)))
         return LODE_REFUSED;
     if (first == 0) {
         coder = coder_start(reads, data, data_count);
         answer = 0;
         for (int i = 0; i < LODE_MASK_MODEL; i++)
-            model[i] = i < WEIGHTS ? UNKNOWN_CONTEXT : FIRST_WEIGHT;
+            model[i] = LODE_NEW_CONTEXT;
     }
     answer = reads ? code_groups(true, &coder, columns, first, last, field, model, answer)
                    : code_groups(false, &coder, columns, first, last, field, model, answer);

@@ -153,7 +153,7 @@ int64_t lode_offsets(int64_t reads, const double *bases, int64_t bases_count, co
         model_count != LODE_OFFSETS_MODEL)
         return LODE_REFUSED;
     for (int i = 0; i < LODE_OFFSETS_MODEL; i++)
-        model[i] = UNKNOWN_CONTEXT;
+        model[i] = LODE_NEW_CONTEXT;
     struct coder coder = coder_start(reads, data, data_count);
     if (reads)
         code_places(true, &coder, bases, restored, (int)bits, places, bases_count, model);

@@ -119,8 +119,8 @@ static void spread_band(struct places at, struct rule rule) {
 /* A band of indices that are known: the trellis follows them in raster order of blocks, as they were coded. */
 static void spread_trellis(struct places at, struct rule rule) {
     int32_t less = (rule.step + 1) / 2;
-    unsigned state = 0;
-    for (int64_t top = 0; top < at.rows; top += BLOCK)
+    for (int64_t top = 0; top < at.rows; top += BLOCK) {
+        unsigned state = 0;
         for (int64_t left = 0; left < at.columns; left += BLOCK)
             for (int64_t i = top; i < top + BLOCK && i < at.rows; i++)
                 for (int64_t j = left; j < left + BLOCK && j < at.columns; j++) {
@@ -130,6 +130,7 @@ static void spread_trellis(struct places at, struct rule rule) {
                     at.out[i * at.pitch + j] = times(times(at.signs[i * at.stride + j], value), rule.unit);
                     state = TRANSITIONS[state][magnitude & 1];
                 }
+    }
 }
 
 static void clear(struct places at) {

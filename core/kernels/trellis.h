@@ -1,5 +1,5 @@
-/* The trellis of dependent quantisation: which of two quantisers a coefficient is taken from (docs/format.md, "The
- * embedded coder"). Every band of a tile begins in state 0.
+/* The trellis of dependent quantisation: which of two quantisers a coefficient is taken from (docs/format.md,
+ * "Passes"). Every row of blocks of a band begins in state 0.
  */
 #ifndef LODE_TRELLIS_H
 #define LODE_TRELLIS_H

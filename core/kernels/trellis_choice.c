@@ -2,7 +2,8 @@
  * "Quantised for one error").
  *
  * What an index costs is known by the class of its coefficient, that is by the size of what is around it. The indices
- * of a band depend on each other by the trellis; Viterbi's algorithm takes the cheapest of all ways through it.
+ * of a row of blocks depend on each other by the trellis; Viterbi's algorithm takes the cheapest of all ways through
+ * it.
  */
 #include <stdbool.h>
 
@@ -193,24 +194,23 @@ static int take(const struct choice *c, int64_t at, int64_t number, int state) {
     return way[0];
 }
 
-static void choose(const int64_t *band, const struct choice *c) {
-    int64_t rows = band[BAND_ROWS], columns = band[BAND_COLUMNS], number = 0;
+/* Choose the indices of a row of blocks. */
+static void choose(const int64_t *band, int64_t top, const struct choice *c) {
+    int64_t end = least(top + BLOCK, band[BAND_ROWS]), columns = band[BAND_COLUMNS], number = 0;
     double cost[TRELLIS_STATES];
     for (int state = 0; state < TRELLIS_STATES; state++)
         cost[state] = state ? __builtin_inf() : 0.0;
-    for (int64_t top = 0; top < rows; top += BLOCK)
-        for (int64_t left = 0; left < columns; left += BLOCK)
-            for (int64_t i = top; i < least(top + BLOCK, rows); i++)
-                for (int64_t j = left; j < least(left + BLOCK, columns); j++, number++)
-                    add_coefficient(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, number, cost);
+    for (int64_t left = 0; left < columns; left += BLOCK)
+        for (int64_t i = top; i < end; i++)
+            for (int64_t j = left; j < least(left + BLOCK, columns); j++, number++)
+                add_coefficient(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, number, cost);
     int state = 0;
     for (int other = 1; other < TRELLIS_STATES; other++)
         state = cost[other] < cost[state] ? other : state;
-    for (int64_t top = (rows - 1) / BLOCK * BLOCK; top >= 0; top -= BLOCK)
-        for (int64_t left = (columns - 1) / BLOCK * BLOCK; left >= 0; left -= BLOCK)
-            for (int64_t i = least(top + BLOCK, rows) - 1; i >= top; i--)
-                for (int64_t j = least(left + BLOCK, columns) - 1; j >= left; j--)
-                    state = take(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, --number, state);
+    for (int64_t left = (columns - 1) / BLOCK * BLOCK; left >= 0; left -= BLOCK)
+        for (int64_t i = end - 1; i >= top; i--)
+            for (int64_t j = least(left + BLOCK, columns) - 1; j >= left; j--)
+                state = take(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, --number, state);
 }
 
 int64_t lode_choose(const int64_t *bands, int64_t bands_count, const double *relative, int64_t relative_count,
@@ -228,7 +228,8 @@ int64_t lode_choose(const int64_t *bands, int64_t bands_count, const double *rel
         int64_t size = band[BAND_ROWS] * band[BAND_COLUMNS];
         if (size > ways_count || size > indices_count / BRANCHES)
             return LODE_REFUSED;
-        choose(band, &choice);
+        for (int64_t top = 0; top < band[BAND_ROWS]; top += BLOCK)
+            choose(band, top, &choice);
     }
     return 0;
 }

@@ -8,22 +8,17 @@ first 1, its sign.
 
 What a context sees of a coefficient are the bits known so far: of this plane for coefficients coded before it, of the
 planes above for those that come later, and of the planes at and above this one for its parent and what is around that.
-All of it is counted in units of the plane (bits below are shifted out); what lies outside the tile's band is 0. The
-contexts, in this order:
+All of it is counted in units of the plane (bits below are shifted out), at most 3 for a neighbour; what lies outside
+the tile's band is 0. docs/format.md, "Contexts of a unit", numbers the contexts:
 
-- *Across*, of a coefficient's bit: ((m 5 + h) 5 + v) 4 + kind. m is the class of its own magnitude so far, in units of
-  the next higher plane: 0, 1, 2 (for 2 and 3), 3 (for 4 and more). h and v are the sums of the two neighbours in its
-  row and of those in its column, at most 4. kind is the band's: 1 for details along the columns' axis plus 2 for
-  details along the rows' axis.
-- *Around*, (m 7 + r) 6 + f, for m = 0 and 1 only, mixed with the former with two weights for each m. r is the `_CLASS`
-  of the sum of the sixteen coefficients at distance two, the four in the same row or column counted twice; f is that of
-  four times the parent plus its four neighbours, at most 5.
-- *Signs*, a 1 is negative: (3 (x + 1) + y + 1) 4 + kind. x is the sign of the sum of the signs known of the neighbours
-  in the row, y of those in the column.
-- With a trellis, in plane 0, *across* and *around* for m = 0 and 1 are other ones, of the quantiser that the index is
-  for: that follows from the parity of all before it, so plane 0 has no first pass there.
-- *Flags*: (3 b + a) 3 + f. b counts the blocks to the left and above that have a significant coefficient, a those to
-  the right and below; f is the largest of the parents of the block's coefficients, at most 2.
+- *Significance*, 36: by the two neighbours in the row, the two in the column, and one sum of all that is further off,
+  of the parent and of what is around that. Rows and columns change places in bands with details along the rows' axis
+  only.
+- *Refinement*, 1, of the first bit after the highest one. Those after it are as likely 0 as 1 and have no context.
+- *Signs*, 15: by the signs of the two neighbours in the row and of the two in the column; opposite cases share one.
+- *Flags*, 27: by the blocks beside this one that have a significant coefficient, and by the parents.
+- With a trellis, those of plane 0 are others, for either quantiser that an index may be for: that follows from the
+  parity of the indices before it, so plane 0 has no first pass there.
 """
 
 from __future__ import annotations
@@ -53,10 +48,9 @@ def pass_count(planes: int) -> int:
 
 
 def new_models(count: int, trellis: bool = False) -> NDArray[np.int32]:
-    """The contexts and weights of so many tiles before their first planes: int32, shape (tile, number)."""
-    models = np.empty((count, kernels.TRELLIS_MODEL if trellis else kernels.MODEL), np.int32)
-    kernels.new_models(trellis, models)
-    return models
+    """The contexts of so many tiles before their first planes: int32, shape (tile, number)."""
+    size = kernels.TRELLIS_MODEL if trellis else kernels.MODEL
+    return np.full((count, size), kernels.NEW_CONTEXT, np.int32)
 
 
 def code_passes(

@@ -26,6 +26,7 @@ __all__ = [
     "MASK_GROUP",
     "MASK_MODEL",
     "MODEL",
+    "NEW_CONTEXT",
     "OFFSETS_MODEL",
     "PART_COLUMNS",
     "PART_ROWS",
@@ -54,7 +55,6 @@ __all__ = [
     "mesh_umbrellas",
     "mesh_unfold",
     "most_bits",
-    "new_models",
     "offsets",
     "pass_gains",
     "passes",
@@ -273,7 +273,7 @@ lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(
 
 # mask.c
 MASK_GROUP = 16
-MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
+MASK_MODEL = (1 << 10) + 4
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
 
 # values.c
@@ -325,14 +325,13 @@ spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writ
 
 # bitplanes.c
 PASSES_STATE = 8
-MODEL, TRELLIS_MODEL = 551, 1127
+MODEL, TRELLIS_MODEL, NEW_CONTEXT = 79, 155, (1 << 27) | 1
 passes = Kernel(
     "passes",
     *[INTEGER] * 2,
     *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
     *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
 )
-new_models = Kernel("new_models", INTEGER, writes(_I32))
 
 # gains.c
 pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))

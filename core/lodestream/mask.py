@@ -1,8 +1,7 @@
 """The mask of a surface with holes, without loss: each point in the context of those before it.
 
-Points are coded in raster order, each by the mean of two models in the logistic domain: one that sees the ten nearest
-points before it and adapts fast, and one that sees sixteen and distinguishes more. Where all that surrounds a group of
-sixteen points in a row is equal, one bit says whether they are equal to that too.
+Points are coded in raster order, each in the context of the ten nearest points before it. Where all that surrounds a
+group of sixteen points in a row is equal, one bit says whether they are equal to that too.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ __all__ = ["decode_mask", "encode_mask"]
 
 #: Points outside the mask that contexts see: above, and at either side.
 _ABOVE = 2
-_BESIDE = 3
+_BESIDE = 2
 #: Groups of points in one call of the kernel.
 _AT_ONCE = 1 << 16
 

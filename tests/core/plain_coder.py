@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,25 +24,7 @@ from lodestream.band_fields import (
 
 __all__ = ["PlainTile", "RangeCoder"]
 
-# fmt: off
-_LOGISTIC = [
-    32768, 36843, 40793, 44511, 47911, 50941, 53581, 55834, 57724, 59287, 60565,
-    61598, 62428, 63090, 63615, 64030, 64357, 64614, 64816, 64974, 65097, 65194,
-    65269, 65328, 65374, 65410, 65438, 65459, 65476, 65489, 65500, 65508, 65514,
-]
-# fmt: on
-_ANCHORS = [65536 - value for value in _LOGISTIC[:0:-1]] + _LOGISTIC
-_CLASSES = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 6]
 _NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
-
-
-def _squashed(x: int) -> int:
-    whole, part = divmod(x + 2048, 64)
-    return min(max((_ANCHORS[whole] * (64 - part) + _ANCHORS[whole + 1] * part) >> 6, 32), 65504)
-
-
-_SQUASH = [_squashed(x) for x in range(-2048, 2048)]
-_STRETCH = [min(max(bisect_left(_SQUASH, 16 * p + 8) - 2048, -2047), 2047) for p in range(4096)]
 
 
 class RangeCoder:
@@ -92,7 +73,6 @@ class PlainTile:
     flag_count: int
     trellis: bool = False
     contexts: dict[tuple[Any, ...], tuple[int, int]] = field(default_factory=lambda: defaultdict(lambda: (2**19, 1)))
-    weights: dict[tuple[int, ...], list[int]] = field(default_factory=lambda: defaultdict(lambda: [32768, 32768]))
 
     def __post_init__(self) -> None:
         self.known, self.sign, self.early = [0] * self.size, [0] * self.size, [0] * self.size
@@ -116,25 +96,12 @@ class PlainTile:
         self._learn(context, bit)
         return bit
 
-    def _mixed(self, first: tuple[Any, ...], second: tuple[Any, ...], pair: tuple[int, ...], bit: int) -> int:
-        inputs = [_STRETCH[self.contexts[context][0] >> 8] for context in (first, second)]
-        weights = self.weights[pair]
-        total = sum(weight * x for weight, x in zip(weights, inputs, strict=True)) >> 16
-        chance = _SQUASH[min(max(total, -2047), 2047) + 2048]
-        bit = self._coder.bit(bit, chance)
-        error = (65536 if bit else 0) - chance
-        for i, x in enumerate(inputs):
-            weights[i] = min(max(weights[i] + ((x * error + 16384) >> 15), -(2**18)), 2**18)
-        self._learn(first, bit)
-        self._learn(second, bit)
-        return bit
-
     def _pass(self, number: int, band: list[int]) -> None:
         plane, first = number >> 1, number & 1
         lowest = self.trellis and plane == 0
-        state = 0
         rows, columns, across = band[ROWS], band[COLUMNS], (band[COLUMNS] + 7) // 8
         for top in range(0, rows, 8):
+            state = 0
             for left in range(0, columns, 8):
                 block = band[FLAGS] + top // 8 * (across + 1) + left // 8
                 inside = [(i, j) for i in range(top, min(top + 8, rows)) for j in range(left, min(left + 8, columns))]
@@ -159,36 +126,58 @@ class PlainTile:
     def _parent(band: list[int], i: int, j: int) -> int:
         return band[PARENT] + (i >> band[ROW_SHIFT]) * band[PARENT_STRIDE] + (j >> band[COLUMN_SHIFT])
 
-    def _around(self, band: list[int], at: int, distance: int) -> dict[tuple[int, int], int]:
-        reach = range(-distance, distance + 1)
-        ring = [(i, j) for i in reach for j in reach if max(abs(i), abs(j)) == distance]
-        return {(i, j): self.known[at + i * band[STRIDE] + j] for i, j in ring}
+    def _around(self, band: list[int], at: int, plane: int) -> dict[tuple[int, int], int]:
+        places = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if i or j]
+        return {(i, j): min(self.known[at + i * band[STRIDE] + j] >> plane, 3) for i, j in places}
 
     def _visits(self, band: list[int], at: int, number: int) -> bool:
         plane = number >> 1
         if number & 1:
-            visits = not self.known[at] and sum(self._around(band, at, 1).values()) >> plane > 0
+            near = [u for (i, j), u in self._around(band, at, plane).items() if max(abs(i), abs(j)) == 1]
+            visits = not self.known[at] and any(near)
             self.early[at] = plane + 1 if visits else self.early[at]
             return visits
         return self.early[at] != plane + 1
 
     def _visit(self, band: list[int], i: int, j: int, plane: int, state: int | None) -> None:
-        at, kind, known = band[OFFSET] + i * band[STRIDE] + j, band[KIND], self.known
-        odd = () if state is None else (state & 1,)
-        own = min((known[at] >> (plane + 1)).bit_length(), 3)
-        side, rise = (min((known[at - d] + known[at + d]) >> plane, 4) for d in (1, band[STRIDE]))
+        at, known = band[OFFSET] + i * band[STRIDE] + j, self.known
+        lowest = () if state is None else (state & 1,)
+        own = min(known[at] >> (plane + 1), 2)
         true = self._true[at] if self._true else 0
         bit = abs(true) >> plane & 1
-        if own > 1:
-            bit = self._alone((own, side, rise, kind), bit)
+        if own == 2 and state is None:
+            bit = self._coder.bit(bit, 32768)
+        elif own:
+            bit = self._alone(("refinement", own, *lowest), bit)
         else:
-            ring = sum(2 * v if 0 in place else v for place, v in self._around(band, at, 2).items())
-            parent, stride = self._parent(band, i, j), band[PARENT_STRIDE]
-            parents = 4 * (known[parent] >> plane) + sum(known[parent + d] >> plane for d in (-1, 1, -stride, stride))
-            around = "around", own, _CLASSES[min(ring >> plane, 17)], min(_CLASSES[min(parents, 17)], 5), odd
-            bit = self._mixed((own, side, rise, kind, odd), around, (own, *odd), bit)
+            bit = self._alone((*self._surroundings(band, i, j, plane), *lowest), bit)
         if bit:
             if not known[at]:
-                x, y = (int(np.sign(self.sign[at - d] + self.sign[at + d])) for d in (1, band[STRIDE]))
-                self.sign[at] = -1 if self._alone(("sign", x, y, kind), int(true < 0)) else 1
+                self._visit_sign(band, at, true)
             known[at] += 1 << plane
+
+    def _surroundings(self, band: list[int], i: int, j: int, plane: int) -> tuple[int, ...]:
+        around = self._around(band, band[OFFSET] + i * band[STRIDE] + j, plane)
+        across, down = (
+            sum(u for place, u in around.items() if place[axis] == 0 and 1 in map(abs, place)) for axis in (0, 1)
+        )
+        further = 0
+        for (row, column), u in around.items():
+            if 0 in (row, column) and max(abs(row), abs(column)) == 1:
+                continue
+            further += u * (2 if 0 in (row, column) or abs(row) + abs(column) == 2 else 1)
+        parent, stride = self._parent(band, i, j), band[PARENT_STRIDE]
+        beside = sum(self.known[parent + d] >> plane for d in (-1, 1, -stride, stride))
+        further += 3 * min(self.known[parent] >> plane, 4) + min(beside, 12)
+        two = [(total > 0) + (total > 2) for total in (across, down)]
+        if band[KIND] == 2:
+            two.reverse()
+        return *two, (further > 0) + (further > 3) + (further > 11)
+
+    def _visit_sign(self, band: list[int], at: int, true: int) -> None:
+        x, y = (int(np.sign(self.sign[at - d] + self.sign[at + d])) for d in (1, band[STRIDE]))
+        kind = band[KIND]
+        total = 3 * y + x if kind == 2 else 3 * x + y
+        flip = total < 0
+        bit = self._alone(("sign", abs(total), max(kind - 1, 0)), int(true < 0) ^ flip) ^ flip
+        self.sign[at] = -1 if bit else 1

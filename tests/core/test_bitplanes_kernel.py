@@ -70,7 +70,7 @@ def test_bytes_and_coefficients_are_those_of_the_plain_coder(
     writer, reader = Arrays(table, trellis), Arrays(table, trellis)
     plain = PlainTile(table.bands[:0], table.size, table.blocks, trellis)
     for tile in range(len(table.members)):
-        plain.bands, plain.contexts, plain.weights = table.of_tile(tile), *fresh()
+        plain.bands, plain.contexts = table.of_tile(tile), fresh()
         passes = 2 * bits - 1
         last = min(cut, passes - 1)
         for first, end in ((passes - 1, last), (last - 1, 0)):
@@ -92,10 +92,9 @@ def test_bytes_and_coefficients_are_those_of_the_plain_coder(
         assert np.array_equal(arrays.models, writer.models)
 
 
-def fresh() -> tuple[Any, Any]:
-    """Contexts and weights of a tile that was not coded so far."""
-    tile = PlainTile(np.zeros((0, 10), np.int64), 0, 0)
-    return tile.contexts, tile.weights
+def fresh() -> Any:
+    """Contexts of a tile that was not coded so far."""
+    return PlainTile(np.zeros((0, 10), np.int64), 0, 0).contexts
 
 
 @given(shape=shapes, bits=st.integers(1, 28), trellis=st.booleans(), data=st.binary(max_size=200))
@@ -105,7 +104,7 @@ def test_any_bytes_are_read_as_the_plain_coder_reads_them(
     table = a_table(shape)
     reader, plain = Arrays(table, trellis), PlainTile(table.bands[:0], table.size, table.blocks, trellis)
     for tile in range(len(table.members)):
-        plain.bands, plain.contexts, plain.weights = table.of_tile(tile), *fresh()
+        plain.bands, plain.contexts = table.of_tile(tile), fresh()
         plain.code(2 * bits - 2, 0, None, data)
     tiles = range(len(table.members))
     runs = np.array([reader.run(tile, 2 * bits - 2, 0, 0, len(data)) for tile in tiles])
@@ -144,6 +143,18 @@ def test_calls_that_are_cut_short_go_on_where_they_stopped(trellis: bool, budget
         results.append((runs.copy(), data))
     assert np.array_equal(results[0][0], results[1][0])
     assert np.array_equal(results[0][1], results[1][1])
+
+
+def test_a_run_is_checked_when_it_is_its_turn() -> None:
+    shape = (30, 30)
+    table = a_table(shape)
+    arrays, data = Arrays(table, False), np.zeros(100, np.uint8)
+    runs = np.array([arrays.run(0, 3, 0, 0, 50), arrays.run(1, 3, 0, 60, 50)])
+    state = np.zeros(kernels.PASSES_STATE, np.int64)
+    own = arrays.known, arrays.sign, arrays.flags, arrays.early, np.zeros(0, np.int32), arrays.models, data, np.zeros(0)
+    assert kernels.passes(True, False, table.bands, runs, *own, state, 1) == 0
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.passes(True, False, table.bands, runs, *own, state, 1 << 30)
 
 
 def a_call(**changes: Any) -> int:

@@ -100,6 +100,11 @@ def in_blocks(values: NDArray[Any]) -> list[Any]:
     return [value for block in blocks for value in block.ravel().tolist()]
 
 
+def rows_of_blocks(values: NDArray[Any]) -> list[slice]:
+    """In each of which the trellis begins anew."""
+    return [slice(top, top + 8) for top in range(0, len(values), 8)]
+
+
 def cost_of(size: float, group: int, odd: int, k: int) -> float:
     """Squared error and bits of an index without its sign."""
     rate = float(BITS[odd, group, min(k, INDICES - 1)]) + (1.0 if k else 0.0)
@@ -137,12 +142,15 @@ def choose(values: NDArray[np.float64], classes: NDArray[np.int8]) -> tuple[NDAr
 def check(values: NDArray[np.float64], classes: NDArray[np.int8]) -> float:
     """The cost of what is chosen, which is counted and has the signs of the values."""
     chosen, counts = choose(values, classes)
-    state, total, expected = 0, 0.0, np.zeros(BITS.shape)
-    for size, group, index in zip(in_blocks(np.abs(values)), in_blocks(classes), in_blocks(chosen), strict=True):
-        odd, k = int(ODD[state]), abs(index)
-        total += cost_of(size, group, odd, k)
-        expected[odd, group, min(k, INDICES - 1)] += 1
-        state = int(TRANSITIONS[state, k & 1])
+    total, expected = 0.0, np.zeros(BITS.shape)
+    for rows in rows_of_blocks(values):
+        state = 0
+        arrays = np.abs(values[rows]), classes[rows], chosen[rows]
+        for size, group, index in zip(*map(in_blocks, arrays), strict=True):
+            odd, k = int(ODD[state]), abs(index)
+            total += cost_of(size, group, odd, k)
+            expected[odd, group, min(k, INDICES - 1)] += 1
+            state = int(TRANSITIONS[state, k & 1])
     assert np.array_equal(counts, expected)
     assert (np.sign(chosen) * np.where(values >= 0, 1, -1) >= 0).all()
     return total
@@ -178,7 +186,8 @@ def test_the_cheapest_of_all_indices_are_found(sizes: list[float], classes: list
 def test_the_cheapest_way_through_a_band_is_found(shape: tuple[int, int], scale: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     values, classes = rng.laplace(0, scale, shape), rng.integers(0, CLASSES, shape).astype(np.int8)
-    best = least_cost(in_blocks(np.abs(values)), in_blocks(classes))
+    rows = rows_of_blocks(values)
+    best = sum(least_cost(in_blocks(np.abs(values[row])), in_blocks(classes[row])) for row in rows)
     # Bits of large indices are taken from a table of logarithms.
     assert check(values, classes) == pytest.approx(best, rel=1e-12, abs=1e-6 * values.size)
 

@@ -59,6 +59,7 @@ class Case:
             step, remaining = int(self.steps[number]), int(self.state[tile])
             trellis = 0
             for i, j in in_blocks(rows, columns):
+                trellis = 0 if (i % 8, j) == (0, 0) else trellis
                 at = offset + i * stride + j
                 magnitude, marked = int(self.known[at]), int(self.early[at])
                 value = magnitude_of(magnitude, marked, remaining, step, bool(ODD[trellis]))

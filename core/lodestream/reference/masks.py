@@ -15,7 +15,7 @@ from .range_coder import Model
 __all__ = ["Masks", "decode_mask", "no_holes", "read_masks"]
 
 GROUP = 16
-MARGIN = 4  # points left of a mask that contexts see; on the right there are fewer
+MARGIN = 2  # points beside a mask that contexts see
 
 Mask = NDArray[np.bool_]
 
@@ -85,9 +85,7 @@ def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
                     here[first : first + n] = around[:1] * n
                     continue
             for c in range(first, first + n):
-                wide = *above2[c - 2 : c + 3], *above[c - 3 : c + 4], *here[c - 4 : c]
-                near = *above2[c - 1 : c + 2], *above[c - 2 : c + 3], *here[c - 2 : c]
-                here[c] = model.mixed(wide, near, "mask")  # they differ in length
+                here[c] = model.bit("point", *above2[c - 1 : c + 2], *above[c - 2 : c + 3], *here[c - 2 : c])
         found.append(np.array(here[MARGIN : MARGIN + columns], bool))
         above2, above = above, here
     model.finish()

@@ -16,9 +16,6 @@ MOST_PLANES = 28
 #: The state of an index, by the state and the parity of the index before it.
 NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
 
-#: The class of a sum, the last of those above 16.
-CLASS = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 5, 6]
-
 Plane = list[list[int]]
 
 
@@ -108,9 +105,10 @@ class _Pass:
         self.has_states = unit.indices and self.number == 0
 
     def run(self) -> None:
-        band, state = self.band, 0
+        band = self.band
         rows, columns = range(len(band.rows)), range(len(band.columns))
         for top in rows[::BLOCK]:
+            state = 0
             for left in columns[::BLOCK]:
                 block = rows[top : top + BLOCK], columns[left : left + BLOCK]
                 significant = self._is_significant(*block)
@@ -143,42 +141,52 @@ class _Pass:
         r, c = row + MARGIN, column + MARGIN
         above, here, below = band.magnitude[r - 1 : r + 2]
         if self.is_first:
-            ring = sum(above[c - 1 : c + 2]) + here[c - 1] + here[c + 1] + sum(below[c - 1 : c + 2])
-            if here[c] or not ring >> plane:
+            around = sum(above[c - 1 : c + 2]) + here[c - 1] + here[c + 1] + sum(below[c - 1 : c + 2])
+            if here[c] or not around >> plane:
                 return
             band.visited[row][column] = plane
         elif band.visited[row][column] == plane:
             return
-        own = here[c] >> (plane + 1)
-        m = own if own < 2 else 2 if own < 4 else 3
-        h = min((here[c - 1] + here[c + 1]) >> plane, 4)
-        w = min((above[c] + below[c]) >> plane, 4)
-        if m < 2:
-            q = band.state[row][column] & 1 if self.has_states else None  # plane 0 of indices has its own contexts
-            around = "around", q, m, self._ring_class(r, c), self._parent_class(row, column)
-            bit = self.model.mixed(("across", q, m, h, w, band.kind), around, (q, m))
+        own = min(here[c] >> (plane + 1), 2)
+        odd = band.state[row][column] & 1 if self.has_states else None  # plane 0 of indices has its own contexts
+        if own == 0:
+            bit = self.model.bit("significance", odd, *self._surroundings(row, column))
+        elif own == 1 or self.has_states:
+            bit = self.model.bit("refinement", odd, own)
         else:
-            bit = self.model.bit("across", None, m, h, w, band.kind)
+            bit = self.model.raw_bit()
         if bit:
             if not here[c]:
-                sign = band.sign
-                x = clamp(sign[r][c - 1] + sign[r][c + 1], -1, 1)
-                y = clamp(sign[r - 1][c] + sign[r + 1][c], -1, 1)
-                sign[r][c] = -1 if self.model.bit("sign", x, y, band.kind) else 1
+                band.sign[r][c] = self._sign(r, c)
                 band.born[row][column] = self.number
             here[c] += 1 << plane
 
-    def _ring_class(self, r: int, c: int) -> int:
-        over, above, here, below, under = self.band.magnitude[r - 2 : r + 3]
-        total = sum(over[c - 2 : c + 3]) + over[c] + sum(under[c - 2 : c + 3]) + under[c]
-        total += above[c - 2] + above[c + 2] + 2 * (here[c - 2] + here[c + 2]) + below[c - 2] + below[c + 2]
-        return CLASS[min(total >> self.plane, 17)]
+    def _surroundings(self, row: int, column: int) -> tuple[int, int, int]:
+        r, c = row + MARGIN, column + MARGIN
+        over, above, here, below, under = (
+            [min(m >> self.plane, 3) for m in line[c - 2 : c + 3]] for line in self.band.magnitude[r - 2 : r + 3]
+        )
+        far = 2 * (above[1] + above[3] + below[1] + below[3] + here[0] + here[4] + over[2] + under[2])
+        far += over[0] + over[1] + over[3] + over[4] + under[0] + under[1] + under[3] + under[4]
+        far += above[0] + above[4] + below[0] + below[4] + self._parents(row, column)
+        across, down = (min((two + 1) // 2, 2) for two in (here[1] + here[3], above[2] + below[2]))
+        if self.band.kind == 2:
+            across, down = down, across
+        return across, down, sum(far >= step for step in (1, 4, 12))
 
-    def _parent_class(self, row: int, column: int) -> int:
+    def _parents(self, row: int, column: int) -> int:
         parent, plane = self.band.parent, self.plane
         if parent is None:
             return 0
         r, c = self.band.parent_of(row, column)
-        across = (parent.at(r, c - 1) >> plane) + (parent.at(r, c + 1) >> plane)
-        down = (parent.at(r - 1, c) >> plane) + (parent.at(r + 1, c) >> plane)
-        return min(CLASS[min(4 * (parent.at(r, c) >> plane) + across + down, 17)], 5)
+        beside = (parent.at(r, c - 1) >> plane) + (parent.at(r, c + 1) >> plane)
+        beside += (parent.at(r - 1, c) >> plane) + (parent.at(r + 1, c) >> plane)
+        return 3 * min(parent.at(r, c) >> plane, 4) + min(beside, 12)
+
+    def _sign(self, r: int, c: int) -> int:
+        sign, kind = self.band.sign, self.band.kind
+        x = clamp(sign[r][c - 1] + sign[r][c + 1], -1, 1)
+        y = clamp(sign[r - 1][c] + sign[r + 1][c], -1, 1)
+        total = 3 * y + x if kind == 2 else 3 * x + y
+        bit = self.model.bit("sign", abs(total), max(kind, 1))
+        return 1 if bit == (total < 0) else -1

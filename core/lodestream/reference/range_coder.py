@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Hashable
 
@@ -10,28 +9,12 @@ from ..errors import StreamError
 
 __all__ = ["Model", "RangeDecoder", "clamp"]
 
-#: The table L, from which `squash` is interpolated.
-LOGISTIC = [
-    *(32768, 36843, 40793, 44511, 47911, 50941, 53581, 55834, 57724, 59287, 60565),
-    *(61598, 62428, 63090, 63615, 64030, 64357, 64614, 64816, 64974, 65097, 65194),
-    *(65269, 65328, 65374, 65410, 65438, 65459, 65476, 65489, 65500, 65508, 65514),
-]
+RATE = [2**17 // (2 * n + 3) for n in range(128)]
 
 
 def clamp(value: int, least: int, most: int) -> int:
     """The value, or the end of the range beyond which it lies."""
     return least if value < least else most if value > most else value
-
-
-def _squash(x: int) -> int:
-    points = [65536 - number for number in LOGISTIC[:0:-1]] + LOGISTIC
-    i, f = (x + 2048) >> 6, (x + 2048) & 63
-    return clamp((points[i] * (64 - f) + points[i + 1] * f) >> 6, 32, 65504)
-
-
-SQUASH = [_squash(x) for x in range(-2048, 2048)]
-STRETCH = [clamp(bisect_left(SQUASH, 16 * p + 8) - 2048, -2047, 2047) for p in range(4096)]  # SQUASH rises
-RATE = [2**17 // (2 * n + 3) for n in range(128)]
 
 
 class RangeDecoder:
@@ -61,7 +44,7 @@ class RangeDecoder:
 
 
 class Model:
-    """Section 7.2: contexts and pairs of weights, each made when it is first used.
+    """Section 7.2: contexts, each made when it is first used.
 
     A context is named by what the page numbers it with: as all begin alike, the numbers themselves do not matter.
     """
@@ -69,7 +52,6 @@ class Model:
     def __init__(self, string: bytes = b"") -> None:
         self.begin(string)
         self._contexts: defaultdict[Hashable, tuple[int, int]] = defaultdict(lambda: (2**19, 1))
-        self._weights: defaultdict[Hashable, tuple[int, int]] = defaultdict(lambda: (32768, 32768))
 
     def begin(self, string: bytes) -> None:
         """Go on with another string."""
@@ -87,18 +69,9 @@ class Model:
         self._adapt(context, state, bit)
         return bit
 
-    def mixed(self, first: Hashable, second: Hashable, pair: Hashable) -> int:
-        """A bit with two mixed contexts and one of the pairs of weights."""
-        one, other = self._contexts[first], self._contexts[second]
-        x, y = STRETCH[one[0] >> 8], STRETCH[other[0] >> 8]
-        u, v = self._weights[pair]
-        probability = SQUASH[clamp((u * x + v * y) >> 16, -2047, 2047) + 2048]
-        bit = self._coder.bit(probability)
-        error = (65536 if bit else 0) - probability
-        self._weights[pair] = _moved(u, x * error), _moved(v, y * error)
-        self._adapt(first, one, bit)
-        self._adapt(second, other, bit)
-        return bit
+    def raw_bit(self) -> int:
+        """A bit without a context."""
+        return self._coder.bit(2**15)
 
     def number(self, bits: int, name: str, first: int = 0) -> int:
         """A number of so many bits, the highest first, each in context `first` + v: v = 1, then 2 v + bit."""
@@ -111,7 +84,3 @@ class Model:
         p, n = state
         target = 2**20 - 1 if bit else 0
         self._contexts[context] = p + ((target - p) * RATE[n] >> 16), min(n + 1, 127)
-
-
-def _moved(weight: int, by: int) -> int:
-    return clamp(weight + ((by + 16384) >> 15), -(2**18), 2**18)
