@@ -179,11 +179,7 @@ def index_memory(file: BinaryIO) -> int:
 
     tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
     try:
-<<<<<<< HEAD
-        return INDEX_GROWTH * parse_footer(read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
-=======
-        return INDEX_GROWTH * parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail).length
->>>>>>> w-testtime
+        return INDEX_GROWTH * parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
     except CorruptStreamError:
         return 0
 
