@@ -113,17 +113,17 @@ def test_an_interrupted_view_is_decoded_on_from_where_it_was(
     name: str, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = (GOLDEN / f"{name}.lode").read_bytes()
-    wanted, mixed, bits = fed(data).surface(), range_coder.Model.mixed, 0
+    wanted, bit, bits = fed(data).surface(), range_coder.Model.bit, 0
 
     def interrupted(*arguments: Any) -> int:
         nonlocal bits
         bits += 1
-        found = mixed(*arguments)
+        found = bit(*arguments)
         if bits % every == 0 and bits <= 4 * every:
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr(range_coder.Model, "mixed", interrupted)
+    monkeypatch.setattr(range_coder.Model, "bit", interrupted)
     with without_kernels():
         slow, interrupts = fed(data), 0
         while True:
