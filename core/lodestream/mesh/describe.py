@@ -115,7 +115,9 @@ def join_blocks(
     if not among:
         return result, 0
     together = np.unique(np.concatenate(among))
-    return result, len(together) - len(np.unique(points[together] + 0, axis=0))
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        places = points[together] + 0  # 0 and -0 are one place
+    return result, len(together) - len(np.unique(places, axis=0))
 
 
 def _border(block: RecognisedBlock, grid: Grid) -> NDArray[np.int64]:
