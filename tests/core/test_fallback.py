@@ -18,7 +18,7 @@ from lodestream import capacity
 from lodestream.capacity import Capacity
 from lodestream.inspection import inspect
 from lodestream.plan import plan
-from lodestream.reference import passes
+from lodestream.reference import range_coder
 from lodestream.selection import Wish
 from lodestream.target import Target, Tolerance
 from tests.torture.targets import TARGETS, mutate
@@ -113,7 +113,7 @@ def test_an_interrupted_view_is_decoded_on_from_where_it_was(
     name: str, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = (GOLDEN / f"{name}.lode").read_bytes()
-    wanted, mixed, bits = fed(data).surface(), passes.Model.mixed, 0
+    wanted, mixed, bits = fed(data).surface(), range_coder.Model.mixed, 0
 
     def interrupted(*arguments: Any) -> int:
         nonlocal bits
@@ -123,7 +123,7 @@ def test_an_interrupted_view_is_decoded_on_from_where_it_was(
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr(passes.Model, "mixed", interrupted)
+    monkeypatch.setattr(range_coder.Model, "mixed", interrupted)
     with without_kernels():
         slow, interrupts = fed(data), 0
         while True:
