@@ -293,6 +293,15 @@ def test_the_library_for_wider_registers_is_loaded_where_they_are_there() -> Non
 
 
 @pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
+def test_the_library_for_wider_registers_has_what_gains_by_them_and_the_other_one_the_rest() -> None:
+    both = [ctypes.CDLL(str(library.NATIVE / str(name))) for name in (library.library_name(), library.wide_name())]
+    for name, wide in (("lode_lift", True), ("lode_store_values", True), ("lode_passes", False), ("lode_mask", False)):
+        assert [hasattr(one, name) for one in both] == [True, wide]
+        assert hasattr(library.library(), name)
+    assert not hasattr(library.library(), "lode_nothing")
+
+
+@pytest.mark.skipif(library.wide_name() is None, reason="there is no second library on this machine")
 @pytest.mark.parametrize("content", [b"no library", OURS[:-1]])
 def test_a_second_library_that_cannot_be_loaded_is_done_without(native: Path, content: bytes) -> None:
     (native / library.library_name()).write_bytes(OURS)

@@ -129,17 +129,6 @@ def test_states_that_no_call_has_left_behind_are_refused(kernel: Kernel, values:
         kernel(*values)
 
 
-@pytest.mark.parametrize("weight", [-(2**18) - 1, 2**18 + 1])
-@pytest.mark.parametrize("reads", [0, 1])
-def test_weights_that_no_call_has_left_behind_are_refused(reads: int, weight: int) -> None:
-    field, data = np.zeros((4, 7), np.uint8), np.zeros(66, np.uint8)
-    model, kept = np.zeros(kernels.MASK_MODEL, np.int32), np.zeros(4, np.int64)
-    kernels.mask(reads, 2, 1, 0, 1, field, model, data, kept)
-    model[-1] = weight
-    with pytest.raises(ValueError, match="do not fit"):
-        kernels.mask(reads, 2, 1, 1, 2, field, model, data, kept)
-
-
 def test_values_without_a_place_count_as_the_largest() -> None:
     """Values that are no numbers come from no decoder, but where a value leads the list of offsets must hold."""
     model, data = np.zeros(kernels.OFFSETS_MODEL, np.int32), np.zeros(1000, np.uint8)

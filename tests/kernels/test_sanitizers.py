@@ -23,7 +23,7 @@ READ = "(coder->place < coder->size ? coder->data[coder->place] : 0);\n        }
 #: A file, what it says, what it is to say, and words of what is then said of it.
 FAULTS = {
     "a read past the end": ("binary_coder.h", READ, READ.replace("<", "<=", 1), "heap-buffer-overflow"),
-    "a length that is not checked": ("mask.c", "last > rows ||", "", "heap-buffer-overflow"),
+    "a length that is not checked": ("mask.c", "last > rows * groups_across(columns) ||", "", "heap-buffer-overflow"),
     "a shift of a negative number": ("mask.c", "above = 0,", "above = -1,", "left shift of negative value"),
     "a loop without end": ("binary_coder.h", "coder->width >= NARROWEST && ", "", "longer than two seconds"),
 }
