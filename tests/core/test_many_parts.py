@@ -100,8 +100,9 @@ def test_four_times_the_parts_take_about_four_times_as_long(maker: Maker, count:
         folder.mkdir()
     few, many = maker(folders[0], count), maker(folders[1], MORE * count)
     seconds(few)  # loads libraries and compiles
-    # The least of three: what else a busy machine does is counted too.
-    assert min(seconds(many) for _ in range(3)) <= TIMES * seconds(few) + NOISE
+    most = TIMES * seconds(few) + NOISE
+    # Once within it is enough: what else a busy machine does is counted too.
+    assert any(seconds(many) <= most for _ in range(3)), f"expected at most {most} seconds"
 
 
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)

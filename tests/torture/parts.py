@@ -1,6 +1,7 @@
 """The parts of ``make torture``: each does what it is told for a while and says what it did.
 
-``python -m tests.torture.parts NAME COUNT SECONDS FILE`` writes what one did into a file; SECONDS may be ``-``.
+``python -m tests.torture.parts NAME COUNT SECONDS FILE`` writes what one did into a file; SECONDS may be ``-``. A part
+imports what it needs when it runs: the others would take longer to load than many a part to begin.
 """
 
 from __future__ import annotations
@@ -19,19 +20,6 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-
-import benchmarks.server as throughput
-import tests.faults.run as faults
-from lodestream.container import read_index
-from lodestream.plan import plan
-from tests.faults.shim import CannotError
-from tests.kernels.compiling import sanitizing_compiler
-from tests.kernels.declared import declarations
-from tests.kernels.fuzzing import fuzz_all
-from tests.server.helpers import hills, npy, push
-from tests.server.programs import server
-
-from . import crowd, fuzz, history, kills, small_disk, streams
 
 __all__ = ["PARTS", "Part", "Result", "sent"]
 
@@ -108,12 +96,20 @@ class Part:
 
 def sent(container: bytes) -> str:
     """Hash of what a stream of the whole surface carries, in its order."""
+    from lodestream.container import read_index
+    from lodestream.plan import plan
+
     chosen = plan(read_index(lambda offset, length: container[offset : offset + length], len(container)))
     places = (*chosen.before, *chosen.ranges, *chosen.after)
     return hashlib.sha256(b"".join(container[place.offset : place.end] for place in places)).hexdigest()
 
 
 def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from tests.server.helpers import hills, npy, push
+    from tests.server.programs import server
+
+    from . import crowd
+
     data = folder / "data"
     with server(data, **crowd.settings(count)) as running:
         with running.client() as http:
@@ -136,6 +132,8 @@ def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
 
 
 def _streams(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import streams
+
     least = _STREAM_SECONDS * count / _SCHEDULES
     report = streams.run(count, least, most=seconds)
     assert not report.problems, "\n".join((str(report), *report.problems[:20]))
@@ -153,6 +151,8 @@ def _streams(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
 
 
 def _throughput(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    import benchmarks.server as throughput
+
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         code = throughput.main(["--streams", str(count)])
@@ -161,6 +161,8 @@ def _throughput(folder: Path, count: int, seconds: float | None) -> tuple[int, t
 
 
 def _kills(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import kills
+
     done = kills.run(folder, count, seconds)
     return done.servers, (
         f"{done.servers} servers and {done.workers} build processes killed",
@@ -172,6 +174,8 @@ def _kills(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[
 
 
 def _disk(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import small_disk
+
     if not small_disk.can_mount():
         return 0, ("skipped: no small disk can be mounted on this machine",)
     done = small_disk.run(folder, count, seconds)
@@ -182,6 +186,8 @@ def _disk(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
 
 
 def _history(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import history
+
     done = history.run(folder, count, seconds)
     cases = sum(done.disasters[kind] for kind in history.possible())
     facts = (
@@ -196,6 +202,9 @@ def _history(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
 
 
 def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    import tests.faults.run as faults
+    from tests.faults.shim import CannotError
+
     try:
         report = faults.run(folder, count / 100, seconds)
     except CannotError as error:
@@ -206,6 +215,7 @@ def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
 
 
 def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import fuzz
     from .targets import TARGETS
 
     found: dict[str, fuzz.Fuzzed | BaseException] = {}
@@ -234,6 +244,10 @@ def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
 
 
 def _kernels(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from tests.kernels.compiling import sanitizing_compiler
+    from tests.kernels.declared import declarations
+    from tests.kernels.fuzzing import fuzz_all
+
     if sanitizing_compiler() is None:
         return 0, ("skipped: there is neither a gcc nor a clang with sanitizers",)
     found = fuzz_all(list(declarations()), math.inf if seconds is None else seconds, count, seed=time.time_ns() % 2**32)
