@@ -1,15 +1,18 @@
-"""Id, log line and metrics of every request."""
+"""Id, log line and metrics of every request, and an answer to those that the server's end interrupts."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 
+from fastapi.requests import HTTPConnection
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .logs import event, new_request
 from .metrics import Metrics
+from .problems import RestartingError, answer
 
 __all__ = ["Observation"]
 
@@ -32,7 +35,7 @@ class Observation:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, and record it."""
+        """Pass a request on, and record it; when it is cancelled before it is answered, answer 503."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -50,6 +53,12 @@ class Observation:
 
         try:
             await self._app(scope, receive, named)
+        except asyncio.CancelledError:
+            # A server that ends waits for requests only so long, and uvicorn would answer 500 to the others.
+            if status or scope["type"] != "http" or not _is_cancelled():
+                raise
+            ended = RestartingError("the server ended before it could answer; ask again")
+            await answer(HTTPConnection(scope), ended)(scope, receive, named)
         finally:
             # The log of a stream tells more than that its handshake was accepted.
             if status != 101:
@@ -72,3 +81,9 @@ class Observation:
             seconds=seconds,
             client=client[0] if client else None,
         )
+
+
+def _is_cancelled() -> bool:
+    """Whether this task is, and not only something that it waited for."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lodestream_server import level_queue, running_server, worker
+from lodestream_server import level_queue, running, running_server, worker
 from lodestream_server.access import key_of
 from lodestream_server.level_files import Key, Lease, LevelFiles
 from lodestream_server.levels import LevelJob, RefusedLevel, make_level
@@ -49,6 +49,11 @@ def asking(url: str, path: str, token: str | None = None) -> Iterator[socket.soc
         line = "" if token is None else f"Authorization: Bearer {token}\r\n"
         made.sendall(f"GET {path} HTTP/1.1\r\nHost: {address.netloc}\r\n{line}\r\n".encode())
         yield made
+
+
+def _answer_to(url: str, path: str) -> httpx.Response:
+    with client(url) as http:
+        return http.get(path)
 
 
 def plain(rows: int, columns: int, height: int = 1) -> NDArray[np.float32]:
@@ -184,6 +189,26 @@ def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: N
         assert [level for _, level in begun(tmp_path)][1:] == [0]  # the other two were never begun
         assert not alive(process)
         assert len(list((tmp_path / "levels").iterdir())) == 1
+
+
+def test_whoever_waits_when_the_server_ends_is_told_to_ask_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slowly: None, line: list[int]
+) -> None:
+    # As if it took longer than a server that is told to end waits for requests.
+    monkeypatch.setattr(running, "_GRACEFUL_SECONDS", 0.2)
+    with ThreadPoolExecutor(3) as threads:
+        with running_server(tmp_path, workers=1) as url, client(url) as http:
+            surface = push(http, npy(hills()))
+            asked = [threads.submit(_answer_to, url, f"{finest(surface)}?format={name}") for name in ("npy", "ply")]
+            asked.append(threads.submit(_answer_to, url, finest(surface)))
+            eventually(lambda: len(line) == 3, "all to wait for a level")
+            ((process, _),) = eventually(lambda: begun(tmp_path), "a level to begin")
+        answers = [answer.result() for answer in asked]
+    assert not alive(process)
+    for answer in answers:
+        assert problem(answer) == (503, "restarting")
+        assert answer.headers["retry-after"] == "5"
+        assert answer.headers["x-request-id"]
 
 
 def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: None, line: list[int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 import logging
@@ -15,17 +16,21 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
 from lodestream.messages import MAX_CREDIT, Bye, End, Header, Layer, Open, Stop
 from lodestream_server import logs, running_server
+from lodestream_server.metrics import Metrics
+from lodestream_server.observation import Observation
 from lodestream_server.table import TABLE
 from tests.server.helpers import PATIENCE, Raw, closed, data_of, eventually, hills, npy, push, raw_stream
 
@@ -309,6 +314,65 @@ def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None
         found = http.get(queued.headers["location"]).json()
         assert found["state"] in ("queued", "building", "ready")
         assert http.get(made["url"]).json() == made
+
+
+def asked_until_cancelled(app: ASGIApp, kind: str = "http") -> tuple[list[Message], bool]:
+    """What `Observation` sends for a request that is cancelled once it waits, and whether it ends as cancelled."""
+    sent: list[Message] = []
+    state = SimpleNamespace(metrics=Metrics())
+    scope = {"type": kind, "method": "GET", "path": "/x", "headers": [], "app": SimpleNamespace(state=state)}
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    async def ask() -> bool:
+        task = asyncio.ensure_future(Observation(app, state.metrics)(scope, receive, send))
+        await asyncio.sleep(0.01)
+        task.cancel("the server ends")
+        await asyncio.wait((task,))
+        return task.cancelled()
+
+    return sent, asyncio.run(ask())
+
+
+async def hang(scope: Scope, receive: Receive, send: Send) -> None:
+    await asyncio.sleep(PATIENCE)
+
+
+def test_a_request_that_outlasts_the_server_is_told_to_come_back(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        (start, body), cancelled = asked_until_cancelled(hang)
+    assert not cancelled
+    assert start["status"] == 503
+    headers = dict(start["headers"])
+    assert headers[b"retry-after"] == b"5"
+    assert headers[b"x-request-id"]
+    assert json.loads(body["body"])["code"] == "restarting"
+    assert [logs._fields(record)["status"] for record in caplog.records if record.getMessage() == "request"] == [503]
+
+
+def test_an_answer_that_has_begun_is_not_begun_again() -> None:
+    async def begin(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await hang(scope, receive, send)
+
+    sent, cancelled = asked_until_cancelled(begin)
+    assert [message["type"] for message in sent] == ["http.response.start"]
+    assert cancelled
+
+
+def test_a_stream_that_is_cut_off_gets_no_answer_of_http() -> None:
+    assert asked_until_cancelled(hang, "websocket") == ([], True)
+
+
+def test_a_request_whose_own_work_was_cancelled_is_a_fault() -> None:
+    async def fail(scope: Scope, receive: Receive, send: Send) -> None:
+        raise asyncio.CancelledError
+
+    assert asked_until_cancelled(fail) == ([], True)
 
 
 def test_the_log_tells_of_requests_that_write_but_not_of_tokens(tmp_path: Path) -> None:
