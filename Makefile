@@ -42,15 +42,17 @@ C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
 C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
 
-lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and gcc's warnings where it is
+lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and the warnings of gcc and clang
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
 	$(CLANG_FORMAT) --dry-run -Werror $(C) || status=1; \
-	if command -v gcc > /dev/null; then \
-		for file in $(filter %.c,$(C)); do gcc $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
-	else \
-		echo "lint: there is no gcc, so nobody has seen its warnings"; \
-	fi; \
+	for compiler in gcc clang; do \
+		if command -v $$compiler > /dev/null; then \
+			for file in $(filter %.c,$(C)); do $$compiler $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
+		else \
+			echo "lint: there is no $$compiler, so nobody has seen its warnings"; \
+		fi; \
+	done; \
 	exit $$status
 
 format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C

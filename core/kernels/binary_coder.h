@@ -205,10 +205,9 @@ static inline int64_t coder_finish(struct coder *coder) {
         coder->low &= WIDEST;
         coder_carry(coder);
     }
-    for (int count = 0; count < 5; count++) {
-        uint64_t mask = WIDEST >> (8 * (count < 4 ? count : 3));
-        if (count == 4)
-            mask = 0;
+    /* One byte is always enough, since the interval is wider than the numbers that begin with it. */
+    for (int count = 0; count < 2; count++) {
+        uint64_t mask = WIDEST >> (8 * count);
         uint64_t value = (coder->low + mask) & ~mask;
         if (value >= coder->low + coder->width)
             continue;
@@ -216,9 +215,8 @@ static inline int64_t coder_finish(struct coder *coder) {
             value &= WIDEST;
             coder_carry(coder);
         }
-        for (int i = 0; i < count; i++, coder->place++)
-            if (coder->place < coder->size)
-                coder->data[coder->place] = (uint8_t)(value >> (24 - 8 * i));
+        if (count && coder->place++ < coder->size)
+            coder->data[coder->place - 1] = (uint8_t)(value >> 24);
         break;
     }
     if (coder->place > coder->size || coder->size < 1)

@@ -25,9 +25,8 @@ const char *lode_sources(void) {
 /* Whether a register of the answer to cpuid, 0 to 3 for eax to edx, has all bits that are wanted. */
 static int processor(uint32_t leaf, int which, uint32_t wanted) {
     uint32_t answer[4] = {0, 0, 0, 0};
-    if (!__get_cpuid_count(leaf, 0, &answer[0], &answer[1], &answer[2], &answer[3]))
-        return 0;
-    return (answer[which] & wanted) == wanted;
+    return __get_cpuid_count(leaf, 0, &answer[0], &answer[1], &answer[2], &answer[3]) &&
+           (answer[which] & wanted) == wanted;
 }
 
 /* Which registers the system keeps for each thread. */

@@ -49,7 +49,8 @@ LODE_API int lode_runs_v3(void);
  * work:      kept from call to call: at least 16 + (midpoints + run + 25) lines, where `lines` is LODE_LIFT_STRIP along
  *            LODE_LIFT_STRIP / 4 or more columns, otherwise 1.
  * Returns how many nodes are done: `run`, except on very long axes where the plane is one row, one column, or at most
- * LODE_LIFT_STRIP columns and at least a quarter of them.
+ * LODE_LIFT_STRIP columns and at least a quarter of them. The first call of an inverse copies all nodes of a line,
+ * which alone takes longer than a tenth of a second where they are more than 2^25.
  */
 LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64_t columns, int64_t pitch,
                            int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a,
@@ -57,18 +58,20 @@ LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t ro
 
 /* mask.c --------------------------------------------------------------------------------------------------------- */
 
-/* Code rows `first` to `last` - 1 of a mask of `rows` x `columns` points.
+/* Code groups `first` to `last` - 1 of a mask of `rows` x `columns` points: LODE_MASK_GROUP points of a row, fewer at
+ * its end, in raster order.
  *
  * field:  flat, (rows + 2) x (columns + 6): two rows before and three columns at either side are zeros; 1 is valid.
  * model:  LODE_MASK_MODEL contexts and weights; begun where `first` is 0.
  * data:   writing, at least 64 + 2 rows columns bytes; reading, all there are, those missing count as zeros.
  * state:  four numbers that are handed on from call to call, as the model is; others are refused.
- * Returns the bytes written or looked at so far, all of them once `last` is `rows`.
+ * Returns the bytes written or looked at so far, all of them once the last group is coded.
  */
 LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
                            int64_t field_count, int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count,
                            int64_t *state, int64_t state_count);
 
+#define LODE_MASK_GROUP 16
 #define LODE_MASK_MODEL ((1 << 16) + (1 << 10) + 4 + 2)
 
 /* values.c ------------------------------------------------------------------------------------------------------- */

@@ -7,13 +7,18 @@
 #include "binary_coder.h"
 
 enum {
-    GROUP = 16,
+    GROUP = LODE_MASK_GROUP,
     ABOVE = 2,
     BESIDE = 3,
     NEAR = 1 << 16,            /* first of the contexts that see ten points */
     GROUPS = NEAR + (1 << 10), /* first of those of groups: by their surroundings and the last group's answer */
     WEIGHTS = GROUPS + 4,
 };
+
+/* Groups of a row; the last one may be shorter. */
+static int64_t groups_across(int64_t columns) {
+    return (columns + GROUP - 1) / GROUP;
+}
 
 /* Whether all around a group is 1 or all is 0: then its value, else -1. */
 static int surroundings(const uint8_t *at, int64_t stride, int64_t count) {
@@ -45,27 +50,30 @@ LODE_INLINE void code_points(bool reads, struct coder *coder, uint8_t *at, int64
     }
 }
 
-LODE_INLINE int code_rows(bool reads, struct coder *coder, int64_t columns, int64_t first, int64_t last, uint8_t *field,
-                          int32_t *model, int answer) {
-    int64_t stride = columns + 2 * BESIDE;
-    for (int64_t row = first; row < last; row++) {
-        for (int64_t left = 0; left < columns; left += GROUP) {
-            int64_t count = columns - left < GROUP ? columns - left : GROUP;
-            uint8_t *at = field + (row + ABOVE) * stride + BESIDE + left;
-            int around = surroundings(at, stride, count);
-            if (around >= 0) {
-                int same = 1;
-                for (int64_t j = 0; !reads && j < count; j++)
-                    same &= at[j] == around;
-                answer = code_bit(reads, coder, same, &model[GROUPS + 2 * around + answer]);
-                if (answer) {
-                    for (int64_t j = 0; j < count; j++)
-                        at[j] = (uint8_t)around;
-                    continue;
-                }
-            }
-            code_points(reads, coder, at, stride, count, model);
+LODE_INLINE int code_groups(bool reads, struct coder *coder, int64_t columns, int64_t first, int64_t last,
+                            uint8_t *field, int32_t *model, int answer) {
+    int64_t stride = columns + 2 * BESIDE, across = groups_across(columns);
+    int64_t row = first / across, left = first % across * GROUP;
+    for (int64_t group = first; group < last; group++, left += GROUP) {
+        if (left >= columns) {
+            row++;
+            left = 0;
         }
+        int64_t count = columns - left < GROUP ? columns - left : GROUP;
+        uint8_t *at = field + (row + ABOVE) * stride + BESIDE + left;
+        int around = surroundings(at, stride, count);
+        if (around >= 0) {
+            int same = 1;
+            for (int64_t j = 0; !reads && j < count; j++)
+                same &= at[j] == around;
+            answer = code_bit(reads, coder, same, &model[GROUPS + 2 * around + answer]);
+            if (answer) {
+                for (int64_t j = 0; j < count; j++)
+                    at[j] = (uint8_t)around;
+                continue;
+            }
+        }
+        code_points(reads, coder, at, stride, count, model);
     }
     return answer;
 }
@@ -74,8 +82,8 @@ int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, i
                   int64_t field_count, int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count,
                   int64_t *state, int64_t state_count) {
     if (rows < 1 || columns < 1 || rows > INT32_MAX || columns > INT32_MAX || first < 0 || last < first ||
-        last > rows || field_count != (rows + ABOVE) * (columns + 2 * BESIDE) || model_count != LODE_MASK_MODEL ||
-        state_count != 4)
+        last > rows * groups_across(columns) || field_count != (rows + ABOVE) * (columns + 2 * BESIDE) ||
+        model_count != LODE_MASK_MODEL || state_count != 4)
         return LODE_REFUSED;
     struct coder coder = {(uint64_t)state[0], (uint32_t)state[1], state[2], data, data_count};
     int answer = state[3] & 1;
@@ -87,11 +95,11 @@ int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, i
         for (int i = 0; i < LODE_MASK_MODEL; i++)
             model[i] = i < WEIGHTS ? UNKNOWN_CONTEXT : FIRST_WEIGHT;
     }
-    answer = reads ? code_rows(true, &coder, columns, first, last, field, model, answer)
-                   : code_rows(false, &coder, columns, first, last, field, model, answer);
+    answer = reads ? code_groups(true, &coder, columns, first, last, field, model, answer)
+                   : code_groups(false, &coder, columns, first, last, field, model, answer);
     state[0] = (int64_t)coder.low;
     state[1] = coder.width;
     state[2] = coder.place;
     state[3] = answer;
-    return reads || last < rows ? coder.place : coder_finish(&coder);
+    return reads || last < rows * groups_across(columns) ? coder.place : coder_finish(&coder);
 }

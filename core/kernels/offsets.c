@@ -92,7 +92,7 @@ LODE_INLINE int code_rank(bool reads, struct coder *coder, int rank, const struc
 /* A place by its difference from the restored one: four bits in the contexts of those before, then each in its own. */
 LODE_INLINE int64_t code_new(bool reads, struct coder *coder, int64_t place, int64_t restored, int bits,
                              int32_t *model) {
-    uint64_t half = (UINT64_C(1) << bits) >> 1;
+    uint64_t half = bits ? UINT64_C(1) << (bits - 1) : 0;
     uint64_t number = (uint64_t)place - (uint64_t)restored + half, value = 0;
     uint32_t node = 1;
     for (int step = 0; step < bits; step++) {

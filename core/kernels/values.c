@@ -97,7 +97,8 @@ static const struct {
     {8, -__builtin_inf(), __builtin_inf()},
 };
 
-/* For each type: `to_`, a value within its range into the type, and `seen_`, what that is as a float64. */
+/* For each type: `to_`, a value within its range into the type, and `seen_`, what that is as a float64; each where it
+ * is needed. */
 #define INTEGER(type)                                                                                                  \
     static inline type##_t to_##type(double value) {                                                                   \
         double sum = value + WHOLE;                                                                                    \
@@ -138,10 +139,6 @@ static inline float to_float32(double value) {
 
 static inline double seen_float32(double value) {
     return (double)(float)value;
-}
-
-static inline double to_float64(double value) {
-    return value;
 }
 
 static inline double seen_float64(double value) {

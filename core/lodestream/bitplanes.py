@@ -28,10 +28,14 @@ contexts, in this order:
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from . import kernels
+from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 
 __all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point"]
 
@@ -126,9 +130,29 @@ def pass_gains(
     ``weights`` are the squared norms of the bands' synthesis functions, one a band; ``early`` is that of the whole
     tile coded.
     """
-    errors = np.empty(passes + 1, np.float64)
-    kernels.pass_gains(bands, weights, true, early, errors)
+    errors, part = np.zeros(passes + 1), np.empty(passes + 1)
+    for rows, worth in _parts(bands, weights):
+        kernels.pass_gains(rows, worth, true, early, part)
+        errors += part
     return errors
+
+
+def _parts(
+    bands: NDArray[np.int64], weights: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Bands and their weights for one call after another: all at once, or rows of one after another where many."""
+    if (bands[:, ROWS] * bands[:, COLUMNS]).sum() <= _AT_ONCE:
+        yield bands, weights
+        return
+    for number in range(len(bands)):
+        band, weight = bands[number : number + 1], weights[number : number + 1]
+        rows, columns = int(band[0, ROWS]), int(band[0, COLUMNS])
+        height = max(1, _AT_ONCE // columns)
+        for top, left in itertools.product(range(0, rows, height), range(0, columns, _AT_ONCE)):
+            part = band.copy()
+            part[0, OFFSET] += top * band[0, STRIDE] + left
+            part[0, ROWS], part[0, COLUMNS] = min(height, rows - top), min(_AT_ONCE, columns - left)
+            yield part, weight
 
 
 def reconstruction_point(plane: int) -> int:

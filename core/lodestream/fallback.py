@@ -42,6 +42,8 @@ class PlainReconstruction(Reconstruction):
         super().__init__(header)
         section = reference.read_section(serialize_header(header), len(SIGNATURE))
         self._decoder = reference.Decoder(reference.read_header(section.payload))
+        #: The number of a segment, and its unit as it was before: each of its objects, with copies of its attributes.
+        self._before: tuple[int, list[tuple[Any, dict[str, Any]]]] = -1, []
 
     def _whole(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
@@ -80,11 +82,24 @@ class PlainReconstruction(Reconstruction):
 
     def _decode(self, length: int) -> None:
         _say_so()
-        for place in range(self._taken, length):
-            segment = self._queue[place]
-            number = segment.tile * self.header.channels + segment.channel
-            begins = self._decoder.units[number].remaining < 0
-            top = segment.first // 2 + 1 if begins else None
-            self._decoder.take([reference.Segment(number, segment.passes, top, segment.data)])
-            self._taken = place + 1
+        while self._taken < length:
+            segment = self._queue[self._taken]
+            unit = self._decoder.units[segment.tile * self.header.channels + segment.channel]
+            if self._before[0] == self._taken:  # an interruption left the unit anywhere within the segment
+                for thing, attributes in self._before[1]:
+                    vars(thing).update(attributes)
+            self._before = self._taken, [(thing, _copied(vars(thing))) for thing in (unit, unit.model, *unit.bands)]
+            unit.decode(segment.first // 2 + 1 if unit.remaining < 0 else None, segment.passes, segment.data)
+            self._taken += 1
             self._forget(self._taken)
+
+
+def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
+    """What decoding changes is in dictionaries, and in lists of rows; all else it replaces."""
+    copies = dict(attributes)
+    for name, value in attributes.items():
+        if isinstance(value, list):
+            copies[name] = [row.copy() if isinstance(row, list) else row for row in value]
+        elif isinstance(value, dict):
+            copies[name] = value.copy()
+    return copies

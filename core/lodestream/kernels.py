@@ -23,6 +23,7 @@ __all__ = [
     "DIFFERENCES_MODEL",
     "INDICES",
     "LIFT_STRIP",
+    "MASK_GROUP",
     "MASK_MODEL",
     "MODEL",
     "OFFSETS_MODEL",
@@ -271,6 +272,7 @@ LIFT_STRIP = 64
 lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
 
 # mask.c
+MASK_GROUP = 16
 MASK_MODEL = (1 << 16) + (1 << 10) + 4 + 2
 mask = Kernel("mask", *[INTEGER] * 5, writes(_U8), writes(_I32), writes(_U8), writes(_I64))
 

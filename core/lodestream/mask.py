@@ -19,8 +19,8 @@ __all__ = ["decode_mask", "encode_mask"]
 #: Points outside the mask that contexts see: above, and at either side.
 _ABOVE = 2
 _BESIDE = 3
-#: Points in one call of the kernel.
-_AT_ONCE = 1 << 20
+#: Groups of points in one call of the kernel.
+_AT_ONCE = 1 << 16
 
 
 def encode_mask(mask: NDArray[np.bool_]) -> bytes:
@@ -75,9 +75,9 @@ def _field(rows: int, columns: int) -> NDArray[np.uint8]:
 def _code(reading: bool, rows: int, columns: int, field: NDArray[np.uint8], data: NDArray[np.uint8]) -> int:
     """Code all points of the field; returns the bytes written, or those looked at."""
     model, state = np.empty(kernels.MASK_MODEL, np.int32), np.zeros(4, np.int64)
-    height = max(1, _AT_ONCE // columns)
+    groups = rows * -(-columns // kernels.MASK_GROUP)
     length = 0
-    for first in range(0, rows, height):
-        last = min(first + height, rows)
+    for first in range(0, groups, _AT_ONCE):
+        last = min(first + _AT_ONCE, groups)
         length = kernels.mask(reading, rows, columns, first, last, field, model, data, state)
     return length

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import bitplanes, kernels
+from lodestream.band_fields import COLUMNS, ROWS
 from lodestream.bitplanes import pass_count, pass_gains, reconstruction_point
 from lodestream.layout import Layout
 from lodestream.predictors import COEFFICIENT_BITS
@@ -159,3 +163,24 @@ def test_gains_are_the_squared_errors_of_what_is_known() -> None:
                 w * squares[slice(*b.rows), slice(*b.columns)].sum() for w, b in zip(weights, bands, strict=True)
             ]
             assert errors[remaining] == pytest.approx(float(sum(expected)))
+
+
+@pytest.mark.parametrize("at_once", [1, 5, 23, 60, 1000])
+def test_gains_of_a_large_tile_are_those_of_its_parts(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = Layout.single((25, 18), (False, False), (3, 3))
+    table, true = TileTable.of(layout), gather(TileTable.of(layout), [coefficients((25, 18), 10, 0.7, 10)])
+    early = np.random.default_rng(2).integers(0, 5, table.size, np.uint8)
+    rows = table.of_tile(len(layout.tiles) - 1)
+    weights = np.arange(1.0, len(rows) + 1)
+    whole = pass_gains(rows, weights, 19, true, early)
+    kernel, sizes = kernels.pass_gains, []
+
+    def counted(bands: Any, *arguments: Any) -> int:
+        sizes.append(int((bands[:, ROWS] * bands[:, COLUMNS]).sum()))
+        return kernel(bands, *arguments)
+
+    monkeypatch.setattr(bitplanes, "_AT_ONCE", at_once)
+    monkeypatch.setattr(kernels, "pass_gains", counted)
+    np.testing.assert_allclose(pass_gains(rows, weights, 19, true, early), whole, rtol=1e-12)
+    assert max(sizes) <= at_once
+    assert sum(sizes) == (rows[:, ROWS] * rows[:, COLUMNS]).sum()

@@ -179,6 +179,11 @@ def test_the_call_that_others_differ_from_is_taken() -> None:
     assert a_call() == 1
 
 
+@pytest.mark.parametrize("column", [ROWS, COLUMNS])
+def test_a_band_without_coefficients_may_lie_anywhere(column: int) -> None:
+    assert a_call(**{f"band{column}": 0, f"band{OFFSET}": 2**40}) == 1
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -6,6 +6,7 @@ import io
 import logging
 import random
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lodestream import capacity
 from lodestream.capacity import Capacity
 from lodestream.inspection import inspect
 from lodestream.plan import plan
+from lodestream.reference import passes
 from lodestream.selection import Wish
 from lodestream.target import Target, Tolerance
 from tests.torture.targets import TARGETS, mutate
@@ -104,6 +106,34 @@ def test_a_state_before_the_last_one_decodes_nothing_of_what_came_since() -> Non
         slow.layers[0].surface()
         assert plain._queue == waiting
         assert_same(slow.surface(), fed(data).surface())
+
+
+@pytest.mark.parametrize(("name", "every"), [("sphere-closed", 501), ("attributes", 1301)])
+def test_an_interrupted_view_is_decoded_on_from_where_it_was(
+    name: str, every: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = (GOLDEN / f"{name}.lode").read_bytes()
+    wanted, mixed, bits = fed(data).surface(), passes.Model.mixed, 0
+
+    def interrupted(*arguments: Any) -> int:
+        nonlocal bits
+        bits += 1
+        found = mixed(*arguments)
+        if bits % every == 0 and bits <= 4 * every:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(passes.Model, "mixed", interrupted)
+    with without_kernels():
+        slow, interrupts = fed(data), 0
+        while True:
+            try:
+                found = slow.surface()
+                break
+            except KeyboardInterrupt:
+                interrupts += 1
+        assert interrupts == 4
+        assert_same(found, wanted)
 
 
 def test_some_attributes_alone_are_the_same() -> None:

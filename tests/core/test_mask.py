@@ -38,6 +38,15 @@ def test_masks_of_blobs_come_back(shape: tuple[int, int], seed: int) -> None:
     assert np.array_equal(decode_mask(encode_mask(mask), shape, 0), mask)
 
 
+@given(mask=arrays.arrays(np.bool_, st.tuples(st.integers(1, 9), st.integers(1, 70))), at_once=st.integers(1, 7))
+def test_calls_that_end_within_a_row_change_nothing(mask: Mask, at_once: int) -> None:
+    data = encode_mask(mask)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lodestream.mask._AT_ONCE", at_once)
+        assert encode_mask(mask) == data
+        assert np.array_equal(decode_mask(data, mask.shape, 0), mask)
+
+
 def test_a_mask_takes_less_than_half_of_what_a_general_compressor_takes() -> None:
     mask = blobs((300, 400), 1)
     assert len(encode_mask(mask)) < 0.5 * len(zlib.compress(np.packbits(mask).tobytes(), 9))

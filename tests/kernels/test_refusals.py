@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from lodestream import kernels
 from lodestream.kernels import INTEGER, Kernel, Values
 
 from .declared import declarations
@@ -74,3 +76,78 @@ def test_what_does_not_fit_is_refused(calls: dict[str, list[tuple[Kernel, Values
             except ValueError:
                 refused += 1
     assert 0 < refused < made  # some changes still fit
+
+
+def ints(*numbers: int) -> NDArray[np.int32]:
+    return np.array(numbers, np.int32)
+
+
+def state(*numbers: int) -> NDArray[np.int64]:
+    return np.array(numbers, np.int64)
+
+
+ALONE = ints(-1, -1, -1, -1)  # the twins of a face that has no neighbour
+QUAD = ints(0, 1, 2, 3)
+#: Two quads and three that have a side in common with the first.
+PAIR = ints(4, -1, -1, -1, 0, -1, -1, -1)
+STAR = ints(4, 8, -1, -1, 0, -1, -1, -1, 1, -1, -1, -1)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "values"),
+    [
+        # A face that no piece has, and a queue that is full of others; a face in the queue that there is not.
+        (kernels.mesh_pieces, (ALONE, ints(-1), ints(0), state(0, 1, 1, 1), 9)),
+        (kernels.mesh_pieces, (ALONE, ints(-1), ints(5), state(0, 0, 1, 1), 9)),
+        # The same, of a neighbour and of a face to begin with; of a face to be turned round.
+        (
+            kernels.mesh_orient,
+            (ints(*QUAD, 1, 0, 4, 5), PAIR, np.array([0, 2], np.uint8), ints(0, 0), state(0, 0, 0, 2, 0), 9),
+        ),
+        (kernels.mesh_orient, (QUAD, ALONE, np.array([2], np.uint8), ints(0), state(0, 1, 1, 1, 0), 9)),
+        (kernels.mesh_orient, (QUAD, ALONE, np.array([0], np.uint8), ints(9), state(0, 0, 1, 1, -1), 9)),
+        # The fan of a pole has a vertex that there is not, and it was looked at before.
+        (
+            kernels.mesh_poles,
+            (
+                *(QUAD, ALONE, ints(0, 9, 0, 0), ints(-2), ints(0), ints(0), 0),
+                *(np.zeros(1, np.uint8), ints(0), state(0, 0, 0, 1), 9),
+            ),
+        ),
+        # A stack that has room for one neighbour and not for two.
+        (
+            kernels.mesh_develop,
+            (
+                *(4, STAR, ints(0, -1, -1), np.zeros(6, np.int32), np.array([0, -1, -1], np.int8)),
+                *(np.zeros(1, np.uint8), np.zeros(3, np.int64), np.zeros(3, np.int32), state(0, 3, 1), 9),
+            ),
+        ),
+    ],
+)
+def test_states_that_no_call_has_left_behind_are_refused(kernel: Kernel, values: Values_) -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        kernel(*values)
+
+
+@pytest.mark.parametrize("weight", [-(2**18) - 1, 2**18 + 1])
+@pytest.mark.parametrize("reads", [0, 1])
+def test_weights_that_no_call_has_left_behind_are_refused(reads: int, weight: int) -> None:
+    field, data = np.zeros((4, 7), np.uint8), np.zeros(66, np.uint8)
+    model, kept = np.zeros(kernels.MASK_MODEL, np.int32), np.zeros(4, np.int64)
+    kernels.mask(reads, 2, 1, 0, 1, field, model, data, kept)
+    model[-1] = weight
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.mask(reads, 2, 1, 1, 2, field, model, data, kept)
+
+
+def test_values_without_a_place_count_as_the_largest() -> None:
+    """Values that are no numbers come from no decoder, but where a value leads the list of offsets must hold."""
+    model, data = np.zeros(kernels.OFFSETS_MODEL, np.int32), np.zeros(1000, np.uint8)
+    bases = np.array([0.0, np.inf, -np.inf, np.nan, 1e300, 1.0])
+    places, restored = np.zeros(6, np.int64), np.zeros(6, np.int64)
+    largest = int(np.finfo(np.float32).max.view(np.int32))
+    places[1:5] = largest
+    length = kernels.offsets(0, bases, restored, 34, places, model, data)
+    read = np.zeros(6, np.int64)
+    assert kernels.offsets(1, bases, restored, 34, read, model, data[:length].copy()) <= length + 4
+    np.testing.assert_array_equal(read, places)
