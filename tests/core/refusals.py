@@ -2,7 +2,7 @@
 
 ``python -m tests.core.refusals`` takes a JSON list of [path, options] on standard input and prints one JSON object for
 each: the class of the error and its message, the greatest memory in bytes (libraries included) and the processor's
-seconds. The libraries are loaded before, so that their time does not count for any file.
+seconds. What they need is loaded before, so that its time does not count for any file.
 """
 
 from __future__ import annotations
@@ -48,19 +48,13 @@ def refusals(cases: list[tuple[Path, dict[str, Any]]]) -> list[Refusal]:
 
 
 def _main() -> None:
-    import h5netcdf  # noqa: F401
-    import PIL.PngImagePlugin  # noqa: F401
-    import rasterio
-    import scipy.io  # noqa: F401
-    import xarray
-    from xarray.backends import h5netcdf_, scipy_  # noqa: F401
+    import lodestream.formats
+    import lodestream.mesh.recognise  # noqa: F401
 
-    import lodestream.formats  # noqa: F401
-
-    with rasterio.Env():
-        pass
-    xarray.Dataset()
-    for path, options in json.load(sys.stdin):
+    cases = json.load(sys.stdin)
+    if any(Path(path).suffix in (".nc", ".png", ".tif") for path, _ in cases):
+        _load_libraries()
+    for path, options in cases:
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
@@ -76,6 +70,19 @@ def _main() -> None:
             json.dumps(found | {"memory": usage.ru_maxrss * 1024, "seconds": usage.ru_utime + usage.ru_stime}),
             flush=True,
         )
+
+
+def _load_libraries() -> None:
+    import h5netcdf  # noqa: F401
+    import PIL.PngImagePlugin  # noqa: F401
+    import rasterio
+    import scipy.io  # noqa: F401
+    import xarray
+    from xarray.backends import h5netcdf_, scipy_  # noqa: F401
+
+    with rasterio.Env():
+        pass
+    xarray.Dataset()
 
 
 def _read(path: str, options: dict[str, Any]) -> dict[str, str]:

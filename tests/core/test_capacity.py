@@ -28,7 +28,7 @@ from lodestream.target import Target
 
 from .forgery import index_of
 
-LARGE = (4000, 4000)
+LARGE = (2000, 2000)
 
 
 @cache
@@ -68,7 +68,7 @@ def test_a_few_bytes_are_refused_what_they_promise() -> None:
     assert len(data) < 1000
     ls.decode(empty(9, 9))  # what is compiled or imported once
     with within(5_000_000):
-        with pytest.raises(TooLargeError, match=r"at most 1,000,000 vertices \(max_vertices\), got 16,000,000"):
+        with pytest.raises(TooLargeError, match=r"at most 1,000,000 vertices \(max_vertices\), got 4,000,000"):
             ls.decode(data, max_vertices=1_000_000)
         decoder = ls.Decoder(max_vertices=1_000_000)
         with pytest.raises(TooLargeError):
@@ -76,7 +76,7 @@ def test_a_few_bytes_are_refused_what_they_promise() -> None:
 
 
 def test_what_is_allowed_is_decoded() -> None:
-    assert ls.decode(empty(), max_vertices=16_000_000).points.shape == LARGE
+    assert ls.decode(empty(), max_vertices=4_000_000).points.shape == LARGE
     assert ls.decode(empty()).points.shape == LARGE
     assert ls.decode(small(), max_vertices=2000).points.shape == (40, 50)
     with pytest.raises(TooLargeError):
@@ -84,11 +84,11 @@ def test_what_is_allowed_is_decoded() -> None:
 
 
 def test_the_default_fits_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 30)
-    with pytest.raises(TooLargeError, match=r"at most 410 MiB to decode \(40% of the available memory\)") as caught:
+    monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 28)
+    with pytest.raises(TooLargeError, match=r"at most 102 MiB to decode \(40% of the available memory\)") as caught:
         ls.decode(empty())
-    assert "max_vertices=16000000 allows it" in str(caught.value)
-    monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 31)
+    assert "max_vertices=4000000 allows it" in str(caught.value)
+    monkeypatch.setattr(capacity, "memory_limit", lambda: 1 << 29)
     assert ls.decode(empty()).points.shape == LARGE
 
 

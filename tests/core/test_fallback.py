@@ -145,7 +145,7 @@ def test_some_attributes_alone_are_the_same() -> None:
         assert_same(fed(data, wish=Wish(attributes=(first,))).surface(), wanted)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(surfaces(), st.sampled_from([{}, {"precision": "1e-3d"}, {"rms": "1e-2d"}]), st.integers(0), st.integers(0))
 def test_the_reference_and_the_kernels_agree(
     surface: ls.Surface, options: dict[str, str], layer: int, level: int

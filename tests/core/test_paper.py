@@ -45,7 +45,7 @@ def bound(terms: int) -> float:
     return (3 + math.sqrt(2)) / 32 * abs(C) ** terms
 
 
-@pytest.mark.parametrize("sizes", [range(5, 200), range(200, 400), range(400, 501)], ids=str)
+@pytest.mark.parametrize("sizes", [range(5, 200), range(200, 501, 20)], ids=str)
 def test_solve_meets_the_bound_of_lemma_2_for_every_right_hand_side(sizes: range) -> None:
     # The error is linear in b: its largest row sum, over the unit right-hand sides, is the worst that any b with
     # entries in [-1, 1] can do, and the signs of that row are the b that does it.

@@ -30,8 +30,6 @@ from .meshes import collapse, grid_faces
 #: What a container does not keep is another matter, see test_losses.
 pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
-
 #: Number of vertices and the faces, or edges, over them, in the order of the file.
 Topology = tuple[int, list[list[int]]]
 
@@ -362,30 +360,6 @@ def test_rough_values_do_not_change_the_faces(
         found = weld(roughly(decoder.surface(level), bits))
         for field in ("source", "quads", "triangles", "edges", "joined"):
             np.testing.assert_array_equal(getattr(found, field), getattr(coarse, field))
-
-
-FILES: dict[str, dict[str, Any]] = {
-    "m6_small.fmt": {},
-    "teapot.bpt": {"density": "8"},
-    "bamboo_pen.obj": {},
-    "step_grdgen.fmt": {"plane": "i0"},
-    "capsule.obj": {},
-    "multi-ascii.xyz": {"plane": "i0"},
-}
-
-
-@pytest.mark.filterwarnings("ignore::lodestream.errors.FormatWarning")  # materials, which are not looked at here
-@pytest.mark.parametrize("name", FILES)
-def test_real_surfaces_keep_their_faces(name: str) -> None:
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{name} is not there")
-    surface = ls.read(path, **FILES[name])
-    expected = weld(surface)
-    for view in decoded(surface).layers[:8]:
-        found = weld(view.surface())
-        for field in ("source", "quads", "triangles", "joined"):
-            np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
 
 
 def test_places_of_points_are_not_compared_where_the_structure_is_known() -> None:

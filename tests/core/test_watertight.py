@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container import Header
+from lodestream.mesh import weld
 from lodestream.parts import part_positions
 from lodestream.sides import LatticeBlock
 
@@ -89,8 +89,11 @@ def _places(header: Header, level: int, block: int) -> list[NDArray[np.int64]]:
     return [np.concatenate(axis) for axis in places]
 
 
-def assert_together(surface: ls.Surface) -> ls.Decoder:
-    """No shared side opens, after any layer, at any level; at the end every value is what it was."""
+def assert_together(surface: ls.Surface, most: int = 100) -> tuple[ls.Decoder, list[ls.View]]:
+    """No shared side opens, after any layer, at any level; at the end every value is what it was.
+
+    Of more layers than `most` these are looked at, the last among them. The decoder and they are returned.
+    """
     decoder = ls.Decoder()
     decoder.feed(ls.encode(surface))
     decoder.finish()
@@ -106,7 +109,8 @@ def assert_together(surface: ls.Surface) -> ls.Decoder:
         for end in range(2)
     }
     first, second = np.array(sorted(same), np.intp).reshape(-1, 2).T
-    for view in decoder.layers:
+    views = decoder.layers[:: -max(1, len(decoder.layers) // most)]
+    for view in views:
         shown = np.concatenate([block.points.reshape(-1, block.points.shape[2]) for block in view.surface().blocks])
         bits = shown.view(f"u{shown.itemsize}")
         assert (bits[first] == bits[second]).all(), view.number
@@ -120,7 +124,7 @@ def assert_together(surface: ls.Surface) -> ls.Decoder:
             assert found.mask is not None
             np.testing.assert_array_equal(found.mask, block.mask)
             np.testing.assert_array_equal(found.points[block.mask], block.points[block.mask])
-    return decoder
+    return decoder, views
 
 
 def surface_of(blocks: list[LatticeBlock]) -> ls.Surface | None:
@@ -132,7 +136,7 @@ def surface_of(blocks: list[LatticeBlock]) -> ls.Surface | None:
     return ls.Surface(blocks=[ls.Block(b.coordinates.astype(np.int64), b.closed, mask=b.mask) for b in usable])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(layouts(largest=8))
 def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)
@@ -140,7 +144,7 @@ def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
         assert_together(surface)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.one_of(overlapping(largest=7), tubes()))
 def test_overlaps_and_tubes_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)
@@ -150,6 +154,8 @@ def test_overlaps_and_tubes_stay_together(blocks: list[LatticeBlock]) -> None:
 
 def boundary(surface: ls.Surface) -> int:
     """Edges of the welded mesh that belong to one face only, as trimesh sees them."""
+    import trimesh
+
     faces = drawn(surface)
     triangles = np.concatenate([faces.triangles, faces.quads[:, [0, 1, 2]], faces.quads[:, [0, 2, 3]]])
     mesh = trimesh.Trimesh(faces.vertices, triangles, process=False, validate=False)
@@ -167,20 +173,24 @@ FILES: dict[str, dict[str, Any]] = {
     "bamboo_pen.obj": {},
     "capsule.obj": {},
     "step_grdgen.fmt": {"plane": "i0"},
+    "multi-ascii.xyz": {"plane": "i0"},
 }
 
 
 @pytest.mark.filterwarnings("ignore:materials .* left out:lodestream.errors.FormatWarning")
 @pytest.mark.parametrize("name", FILES)
-def test_real_surfaces_stay_together(name: str) -> None:
+def test_real_surfaces_stay_together_and_keep_their_faces(name: str) -> None:
     path = DATA / name
     if not path.exists():
         pytest.skip(f"{name} is not there")
     surface = ls.read(path, **FILES[name])
-    decoder = assert_together(surface)
-    edges = boundary(surface)
-    for view in decoder.layers[:: max(1, len(decoder.layers) // 6)]:
-        assert boundary(view.surface()) <= edges
+    decoder, views = assert_together(surface, 6)
+    edges, expected = boundary(surface), weld(surface)
+    for shown in (view.surface() for view in views):
+        assert boundary(shown) <= edges
+        found = weld(shown)
+        for field in ("source", "quads", "triangles", "joined"):
+            np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
     assert boundary(decoder.surface()) == edges
     if edges == 0:
         for level in range(header_of(decoder).levels):

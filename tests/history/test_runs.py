@@ -27,8 +27,8 @@ def told(folder: Path, *kinds: str, owners: bool = False) -> history.Done:
     return done
 
 
-def test_a_server_that_is_ended_and_killed_and_does_not_find_a_folder(tmp_path: Path) -> None:
-    assert told(tmp_path, "restart", "kill", "unmounted").uploads > 0
+def test_a_server_that_is_ended_and_does_not_find_a_folder_or_an_extra(tmp_path: Path) -> None:
+    assert told(tmp_path, "restart", "unmounted", "extra").uploads > 0
 
 
 @pytest.mark.skipif("full" not in history.possible(), reason="no small disk can be mounted on this machine")
@@ -36,12 +36,8 @@ def test_a_full_disk(tmp_path: Path) -> None:
     assert told(tmp_path, "full").refused > 0
 
 
-def test_two_owners_and_a_backup_under_load_that_is_restored(tmp_path: Path) -> None:
+def test_two_owners_a_server_that_is_killed_and_a_backup_under_load_that_is_restored(tmp_path: Path) -> None:
     assert told(tmp_path, "kill", "backup", owners=True).owners == 2
-
-
-def test_an_extra_that_is_missing(tmp_path: Path) -> None:
-    told(tmp_path, "extra")
 
 
 def test_every_kind_has_a_run() -> None:

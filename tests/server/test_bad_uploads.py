@@ -79,7 +79,7 @@ def test_options_that_do_not_exist_are_refused_at_once(
 def bomb() -> bytes:
     file = BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.npy", npy(np.zeros((100, 100)))[:128] + bytes(200 << 20))
+        archive.writestr("a.npy", npy(np.zeros((100, 100)))[:128] + bytes(20 << 20))
     return file.getvalue()
 
 
