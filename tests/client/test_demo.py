@@ -37,8 +37,8 @@ def test_the_demo(tmp_path: Path, plot: bool) -> None:
     assert np.array_equal(heights, terrain(SHAPE))
     assert shown["plain_bytes"] == (tmp_path / "demo" / "terrain.npy").stat().st_size
     for moment in shown["moments"]:
-        assert f"{moment['rms']:.9g}" == f"{moment['rms_found']:.9g}"
-        assert f"{moment['max']:.9g}" == f"{moment['max_found']:.9g}"
+        for told, found in ((moment["rms"], moment["rms_found"]), (moment["max"], moment["max_found"])):
+            assert (1 - 1e-9) * found <= told <= (1 + 1e-6) * found
     last = shown["moments"][-1]
     assert last["rms"] <= 10.0 < shown["moments"][-2]["rms"]
     assert last["bytes"] < shown["whole_bytes"] / 4
