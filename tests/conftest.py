@@ -28,18 +28,21 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 #: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
 LONGEST = (
     "tests/history/test_runs.py",
-    "tests/faults/test_sample.py",
-    "tests/server/test_floods.py",
-    "tests/server/test_kills.py",
-    "tests/server/test_crowds.py",
-    "tests/server/test_strangers.py",
-    "tests/client/test_broken_links.py",
-    "tests/client/test_interrupted.py",
-    "tests/client/test_program.py",
-    "tests/server/test_command.py",
-    "tests/server/test_levels.py",
-    "tests/torture/test_lanes.py",
+    "tests/core/test_reference_decoder.py",
     "tests/core/test_many_parts.py",
+    "tests/core/test_watertight.py",
+    "tests/client/test_interrupted.py",
+    "tests/core/test_fallback.py",
+    "tests/client/test_without_kernels.py",
+    "tests/core/test_decoder.py",
+    "tests/kernels/test_sanitizers.py",
+    "tests/core/test_topology.py",
+    "tests/server/test_floods.py",
+    "tests/server/test_levels.py",
+    "tests/faults/test_sample.py",
+    "tests/server/test_crowds.py",
+    "tests/server/test_kills.py",
+    "tests/server/test_strangers.py",
 )
 
 
