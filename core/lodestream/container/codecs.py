@@ -59,7 +59,6 @@ def parse_codecs(fields: FieldReader) -> tuple[int, ...]:
         raise CorruptStreamError(f"expected the numbers of codecs, each above the one before, got {needed}", start)
     for codec in needed:
         if codec not in KNOWN:
-            raise UnsupportedVersionError(
-                f"expected codecs that this version has (1 to {max(KNOWN)}), got a container that needs codec {codec}"
-            )
+            had = ", ".join(map(str, KNOWN))
+            raise UnsupportedVersionError(f"expected codecs among {had}, got a container that needs codec {codec}")
     return tuple(needed)
