@@ -5,6 +5,7 @@
  */
 #include "band_fields.h"
 #include "block_coder.h"
+#include "class_coder.h"
 #include "logarithm.h"
 
 _Static_assert(LODE_MODEL == CONTEXTS && LODE_TRELLIS_MODEL == TRELLIS_CONTEXTS, "models as lodestream.h has them");
@@ -50,22 +51,6 @@ typedef int64_t (*blocks_t)(struct coder *, const struct tiles *, const struct b
 static const blocks_t BLOCKS_OF[2][3] = {{write_first, write_second, write_lowest},
                                          {read_first, read_second, read_lowest}};
 
-static struct band band_of(const int64_t *fields) {
-    return (struct band){
-        .offset = fields[BAND_OFFSET],
-        .stride = fields[BAND_STRIDE],
-        .rows = fields[BAND_ROWS],
-        .columns = fields[BAND_COLUMNS],
-        .flags = fields[BAND_FLAGS],
-        .across = (fields[BAND_COLUMNS] + BLOCK - 1) / BLOCK,
-        .parent = fields[BAND_PARENT],
-        .parent_stride = fields[BAND_PARENT_STRIDE],
-        .row_shift = (int)fields[BAND_ROW_SHIFT],
-        .column_shift = (int)fields[BAND_COLUMN_SHIFT],
-        .kind = (int)fields[BAND_KIND],
-    };
-}
-
 static bool is_shift(int64_t shift) {
     return shift == 0 || shift == 1 || shift == NO_PARENT;
 }
@@ -93,12 +78,13 @@ static bool band_fits(const int64_t *fields, int64_t size, int64_t flags) {
 
 /* Passes of one tile: a row of the table of runs. */
 struct run {
-    int64_t band, bands, model, first, last, start, length;
+    int64_t band, bands, model, first, last, start, length, large;
 };
 
 static struct run run_of(const int64_t *fields) {
     return (struct run){
-        fields[0], fields[1], fields[2], fields[3], fields[4], fields[LODE_RUN_START], fields[LODE_RUN_LENGTH]};
+        fields[0], fields[1], fields[2], fields[3], fields[4], fields[LODE_RUN_START], fields[LODE_RUN_LENGTH],
+        fields[LODE_RUN_LARGE]};
 }
 
 static bool run_fits(const struct run *run, int64_t bands, int64_t models, int64_t data, int64_t costs) {
@@ -152,11 +138,22 @@ static bool go_on(bool reads, const struct run *run, const struct position *at, 
            coder_can_go_on(reads, coder);
 }
 
+/* Where the walk over a large unit stood, from what was kept; whether that can be. */
+static bool find_place(const struct run *run, const int64_t *state, struct class_place *place) {
+    if (!(place->passes || place->band || place->stripe))
+        return true;
+    place->bytes = state[AT_PLACE];
+    place->bits = state[AT_LOW];
+    return place->passes >= 0 && place->band >= 0 && place->stripe >= 0 && place->bytes >= 0 &&
+           place->bytes <= run->length && place->bits >= 0 && place->bits < INT64_C(1) << 40;
+}
+
 int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
                     int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
                     uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count, const int32_t *truth,
                     int64_t truth_count, int32_t *models, int64_t models_count, uint8_t *data, int64_t data_count,
-                    double *costs, int64_t costs_count, int64_t *state, int64_t state_count, int64_t budget) {
+                    double *costs, int64_t costs_count, uint16_t *symbols, int64_t symbols_count, int64_t *state,
+                    int64_t state_count, int64_t budget) {
     int64_t model = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL, all = runs_count / LODE_RUN_FIELDS;
     if (bands_count % BAND_FIELDS || runs_count % LODE_RUN_FIELDS || sign_count != known_count ||
         early_count != known_count || (!reads && truth_count != known_count) || models_count % model ||
@@ -173,6 +170,31 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
             if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
                 return LODE_REFUSED;
         struct tiles tiles = {(uint32_t *)known, sign, flags, early, truth, models + run.model * model};
+        if (run.large) {
+            if (trellis)
+                return LODE_REFUSED;
+            if (reads) {
+                struct class_place place = {at.passes, at.band, at.block, 0, 0};
+                if (!find_place(&run, state, &place))
+                    return LODE_REFUSED;
+                bool done = lode_class_read(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, run.last,
+                                            data + run.start, run.length, &place, &budget);
+                state[AT_PLACE] = place.bytes;
+                state[AT_LOW] = place.bits;
+                if (done)
+                    continue;
+                at = (struct position){at.run, place.passes, place.band, place.stripe, 0};
+                break;
+            }
+            struct class_output output = {symbols, symbols_count, data + run.start, run.length, costs};
+            if (run.last != 0 || run.first >= costs_count)
+                return LODE_REFUSED;
+            fields[LODE_RUN_LENGTH] =
+                lode_class_write(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, &output);
+            if (fields[LODE_RUN_LENGTH] < 0)
+                return LODE_REFUSED;
+            continue;
+        }
         struct coder coder;
         if (!go_on(reads, &run, &at, state, data, &coder))
             return LODE_REFUSED;

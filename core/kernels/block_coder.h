@@ -7,6 +7,7 @@
 #ifndef LODE_BLOCK_CODER_H
 #define LODE_BLOCK_CODER_H
 
+#include "band_fields.h"
 #include "binary_coder.h"
 #include "surroundings.h"
 #include "trellis.h"
@@ -39,6 +40,22 @@ struct band {
     int64_t offset, stride, rows, columns, flags, across, parent, parent_stride;
     int row_shift, column_shift, kind;
 };
+
+static inline struct band band_of(const int64_t *fields) {
+    return (struct band){
+        .offset = fields[BAND_OFFSET],
+        .stride = fields[BAND_STRIDE],
+        .rows = fields[BAND_ROWS],
+        .columns = fields[BAND_COLUMNS],
+        .flags = fields[BAND_FLAGS],
+        .across = (fields[BAND_COLUMNS] + BLOCK - 1) / BLOCK,
+        .parent = fields[BAND_PARENT],
+        .parent_stride = fields[BAND_PARENT_STRIDE],
+        .row_shift = (int)fields[BAND_ROW_SHIFT],
+        .column_shift = (int)fields[BAND_COLUMN_SHIFT],
+        .kind = (int)fields[BAND_KIND],
+    };
+}
 
 /* A block of a band. */
 struct block {
@@ -88,28 +105,37 @@ LODE_INLINE void code_sign(bool reads, struct coder *coder, const struct tiles *
     *sign = (int8_t)(1 - 2 * bit);
 }
 
-/* Code whether a block gets a significant coefficient, which has none so far. */
-LODE_INLINE int code_flag(bool reads, struct coder *coder, const struct tiles *tiles, const struct band *band,
-                          const struct block *block, int plane) {
+/* All bits of the parents of a block's coefficients. */
+static inline uint32_t parents_in(const struct tiles *tiles, const struct band *band, const struct block *block) {
     int64_t first = block->top >> band->row_shift, last = (block->top + block->rows - 1) >> band->row_shift;
     int64_t left = block->left >> band->column_shift, right = (block->left + block->columns - 1) >> band->column_shift;
     const uint32_t *parents = tiles->known + band->parent;
-    uint32_t family = 0, seen = 0;
+    uint32_t family = 0;
     for (int64_t i = first; i <= last; i++)
         for (int64_t j = left; j <= right; j++)
             family |= parents[i * band->parent_stride + j];
-    family >>= plane;
-    if (!reads) {
-        const int32_t *truth = tiles->truth + band->offset + block->top * band->stride + block->left;
-        for (int64_t i = 0; i < block->rows; i++, truth += band->stride)
-            for (int64_t j = 0; j < block->columns; j++)
-                seen |= magnitude(truth[j]);
-    }
+    return family;
+}
+
+/* All bits of the magnitudes of a block that is written. */
+static inline uint32_t truth_in(const struct tiles *tiles, const struct band *band, const struct block *block) {
+    const int32_t *truth = tiles->truth + band->offset + block->top * band->stride + block->left;
+    uint32_t seen = 0;
+    for (int64_t i = 0; i < block->rows; i++, truth += band->stride)
+        for (int64_t j = 0; j < block->columns; j++)
+            seen |= magnitude(truth[j]);
+    return seen;
+}
+
+/* Code whether a block gets a significant coefficient, which has none so far. */
+LODE_INLINE int code_flag(bool reads, struct coder *coder, const struct tiles *tiles, const struct band *band,
+                          const struct block *block, int plane) {
+    uint32_t family = parents_in(tiles, band, block) >> plane;
     const uint8_t *flag = tiles->flags + block->flag;
     int before = (flag[-1] != 0) + (flag[-band->across - 1] != 0);
     int after = (flag[1] != 0) + (flag[band->across + 1] != 0);
     int slot = FLAGS + (before * 3 + after) * 3 + (int)(family < 2 ? family : 2);
-    return code_bit(reads, coder, seen >> plane != 0, &tiles->model[slot]);
+    return code_bit(reads, coder, !reads && truth_in(tiles, band, block) >> plane != 0, &tiles->model[slot]);
 }
 
 /* Look at a block, and at what is around its parents. */

@@ -302,15 +302,22 @@ LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const in
  *
  * trellis:  1 where coefficients are indices of a trellis.
  * runs:     LODE_RUN_FIELDS numbers each: the tile's first band, its bands, its model's number, the first pass and the
- *           last one (from the highest down, at most 55), where its bytes start in `data`, and how many they are.
- * Writing, there must be room for 11 bits of each decision; how many were written takes the place of the last number.
+ *           last one (from the highest down, at most 55), where its bytes start in `data`, how many they are, and 1
+ *           where the unit is a large one. Such a one is written whole, in one run.
+ * Writing, there must be room for 11 bits of each decision, for 16 in a large unit; how many bytes were written takes
+ * the place of the room.
  * known:    magnitudes as far as they are known, zeros around each band.
  * sign:     -1, 1, or 0 where no bit is known.
  * flags:    of blocks, 0 as long as no coefficient is known to be significant.
- * early:    1 + the plane in whose first pass a coefficient was coded last, or 0.
+ * early:    1 + the plane in whose first pass a coefficient was coded last, or 0. In large units 1 + the plane in which
+ *           it was found, and 128 more if that was in the second pass.
  * truth:    writing, the coefficients with their signs; reading, empty.
- * models:   LODE_MODEL or, of a trellis, LODE_TRELLIS_MODEL contexts each, at first LODE_NEW_CONTEXT.
- * costs:    empty; or the bits that were written when each pass had ended, by its number.
+ * models:   LODE_MODEL or, of a trellis, LODE_TRELLIS_MODEL contexts each, at first LODE_NEW_CONTEXT, or zeros of a
+ *           large unit.
+ * costs:    empty; or the bits that were written when each pass had ended, by its number. Not empty where a large unit
+ *           is written.
+ * symbols:  where large units are written, room for the decisions of any of them, and for a stripe's more: of n
+ *           coefficients in p planes n (p + 2) + n p / 8 + 2048.
  * state:    LODE_PASSES_STATE numbers, zeros at first, handed on from call to call.
  * budget:   about so many coefficients are looked at in a call, at least one block.
  *
@@ -320,10 +327,11 @@ LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *band
                              int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
                              uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count,
                              const int32_t *truth, int64_t truth_count, int32_t *models, int64_t models_count,
-                             uint8_t *data, int64_t data_count, double *costs, int64_t costs_count, int64_t *state,
-                             int64_t state_count, int64_t budget);
+                             uint8_t *data, int64_t data_count, double *costs, int64_t costs_count, uint16_t *symbols,
+                             int64_t symbols_count, int64_t *state, int64_t state_count, int64_t budget);
 
-#define LODE_RUN_FIELDS 7
+#define LODE_RUN_FIELDS 8
+#define LODE_RUN_LARGE 7
 #define LODE_RUN_START 5
 #define LODE_RUN_LENGTH 6
 #define LODE_PASSES_STATE 8

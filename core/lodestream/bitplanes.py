@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from . import kernels
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 
-__all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point"]
+__all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point", "symbols_room"]
 
 #: Rows and columns of a block.
 BLOCK = 8
@@ -47,10 +47,20 @@ def pass_count(planes: int) -> int:
     return 2 * planes - 1 if planes else 0
 
 
-def new_models(count: int, trellis: bool = False) -> NDArray[np.int32]:
-    """The contexts of so many tiles before their first planes: int32, shape (tile, number)."""
+def new_models(count: int, trellis: bool = False, large: int | None = None) -> NDArray[np.int32]:
+    """The contexts of so many tiles before their first planes: int32, shape (tile, number).
+
+    ``large`` is the first of the tiles that are large units, if there are any.
+    """
     size = kernels.TRELLIS_MODEL if trellis else kernels.MODEL
-    return np.full((count, size), kernels.NEW_CONTEXT, np.int32)
+    models = np.full((count, size), kernels.NEW_CONTEXT, np.int32)
+    models[count if large is None else large :] = 0
+    return models
+
+
+def symbols_room(coefficients: int, planes: int) -> int:
+    """Room for the decisions of a large unit that is written, in numbers of uint16."""
+    return coefficients * (planes + 2) + coefficients * planes // 8 + 2048
 
 
 def code_passes(
@@ -67,6 +77,7 @@ def code_passes(
     costs: NDArray[np.float64],
     trellis: bool,
     state: NDArray[np.int64] | None = None,
+    symbols: NDArray[np.uint16] | None = None,
 ) -> None:
     """Code runs of passes of one channel, one after another; plane p of a tile has the passes 2 p + 1 and 2 p.
 
@@ -75,10 +86,11 @@ def code_passes(
     reading : bool
         Read ``data`` rather than write it.
     bands : int64, shape (band, `band_fields.BAND_FIELDS`)
-    runs : int64, shape (run, 7)
+    runs : int64, shape (run, 8)
         Of each: the tile's first band and the number of its bands, the tile, the first and the last pass (from the
-        highest down), where its bytes begin in ``data``, and how many they are. Where writing, that is the room for
-        them, and is replaced by how many were written; a bit in a context takes at most 11 bits.
+        highest down), where its bytes begin in ``data``, how many they are, and 1 if it is a large unit, whose passes
+        are written all at once. Where writing, the bytes are the room for them, and are replaced by how many were
+        written; a bit in a context takes at most 11 bits, in a large unit 16.
     known : int32, flat
         Magnitudes as far as they are known, of all tiles, two zeros around each band; updated.
     sign : int8, flat
@@ -86,19 +98,22 @@ def code_passes(
     flags : uint8, flat
         Not 0 where a block has a significant coefficient; updated.
     early : uint8, flat
-        1 + the plane in whose first pass a coefficient was coded last; updated.
+        1 + the plane in whose first pass a coefficient was coded last; in large units 1 + the plane in which it was
+        found, and 128 more if in the second pass; updated.
     true : int32, flat
         The coefficients with their signs, where writing; empty where reading.
     models : int32, shape (tile, number), see `new_models`
         Updated.
     data : uint8
     costs : float64
-        The bits written when each pass ended, by its number; or empty.
+        The bits written when each pass ended, by its number; or empty, unless a large unit is written.
     trellis : bool
         The coefficients are indices with a trellis, see `trellis`; ``models`` are of a trellis.
     state : int64, shape (`kernels.PASSES_STATE`,), optional
         How far the runs are, zeros at first; updated. A call that was interrupted goes on from there when it is made
         again with the same arrays.
+    symbols : uint16, optional
+        Room for the decisions of a large unit that is written, see `symbols_room`.
 
     Raises
     ------
@@ -107,7 +122,8 @@ def code_passes(
     """
     if state is None:
         state = np.zeros(kernels.PASSES_STATE, np.int64)
-    arrays = known, sign, flags, early, true, models, data, costs, state
+    symbols = np.zeros(0, np.uint16) if symbols is None else symbols
+    arrays = known, sign, flags, early, true, models, data, costs, symbols, state
     while kernels.passes(reading, trellis, bands, runs, *arrays, _AT_ONCE) < len(runs):
         pass
 

@@ -217,7 +217,7 @@ class Encoding:
     def _curves(self) -> list[TileCurve]:
         """Cost and gain of every pass, by coding each tile once as a whole."""
         coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
-        self.tiles = coder.tiles
+        self.tiles, self._strings = coder.tiles, coder.strings
         curves = []
         for tile in range(len(self.layout.tiles)):
             for number, channel in enumerate(self.channels):
@@ -350,7 +350,7 @@ class Encoding:
     def _coded(self, states: list[State], errors: list[Errors]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self.tiles, self._last  # as large as what takes their place
-        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser, self._strings)
         before = start = self._all_passes()
         layers = []
         for state, measured in zip(states, errors, strict=True):

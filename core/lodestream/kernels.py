@@ -265,7 +265,15 @@ def _described(values: tuple[Any, ...]) -> str:
     return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
-_BOOL, _I8, _U8, _I32, _I64, _F64 = np.bool_, np.int8, np.uint8, np.int32, np.int64, np.float64
+_BOOL, _I8, _U8, _U16, _I32, _I64, _F64 = (
+    np.bool_,
+    np.int8,
+    np.uint8,
+    np.uint16,
+    np.int32,
+    np.int64,
+    np.float64,
+)
 
 # lifting.c
 LIFT_STRIP = 64
@@ -330,7 +338,7 @@ passes = Kernel(
     "passes",
     *[INTEGER] * 2,
     *(reads(_I64), writes(_I64), writes(_I32), writes(_I8), writes(_U8), writes(_U8), reads(_I32), writes(_I32)),
-    *(writes(_U8), writes(_F64), writes(_I64), INTEGER),
+    *(writes(_U8), writes(_F64), writes(_U16), writes(_I64), INTEGER),
 )
 
 # gains.c

@@ -18,10 +18,13 @@ from .axis import AxisStep, axis_lengths, axis_step
 from .errors import InputError
 from .surface import Closed
 
-__all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
+__all__ = ["LARGE", "REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
 
 #: Layouts, and tables of their tiles, that are remembered: that of a surface in hand is asked for again and again.
 REMEMBERED = 4
+
+#: Points of all grids at a level from which on its units are large.
+LARGE = 1 << 15
 
 Sides = tuple[bool, bool, bool, bool]
 _NONE: Sides = (False, False, False, False)
@@ -281,6 +284,18 @@ class Layout:
     def tiles_of(self, level: int) -> range:
         """Numbers of the tiles of a level."""
         return self._tile_ranges[level]
+
+    @cached_property
+    def first_large(self) -> int:
+        """The first tile whose units are large; the number of tiles where none is.
+
+        All units of a level are large where the grids have together at least `LARGE` points at it; every finer level
+        has more. Units of indices never are.
+        """
+        for level in range(1, self.levels + 1):
+            if sum(rows * columns for rows, columns in (s[level] for s in self._shapes)) >= LARGE:
+                return self.tiles_of(level).start
+        return len(self.tiles)
 
     @cached_property
     def _tile_ranges(self) -> list[range]:

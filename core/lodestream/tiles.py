@@ -113,7 +113,7 @@ class TileTable:
 class Tiles:
     """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`.
 
-    Where there is a quantiser, they are those of indices.
+    Where there is a quantiser, they are those of indices. From the tile ``large`` on all are large units.
     """
 
     def __init__(self, table: TileTable, quantiser: Quantiser | None = None) -> None:
@@ -124,7 +124,8 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
         self.trellis = quantiser is not None
-        self.models = new_models(len(table.members), self.trellis)
+        self.large = len(table.members) if self.trellis else table.layout.first_large
+        self.models = new_models(len(table.members), self.trellis, self.large)
 
     def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
         """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
@@ -136,7 +137,7 @@ class Tiles:
         bands = np.array(self.table.first)
         count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
         data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
-        table = np.stack([bands[tile], count, tile, first, last, start, length], 1)
+        table = np.stack([bands[tile], count, tile, first, last, start, length, tile >= self.large], 1)
         return partial(self.code, True, table, _NOTHING, data, _FREE, np.zeros(PASSES_STATE, np.int64))
 
     def code(
@@ -147,10 +148,11 @@ class Tiles:
         data: NDArray[np.uint8],
         costs: NDArray[np.float64],
         state: NDArray[np.int64] | None = None,
+        symbols: NDArray[np.uint16] | None = None,
     ) -> None:
         """Read or write runs of passes, see `bitplanes.code_passes`."""
         arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
-        code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state)
+        code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state, symbols)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.

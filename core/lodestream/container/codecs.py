@@ -10,10 +10,11 @@ from .model import Header
 
 __all__ = ["KNOWN", "needed_codecs", "parse_codecs", "piece_codec", "serialize_codecs"]
 
-BIT_PLANES, INDICES, MASKS, DIFFERENCES, OFFSETS = 1, 3, 4, 5, 6
+BIT_PLANES, LARGE_UNITS, INDICES, MASKS, DIFFERENCES, OFFSETS = 1, 2, 3, 4, 5, 6
 #: By number, see docs/format.md, section 3.
 KNOWN = {
     BIT_PLANES: "bit-planes",
+    LARGE_UNITS: "large units",
     INDICES: "indices of quantised coordinates",
     MASKS: "masks",
     DIFFERENCES: "differences",
@@ -30,6 +31,9 @@ def needed_codecs(header: Header, pieces: Iterable[bytes]) -> tuple[int, ...]:
         needed.add(MASKS)
     if header.quantiser is not None:
         needed.add(INDICES)
+    layout, coded = header.layout, header.channels if header.quantiser is None else header.channels - header.geometric
+    if coded and layout.first_large < len(layout.tiles):
+        needed.add(LARGE_UNITS)
     return tuple(sorted(needed | {BIT_PLANES}))
 
 
