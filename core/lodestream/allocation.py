@@ -31,7 +31,7 @@ _ENTRY = 5
 _GROWTH = 1.12, 1.147
 _OFTEN = 3800
 #: ... and before: a layer's frame takes about 50 bytes with its share of the index, which counts there.
-_EARLY_GROWTH = 1.7, 2.6
+_EARLY_GROWTH = 1.4, 1.8
 _EARLY_STEP = 160
 _FIRST_LAYER = 48  # bytes of coefficients, at least where there are more layers
 # Of streams made for one error; one of fewer bytes than the first is one layer.
