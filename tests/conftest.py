@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, settings
 settings.register_profile(
     "default",
     deadline=None,
-    max_examples=50,
+    max_examples=30,
     derandomize=True,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],
@@ -49,6 +50,13 @@ LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
     config.option.loadscopereorder = False
+    gc.disable()  # what is collected stays: to look through it again and again frees nothing
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage from now on, among what the tests make."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -94,6 +94,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":  # or nobody would know when what a call has left behind has ended
         ctypes.CDLL(None).prctl(_INHERIT_ORPHANS, 1)
+    gc.disable()  # what is loaded stays
     parent = os.getppid()
     confinement = _try_confinement()
     _say(control, {"confinement": confinement})
@@ -103,6 +104,7 @@ def main() -> None:
     _adapter(_Request)  # which takes longer to make than most calls
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
+    gc.enable()
     _Server(control).run()
 
 

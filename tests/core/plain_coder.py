@@ -24,6 +24,8 @@ from lodestream.band_fields import (
 
 __all__ = ["PlainTile", "RangeCoder"]
 
+_AROUND = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if i or j]
+_NEAR = [(i, j) for i, j in _AROUND if max(abs(i), abs(j)) == 1]
 _NEXT = [(0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5)]
 
 
@@ -127,13 +129,12 @@ class PlainTile:
         return band[PARENT] + (i >> band[ROW_SHIFT]) * band[PARENT_STRIDE] + (j >> band[COLUMN_SHIFT])
 
     def _around(self, band: list[int], at: int, plane: int) -> dict[tuple[int, int], int]:
-        places = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if i or j]
-        return {(i, j): min(self.known[at + i * band[STRIDE] + j] >> plane, 3) for i, j in places}
+        return {(i, j): min(self.known[at + i * band[STRIDE] + j] >> plane, 3) for i, j in _AROUND}
 
     def _visits(self, band: list[int], at: int, number: int) -> bool:
         plane = number >> 1
         if number & 1:
-            near = [u for (i, j), u in self._around(band, at, plane).items() if max(abs(i), abs(j)) == 1]
+            near = (self.known[at + i * band[STRIDE] + j] >> plane for i, j in _NEAR)
             visits = not self.known[at] and any(near)
             self.early[at] = plane + 1 if visits else self.early[at]
             return visits

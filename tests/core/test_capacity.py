@@ -115,19 +115,19 @@ def test_headers_that_promise_too_much(changes: dict[str, Any]) -> None:
 
 
 def test_attributes_count_by_their_bytes() -> None:
-    heights = np.add.outer(np.arange(600.0), np.arange(500.0))
+    heights = np.add.outer(np.arange(400.0), np.arange(300.0))
     plain = ls.encode(ls.Surface(heights))
     names = {f"a{number}": heights for number in range(20)}
     rich = ls.encode(ls.Surface(heights, attributes=names))
-    ls.decode(plain, max_vertices=300_000)
+    ls.decode(plain, max_vertices=120_000)
     with pytest.raises(TooLargeError, match=r"vertices that takes .* MiB; max_vertices=[0-9]+ allows it") as caught:
-        ls.decode(rich, max_vertices=300_000)
+        ls.decode(rich, max_vertices=120_000)
     enough = int(str(caught.value).partition("; max_vertices=")[2].partition(" ")[0])
     assert ls.decode(rich, max_vertices=enough).points.shape == heights.shape
     with pytest.raises(TooLargeError):
         ls.decode(rich, max_vertices=enough - 1)
     # Of what is not wanted nothing is counted.
-    decoder = ls.Decoder(Wish(None, ("a3",)), max_vertices=300_000)
+    decoder = ls.Decoder(Wish(None, ("a3",)), max_vertices=120_000)
     decoder.feed(rich)
     assert decoder.complete
 

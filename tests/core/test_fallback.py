@@ -145,7 +145,7 @@ def test_some_attributes_alone_are_the_same() -> None:
         assert_same(fed(data, wish=Wish(attributes=(first,))).surface(), wanted)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(surfaces(), st.sampled_from([{}, {"precision": "1e-3d"}, {"rms": "1e-2d"}]), st.integers(0), st.integers(0))
 def test_the_reference_and_the_kernels_agree(
     surface: ls.Surface, options: dict[str, str], layer: int, level: int
@@ -153,8 +153,8 @@ def test_the_reference_and_the_kernels_agree(
     agree_on(ls.encode(surface, **options), layer, level)  # type: ignore[arg-type]
 
 
-@settings(max_examples=20)
-@given(st.tuples(st.integers(2, 60), st.integers(2, 200)), st.booleans(), st.integers(0, 2**32), st.integers(0))
+@settings(max_examples=12)
+@given(st.tuples(st.integers(2, 40), st.integers(2, 130)), st.booleans(), st.integers(0, 2**32), st.integers(0))
 def test_they_agree_on_tiles_and_pieces_of_any_size(
     shape: tuple[int, int], floats: bool, seed: int, layer: int
 ) -> None:

@@ -81,7 +81,7 @@ def test_every_prefix_shows_the_last_whole_layer(name: str) -> None:
 def test_a_flipped_bit_leaves_the_layers_before_it_and_a_clear_error(name: str) -> None:
     container, layers = container_of(name), EXPECTED[name]["layers"]
     shuffle = random.Random(name)
-    for _ in range(24 if len(container) < 5000 else 8):
+    for _ in range(12 if len(container) < 5000 else 6):
         place, bit = shuffle.randrange(len(container)), shuffle.randrange(8)
         damaged = bytearray(container)
         damaged[place] ^= 1 << bit

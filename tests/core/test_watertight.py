@@ -184,7 +184,7 @@ def test_real_surfaces_stay_together_and_keep_their_faces(name: str) -> None:
     if not path.exists():
         pytest.skip(f"{name} is not there")
     surface = ls.read(path, **FILES[name])
-    decoder, views = assert_together(surface, 6)
+    decoder, views = assert_together(surface, 3)
     edges, expected = boundary(surface), weld(surface)
     for shown in (view.surface() for view in views):
         assert boundary(shown) <= edges

@@ -37,10 +37,12 @@ def _answer() -> None:
 
 def main() -> None:
     """Serve until told to end."""
+    gc.disable()  # what is imported stays: to look through it again and again frees nothing
     from lodestream_server import Settings
     from lodestream_server.logs import configure
     from lodestream_server.running import serve_alone
 
+    gc.enable()
     settings = Settings(**json.loads(sys.argv[1]))
     configure(settings.log_format, settings.log_level)
     # Its own standard input: a process that it spawns must not read from it.

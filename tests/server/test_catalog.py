@@ -17,7 +17,7 @@ from lodestream_server.records import Record
 from lodestream_server.storage import Storage
 from tests.server.helpers import hills, npy
 
-_COUNT = 100_000
+_COUNT = 20_000
 
 
 def record(number: int, **more: Any) -> Record:

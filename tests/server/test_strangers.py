@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.torture.targets import EDGES, KINDS, TARGETS, Edit, edit
 
 #: Few enough for every run; `make torture` does a million of each.
-CASES = {"containers": 400, "messages": 800, "uploads": 400}
+CASES = {"containers": 200, "messages": 400, "uploads": 200}
 
 EDITS = st.builds(
     Edit,
@@ -54,7 +54,7 @@ def test_any_change_is_taken_or_refused(name: str) -> None:
 def test_any_bytes_are_refused(name: str) -> None:
     target = TARGETS[name]
 
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=150, deadline=None)
     @given(st.binary(max_size=300))
     def check(data: bytes) -> None:
         target.run(data)
