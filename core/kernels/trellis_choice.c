@@ -3,25 +3,31 @@
  *
  * What an index costs is known by the class of its coefficient, that is by the size of what is around it. The indices
  * of a row of blocks depend on each other by the trellis; Viterbi's algorithm takes the cheapest of all ways through
- * it.
+ * it. Errors of coefficients close to each other add up in the surface: what counts is the error of each coefficient
+ * and what a filter feeds back of those before it, above and to the left. So each survivor of the algorithm keeps its
+ * errors.
  */
 #include <stdbool.h>
 
 #include "band_fields.h"
+#include "copying.h"
 #include "lodestream.h"
-#include "logarithm.h"
 #include "trellis.h"
 
 enum {
-    BLOCK = 8,       /* rows and columns of the blocks in whose order a band is coded */
-    FIRST_CLASS = 8, /* of coefficients of about a step */
-    BRANCHES = 4,    /* of a coefficient: for either quantiser the best even and the best odd index */
+    BLOCK = 8,                     /* rows and columns of the blocks in whose order a band is coded */
+    FIRST_CLASS = 8,               /* of coefficients of about a step */
+    BRANCHES = 2 * TRELLIS_STATES, /* the best even index of each state, then the best odd one of each */
+    RULE = 6,                      /* numbers that a band's rule has */
+    SMALL = 32,                    /* below it, coefficients are worked on as they are */
+    MOST = 61,                     /* in the search for an index: two above it have a rate, too */
+    LARGEST = (1 << 28) - 2 * LODE_RATES,
 };
 
-/* What leads into each state: a state before it and the parity of an index; the lower state first. */
-static const uint8_t ARRIVALS[TRELLIS_STATES][2][2] = {
-    {{0, 0}, {4, 1}}, {{2, 0}, {6, 1}}, {{0, 1}, {4, 0}}, {{2, 1}, {6, 0}},
-    {{3, 1}, {5, 0}}, {{1, 0}, {7, 1}}, {{3, 0}, {5, 1}}, {{1, 1}, {7, 0}},
+/* The two branches into each state, by the state that they come from, plus TRELLIS_STATES where the index is odd; the
+ * lower state first. */
+static const uint8_t ARRIVALS[TRELLIS_STATES][2] = {
+    {0, 8 + 4}, {2, 8 + 6}, {8 + 0, 4}, {8 + 2, 6}, {8 + 3, 5}, {1, 8 + 7}, {3, 8 + 5}, {8 + 1, 7},
 };
 
 static int64_t least(int64_t a, int64_t b) {
@@ -110,126 +116,240 @@ int64_t lode_classify(const int64_t *bands, int64_t bands_count, const int64_t *
     return 0;
 }
 
-/* What it takes to give a coefficient an index: squared error and bits. */
-struct branch {
-    double cost;
-    int32_t index;
-};
-
-static double cost_of(double size, int64_t index, double half, const double *bits, double worth) {
-    double error = index ? size - ((double)index - half) : size;
-    double rate = bits[least(index, LODE_INDICES - 1)];
-    if (index)
-        rate += 1.0; /* the sign */
-    if (index >= LODE_INDICES - 1)
-        rate += 2.0 * log2_of((double)(index - LODE_INDICES + 3));
-    return error * error + worth * rate;
-}
-
-/* The best even and the best odd index of a quantiser: the nearest below, the nearest above, and none. */
-static void find_branches(double size, double half, const double *bits, double worth, struct branch *found) {
-    int64_t nearest = size < INT32_MAX - 1 ? (int64_t)(size + half) : INT32_MAX - 1;
-    for (int64_t index = nearest; index < nearest + 2; index++) {
-        found[index & 1].cost = cost_of(size, index, half, bits, worth);
-        found[index & 1].index = (int32_t)index;
-    }
-    double none = cost_of(size, 0, half, bits, worth);
-    if (none < found[0].cost) {
-        found[0].cost = none;
-        found[0].index = 0;
-    }
-}
-
-/* One coefficient further: the least cost of each state, and in the bits of what is returned which of the two ways
- * into it. */
-static uint8_t advance(double *cost, const struct branch *branches) {
-    double next[TRELLIS_STATES];
-    unsigned ways = 0;
-    for (unsigned state = 0; state < TRELLIS_STATES; state++) {
-        const uint8_t (*from)[2] = ARRIVALS[state];
-        double first = cost[from[0][0]] + branches[2 * ODD[from[0][0]] + from[0][1]].cost;
-        double second = cost[from[1][0]] + branches[2 * ODD[from[1][0]] + from[1][1]].cost;
-        bool other = second < first;
-        next[state] = other ? second : first;
-        ways |= (unsigned)other << state;
-    }
-    memcpy(cost, next, sizeof next);
-    return (uint8_t)ways;
-}
-
+/* A band whose indices are chosen. Errors are in steps. */
 struct choice {
+    const int64_t *band;
     const double *relative;
     const int8_t *classes;
-    const double *bits;
-    double worth;
+    const float *rates;
+    float half;    /* how far below an index its point lies in the odd quantiser */
+    float weight;  /* of a squared error */
+    float up[2];   /* what is fed back of errors one and two rows above, */
+    float left[2]; /* and one and two columns to the left */
+    float *above;  /* errors of the two rows above the row of blocks, the upper one first, filtered along the rows */
     int32_t *chosen;
     double *counts;
     int32_t *indices;
-    uint8_t *ways;
+    uint8_t *from;
 };
+
+/* The ways through a row of a block, by the state that they lead to. */
+struct survivors {
+    float cost[TRELLIS_STATES];
+    float last[TRELLIS_STATES], second[TRELLIS_STATES]; /* errors one and two columns before, in the row */
+    uint8_t root[TRELLIS_STATES];                       /* the state at the row's begin */
+};
+
+/* What a way has left behind, for the rows to come. */
+struct trail {
+    float edges[BLOCK]
+               [2]; /* the last two errors of each row, in this block where that is done, else in the one before */
+    float above[2][BLOCK]; /* errors two rows and one row above, filtered along the row */
+};
+
+/* What it takes to give a coefficient an index. */
+struct branches {
+    float cost[BRANCHES];
+    float error[BRANCHES];
+    int32_t index[BRANCHES];
+};
+
+/* A coefficient without an even number that all its indices have in common: float32 then has enough places. */
+struct part {
+    float rest;
+    int32_t common;
+};
+
+static struct part part_of(double value) {
+    double size = magnitude(value);
+    if (size < SMALL)
+        return (struct part){(float)value, 0};
+    size = size < LARGEST ? size : LARGEST;
+    int32_t common = ((int32_t)size & -2) - SMALL / 2;
+    float rest = (float)(size - common);
+    return value < 0 ? (struct part){-rest, -common} : (struct part){rest, common};
+}
+
+/* Of each survivor the best even and the best odd index: the nearest below, the nearest above, and none. */
+static void find_branches(const struct choice *c, const struct survivors *ways, float rest, const float *fed,
+                          const float *rates, struct branches *found) {
+    for (int state = 0; state < TRELLIS_STATES; state++) {
+        const float *own = rates + ODD[state] * (LODE_CLASSES * LODE_RATES);
+        float half = ODD[state] ? c->half : 0.0f;
+        float wanted =
+            rest + fed[ways->root[state] * BLOCK] + c->left[0] * ways->last[state] + c->left[1] * ways->second[state];
+        float size = __builtin_fabsf(wanted), sign = __builtin_copysignf(1.0f, wanted);
+        size = size < MOST ? size : MOST;
+        int32_t below = (int32_t)(size + half), flip = wanted < 0 ? -1 : 1;
+        float low = below ? (float)below - half : 0.0f, high = (float)(below + 1) - half;
+        float none = c->weight * (size * size) + own[0];
+        float low_cost = c->weight * ((size - low) * (size - low)) + own[below];
+        float high_cost = c->weight * ((high - size) * (high - size)) + own[below + 1];
+        bool odd = below & 1;
+        float even_cost = odd ? high_cost : low_cost;
+        bool zero = none < even_cost;
+        found->cost[state] = ways->cost[state] + (zero ? none : even_cost);
+        found->error[state] = rest - sign * (zero ? 0.0f : odd ? high : low);
+        found->index[state] = flip * (zero ? 0 : odd ? below + 1 : below);
+        found->cost[TRELLIS_STATES + state] = ways->cost[state] + (odd ? low_cost : high_cost);
+        found->error[TRELLIS_STATES + state] = rest - sign * (odd ? low : high);
+        found->index[TRELLIS_STATES + state] = flip * (odd ? below : below + 1);
+    }
+}
+
+/* One coefficient further: of the two branches into each state the cheaper one. */
+static void advance(struct survivors *ways, const struct branches *found, int32_t common, float *errors, uint8_t *from,
+                    int32_t *indices) {
+    struct survivors next;
+    for (int state = 0; state < TRELLIS_STATES; state++) {
+        int first = ARRIVALS[state][0], second = ARRIVALS[state][1];
+        int branch = found->cost[second] < found->cost[first] ? second : first, before = branch % TRELLIS_STATES;
+        next.cost[state] = found->cost[branch];
+        next.last[state] = errors[state] = found->error[branch];
+        next.second[state] = ways->last[before];
+        next.root[state] = ways->root[before];
+        from[state] = (uint8_t)before;
+        indices[state] = common + found->index[branch];
+    }
+    *ways = next;
+}
+
+/* After row i of a block: hand the trails on to the survivors, each with the row's errors. */
+static void follow(const struct choice *c, int64_t i, int64_t columns, float (*errors)[TRELLIS_STATES],
+                   const uint8_t *from, struct trail *trails) {
+    struct trail next[TRELLIS_STATES];
+    for (int end = 0; end < TRELLIS_STATES; end++) {
+        float own[2 + BLOCK];
+        int state = end;
+        for (int64_t j = columns - 1; j >= 0; j--) {
+            own[2 + j] = errors[j][state];
+            state = from[j * TRELLIS_STATES + state];
+        }
+        struct trail *trail = next + end;
+        *trail = trails[state];
+        memcpy(own, trail->edges[i], sizeof trail->edges[i]);
+        memcpy(trail->edges[i], own + columns, sizeof trail->edges[i]);
+        memcpy(trail->above[0], trail->above[1], sizeof trail->above[0]);
+        for (int64_t j = 0; j < columns; j++)
+            trail->above[1][j] = own[2 + j] + c->left[0] * own[1 + j] + c->left[1] * own[j];
+    }
+    memcpy(trails, next, sizeof next);
+}
 
 static int64_t class_at(const struct choice *c, int64_t at) {
     return c->classes[at] < 0 ? 0 : least(c->classes[at], LODE_CLASSES - 1);
 }
 
-static void add_coefficient(const struct choice *c, int64_t at, int64_t number, double *cost) {
-    struct branch branches[BRANCHES];
-    double size = magnitude(c->relative[at]);
-    for (int odd = 0; odd < 2; odd++) {
-        const double *bits = c->bits + (odd * LODE_CLASSES + class_at(c, at)) * LODE_INDICES;
-        find_branches(size, 0.5 * odd, bits, c->worth, branches + 2 * odd);
+/* Row i of a block, whose first coefficient is number `number` of the row of blocks. */
+static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t columns, int64_t number,
+                       struct survivors *ways, struct trail *trails) {
+    float fed[TRELLIS_STATES][BLOCK], errors[BLOCK][TRELLIS_STATES];
+    for (int state = 0; state < TRELLIS_STATES; state++) {
+        const struct trail *trail = trails + state;
+        for (int j = 0; j < BLOCK; j++)
+            fed[state][j] = c->up[0] * trail->above[1][j] + c->up[1] * trail->above[0][j];
+        ways->second[state] = trail->edges[i][0], ways->last[state] = trail->edges[i][1];
+        ways->root[state] = (uint8_t)state;
     }
-    for (int branch = 0; branch < BRANCHES; branch++)
-        c->indices[BRANCHES * number + branch] = branches[branch].index;
-    c->ways[number] = advance(cost, branches);
+    for (int64_t j = 0; j < columns; j++) {
+        struct part part = part_of(c->relative[at + j]);
+        struct branches found;
+        find_branches(c, ways, part.rest, fed[0] + j, c->rates + class_at(c, at + j) * LODE_RATES, &found);
+        int64_t place = (number + j) * TRELLIS_STATES;
+        advance(ways, &found, part.common, errors[j], c->from + place, c->indices + place);
+    }
+    follow(c, i, columns, errors, c->from + number * TRELLIS_STATES, trails);
 }
 
-/* Take the index of the way into a state; returns the state before. */
-static int take(const struct choice *c, int64_t at, int64_t number, int state) {
-    const uint8_t *way = ARRIVALS[state][c->ways[number] >> state & 1];
-    int odd = ODD[way[0]];
-    int32_t index = c->indices[BRANCHES * number + 2 * odd + way[1]];
-    c->chosen[at] = c->relative[at] >= 0 ? index : -index;
-    c->counts[(odd * LODE_CLASSES + class_at(c, at)) * LODE_INDICES + least(index, LODE_INDICES - 1)] += 1.0;
-    return way[0];
+/* Survivors and trails at the begin of a block: costs count from the least, so that they stay small. */
+static void begin_block(const struct choice *c, int64_t left, struct survivors *ways, struct trail *trails) {
+    int64_t across = c->band[BAND_COLUMNS];
+    float lowest = ways->cost[0];
+    for (int state = 1; state < TRELLIS_STATES; state++)
+        lowest = ways->cost[state] < lowest ? ways->cost[state] : lowest;
+    for (int state = 0; state < TRELLIS_STATES; state++) {
+        ways->cost[state] -= lowest;
+        for (int64_t j = 0; j < least(BLOCK, across - left); j++)
+            for (int row = 0; row < 2; row++)
+                trails[state].above[row][j] = c->above[row * across + left + j];
+    }
+}
+
+/* Take the way that leads into a state at the end of a row of blocks, and keep the errors of its last two rows. */
+static void take(const struct choice *c, int64_t top, int64_t end, int64_t number, int state) {
+    int64_t columns = c->band[BAND_COLUMNS];
+    for (int64_t left = (columns - 1) / BLOCK * BLOCK; left >= 0; left -= BLOCK)
+        for (int64_t i = end - 1; i >= top; i--)
+            for (int64_t j = least(left + BLOCK, columns) - 1; j >= left; j--) {
+                int64_t at = c->band[BAND_OFFSET] + i * c->band[BAND_STRIDE] + j;
+                int32_t index = c->indices[--number * TRELLIS_STATES + state], size = index < 0 ? -index : index;
+                state = c->from[number * TRELLIS_STATES + state];
+                c->chosen[at] = index;
+                c->counts[(ODD[state] * LODE_CLASSES + class_at(c, at)) * LODE_INDICES +
+                          least(size, LODE_INDICES - 1)] += 1.0;
+                double point = size ? (double)size - (ODD[state] ? (double)c->half : 0.0) : 0.0;
+                if (i >= end - 2)
+                    c->above[(i - end + 2) * columns + j] = (float)(c->relative[at] - (index < 0 ? -point : point));
+            }
+}
+
+/* Errors to what is fed back of them along each of two rows, from the end on, as those to the left are still wanted. */
+static void filter_rows(const struct choice *c) {
+    int64_t columns = c->band[BAND_COLUMNS];
+    for (int row = 0; row < 2; row++) {
+        float *errors = c->above + row * columns;
+        for (int64_t j = columns - 1; j >= 2; j--)
+            errors[j] += c->left[0] * errors[j - 1] + c->left[1] * errors[j - 2];
+        if (columns > 1)
+            errors[1] += c->left[0] * errors[0];
+    }
 }
 
 /* Choose the indices of a row of blocks. */
-static void choose(const int64_t *band, int64_t top, const struct choice *c) {
+static void choose(const struct choice *c, int64_t top) {
+    const int64_t *band = c->band;
     int64_t end = least(top + BLOCK, band[BAND_ROWS]), columns = band[BAND_COLUMNS], number = 0;
-    double cost[TRELLIS_STATES];
+    struct survivors ways;
+    struct trail trails[TRELLIS_STATES];
+    memset(trails, 0, sizeof trails);
     for (int state = 0; state < TRELLIS_STATES; state++)
-        cost[state] = state ? __builtin_inf() : 0.0;
-    for (int64_t left = 0; left < columns; left += BLOCK)
-        for (int64_t i = top; i < end; i++)
-            for (int64_t j = left; j < least(left + BLOCK, columns); j++, number++)
-                add_coefficient(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, number, cost);
+        ways.cost[state] = state ? __builtin_inff() : 0.0f;
+    for (int64_t left = 0; left < columns; left += BLOCK) {
+        int64_t width = least(BLOCK, columns - left);
+        begin_block(c, left, &ways, trails);
+        for (int64_t i = top; i < end; i++, number += width)
+            choose_row(c, i - top, band[BAND_OFFSET] + i * band[BAND_STRIDE] + left, width, number, &ways, trails);
+    }
     int state = 0;
     for (int other = 1; other < TRELLIS_STATES; other++)
-        state = cost[other] < cost[state] ? other : state;
-    for (int64_t left = (columns - 1) / BLOCK * BLOCK; left >= 0; left -= BLOCK)
-        for (int64_t i = end - 1; i >= top; i--)
-            for (int64_t j = least(left + BLOCK, columns) - 1; j >= left; j--)
-                state = take(c, band[BAND_OFFSET] + i * band[BAND_STRIDE] + j, --number, state);
+        state = ways.cost[other] < ways.cost[state] ? other : state;
+    take(c, top, end, number, state);
+    filter_rows(c);
 }
 
-int64_t lode_choose(const int64_t *bands, int64_t bands_count, const double *relative, int64_t relative_count,
-                    const int8_t *classes, int64_t classes_count, const double *bits, int64_t bits_count, double worth,
-                    int32_t *chosen, int64_t chosen_count, double *counts, int64_t counts_count, int32_t *indices,
-                    int64_t indices_count, uint8_t *ways, int64_t ways_count) {
-    if (classes_count != relative_count || chosen_count != relative_count ||
-        bits_count != 2 * LODE_CLASSES * LODE_INDICES || counts_count != bits_count || bands_count % BAND_FIELDS)
+int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
+                    const double *relative, int64_t relative_count, const int8_t *classes, int64_t classes_count,
+                    const float *rates, int64_t rates_count, int32_t *chosen, int64_t chosen_count, double *counts,
+                    int64_t counts_count, int32_t *indices, int64_t indices_count, uint8_t *from, int64_t from_count,
+                    float *above, int64_t above_count) {
+    if (classes_count != relative_count || chosen_count != relative_count || bands_count % BAND_FIELDS ||
+        rules_count != bands_count / BAND_FIELDS * RULE || rates_count != 2 * LODE_CLASSES * LODE_RATES ||
+        counts_count != 2 * LODE_CLASSES * LODE_INDICES || from_count != indices_count)
         return LODE_REFUSED;
-    struct choice choice = {relative, classes, bits, worth, chosen, counts, indices, ways};
-    for (int64_t at = 0; at < bands_count; at += BAND_FIELDS) {
-        const int64_t *band = bands + at;
-        if (!is_band(band, relative_count))
+    for (int64_t number = 0; number < bands_count / BAND_FIELDS; number++) {
+        const int64_t *band = bands + number * BAND_FIELDS;
+        const float *rule = rules + number * RULE;
+        int64_t columns = band[BAND_COLUMNS];
+        if (!is_band(band, relative_count) || !(rule[0] >= 0.0f && rule[0] <= 1.0f) ||
+            columns > indices_count / (BLOCK * TRELLIS_STATES) || columns > above_count / 2)
             return LODE_REFUSED;
-        int64_t size = band[BAND_ROWS] * band[BAND_COLUMNS];
-        if (size > ways_count || size > indices_count / BRANCHES)
-            return LODE_REFUSED;
+        struct choice choice = {
+            band,  relative, classes, rates,   rule[0], rule[1], {rule[2], rule[3]}, {rule[4], rule[5]},
+            above, chosen,   counts,  indices, from};
+        for (int64_t j = 0; j < 2 * columns; j++)
+            above[j] = 0.0f;
         for (int64_t top = 0; top < band[BAND_ROWS]; top += BLOCK)
-            choose(band, top, &choice);
+            choose(&choice, top);
     }
     return 0;
 }

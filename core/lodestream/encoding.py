@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .allocation import TileCurve, assign_layers
 from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
+from .closed_loop import ClosedLoop, quantise
 from .container.fields import told, told_roughly
 from .container.model import Errors, Header
 from .container.writer import CodedLayer, CodedSegment, write_container
@@ -23,7 +24,6 @@ from .piece_coder import as_returned, encode_pieces, piece_size
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
 from .quantiser import Quantiser
-from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
 from .reconstruction import Picture, channel_picture, initial_state, to_values
 from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
@@ -37,9 +37,6 @@ __all__ = ["Encoding", "UnreachableError"]
 #: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
 #: whose tiles are all known is inverted without errors of rounding.
 _ROUNDING = 0.2
-
-#: The step of a stream made for one error, over the error, that is tried first.
-_LIKELY_STEP = 6
 
 #: The share of the bytes that errors of windows may take.
 _WINDOWS_SHARE = 0.005
@@ -74,6 +71,7 @@ class Encoding:
     ) -> None:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
+        self._loops: list[ClosedLoop] = []
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
@@ -146,47 +144,36 @@ class Encoding:
         )
 
     def _quantise(self, wanted: float) -> None:
-        """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
-        table, channels = self.tables[0], self.channels[: self.geometric]
-        choosers = [IndexChooser(table, channel.true) for channel in channels]
-        state, canvases = np.zeros_like(self._all_passes()), self._canvases()
-        kept: dict[int, list[NDArray[np.int32]]] = {}
-        done: list[int] = []
+        """Choose indices, with the longest steps whose error is at most the one wanted."""
+        table, canvases = self.tables[0], self._canvases()
 
-        def error(base: int) -> float:
-            self.quantiser = Quantiser(base)
-            found = [chooser.indices(self.quantiser) for chooser in choosers]
-            self.tiles = [Tiles(table, self.quantiser) for _ in choosers]
-            for tiles, indices in zip(self.tiles, found, strict=True):
-                tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
-            self.header = self._header()
-            done.append(base)
-            self.progress(0.1 + 0.2 * len(done) / MOST_TRIES)
-            rms = told(self._distances(state, canvases)[0][0])
-            if rms <= wanted:
-                kept.clear()
-                kept[base] = found
-            return rms
+        def error() -> float:
+            return told(self._distances_of(canvases, [0] * self.geometric)[0][0])
 
-        base = longest_base(error, wanted, _LIKELY_STEP * self.fineness)
-        if base is None:
+        found = quantise(self._loops, canvases, error, wanted, self.fineness, lambda done: self.progress(0.1 + 0.2 * done))
+        if found is None:
             raise UnreachableError
-        self.quantiser = Quantiser(base)
+        self.quantiser, indices = found
+        self._loops.clear()
         squares = table.steps(self.quantiser).astype(np.float64) ** 2
-        for channel, indices in zip(channels, kept[base], strict=True):
-            channel.true, channel.weights = indices, channel.weights * squares
-            channel.top = np.array([planes_of(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
+        for channel, own in zip(self.channels, indices, strict=False):  # those behind the coordinates stay
+            channel.true, channel.weights = own, channel.weights * squares
+            channel.top = np.array([planes_of(table, own, tile) for tile in range(len(self.layout.tiles))], np.int8)
 
     def _transform(self, number: int, lattice: Lattice) -> tuple[Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
+        quantised = self.prepared.rms is not None and number < self.geometric
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
+            coordinates = [array.copy() for array in arrays] if quantised else []
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
         table = self._table(number)
         true = gather(table, arrays)
+        if quantised:
+            self._loops.append(ClosedLoop(table, predictors, coordinates))
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
         span = self.prepared.extent if number < self.geometric else self._span(number)
@@ -248,6 +235,15 @@ class Encoding:
         for number in range(self.geometric):
             places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
             fractions.append(self._picture(number, state, places)[1])
+        return self._distances_of(canvases, fractions, cells)
+
+    def _distances_of(
+        self,
+        canvases: list[NDArray[np.int32]],
+        fractions: list[int],
+        cells: list[NDArray[np.float64]] | None = None,
+    ) -> list[tuple[float, float]]:
+        """Errors of coordinates over two to these powers."""
         lattices = self.lattices[: self.geometric]
         shown = canvases[self._curves_first :]
         return coordinate_distances(self.prepared.originals, lattices, shown, fractions, cells=cells)

@@ -23,9 +23,14 @@ from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitte
 __all__ = [
     "PADDING",
     "allocate",
+    "bare_level",
     "forward",
     "inverse",
+    "inverse_level",
     "synthesis_norms",
+    "synthesised",
+    "take_details",
+    "take_nodes",
 ]
 
 #: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
@@ -106,27 +111,40 @@ def inverse(
 
     Of a channel that is no ``coordinate`` no side comes from a curve, and curves mean nothing.
     """
-    takes = coordinate and layout.shared
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.curve]
-    if takes:
-        _take_nodes(arrays, layout)
+    if coordinate:
+        take_nodes(arrays, layout)
     for finer in range(1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
                 corner = _corner(arrays[k], layout.shape(k, whole))
                 np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
                 corner <<= FRACTION_BITS
-            grid, steps = layout.grids[k], layout.steps(k, finer)
-            corner = _corner(arrays[k], layout.shape(k, finer))
-            if takes and not grid.curve:
-                _take_details(arrays, layout, predictors, k, finer)
-            for axis in (1, 0):
-                if steps[axis].midpoints:
-                    inverse_step(corner, axis, steps[axis], predictor(predictors, grid, steps[axis], finer, axis))
+            if coordinate:
+                take_details(arrays, layout, predictors, k, finer)
+            inverse_level(arrays[k], layout, predictors, k, finer)
 
 
-def _take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from curves: their common ends first, then the sides of parts."""
+def inverse_level(
+    array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
+) -> None:
+    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in (1, 0):
+        if steps[axis].midpoints:
+            inverse_step(corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis))
+
+
+def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
+    """Turn a level of a grid into nodes of the level below and details before the third step, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in range(2):
+        if steps[axis].midpoints:
+            forward_step(corner, axis, steps[axis], (0, 0))
+
+
+def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
+    """Level 0 of what comes from curves, in place: their common ends first, then the sides of parts."""
     for k, grid in enumerate(layout.grids):
         rows, columns = layout.shape(k, 0)
         for side, source in enumerate(grid.sources):
@@ -147,11 +165,13 @@ def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source,
     return points[::-1] if source.reversed else points
 
 
-def _take_details(
+def take_details(
     arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], part: int, level: int
 ) -> None:
-    """The details along a part's sides that come from curves."""
+    """The details along a part's sides that come from curves, in place: curves are at ``level`` already."""
     grid, steps = layout.grids[part], layout.steps(part, level)
+    if grid.curve:
+        return
     rows, columns = (step.coarse for step in steps)
     for side, source in enumerate(grid.sources):
         axis = 1 if side < 2 else 0
@@ -309,13 +329,13 @@ def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[
     nodes[0, 8] = 1.0
     (details if stepping[0][0] == first else nodes)[1, 8] = 1.0
     for _, a, b in stepping[:_NORM_LEVELS]:
-        nodes = _synthesised(nodes, details, a, b)
+        nodes = synthesised(nodes, details, a, b)
         details = np.zeros_like(nodes)
     squares = (nodes * nodes).sum(axis=1) * 2.0 ** max(0, len(stepping) - _NORM_LEVELS)
     return float(squares[0]), float(squares[1])
 
 
-def _synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
+def synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
     """One inverse step of closed lines without rounding; float64, shape (line, sample)."""
     count = nodes.shape[1]
     c = np.concatenate([nodes[:, -2:], nodes, nodes[:, :3]], axis=1)
