@@ -180,16 +180,15 @@ LODE_API int64_t lode_classify(const int64_t *bands, int64_t bands_count, const 
  * chosen:   the indices with their signs.
  * counts:   (2, LODE_CLASSES, LODE_INDICES): increased by 1 for each index that was chosen; the last one of a class
  *           stands for all that are larger.
- * indices, from, above: room to work in, for each column of the widest band 64, 64 and 2.
+ * ways, above: room to work in, 64 and 2 for each column of the widest band.
  *
  * Returns 0.
  */
 LODE_API int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
                              const double *relative, int64_t relative_count, const int8_t *classes,
                              int64_t classes_count, const float *rates, int64_t rates_count, int32_t *chosen,
-                             int64_t chosen_count, double *counts, int64_t counts_count, int32_t *indices,
-                             int64_t indices_count, uint8_t *from, int64_t from_count, float *above,
-                             int64_t above_count);
+                             int64_t chosen_count, double *counts, int64_t counts_count, int16_t *ways,
+                             int64_t ways_count, float *above, int64_t above_count);
 
 /* lzf.c ---------------------------------------------------------------------------------------------------------- */
 

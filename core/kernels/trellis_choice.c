@@ -14,21 +14,26 @@
 #include "lodestream.h"
 #include "trellis.h"
 
+#define LODE_INLINE static inline __attribute__((always_inline))
+
 enum {
-    BLOCK = 8,                     /* rows and columns of the blocks in whose order a band is coded */
-    FIRST_CLASS = 8,               /* of coefficients of about a step */
-    BRANCHES = 2 * TRELLIS_STATES, /* the best even index of each state, then the best odd one of each */
-    RULE = 6,                      /* numbers that a band's rule has */
-    SMALL = 32,                    /* below it, coefficients are worked on as they are */
-    MOST = 61,                     /* in the search for an index: two above it have a rate, too */
+    BLOCK = 8,       /* rows and columns of the blocks in whose order a band is coded */
+    FIRST_CLASS = 8, /* of coefficients of about a step */
+    LANES = TRELLIS_STATES,
+    PAIRS = LANES / 2,
+    RULE = 6,   /* numbers that a band's rule has */
+    SMALL = 32, /* below it, coefficients are worked on as they are */
+    MOST = 61,  /* in the search for an index: two above it have a rate, too */
     LARGEST = (1 << 28) - 2 * LODE_RATES,
 };
 
-/* The two branches into each state, by the state that they come from, plus TRELLIS_STATES where the index is odd; the
- * lower state first. */
-static const uint8_t ARRIVALS[TRELLIS_STATES][2] = {
-    {0, 8 + 4}, {2, 8 + 6}, {8 + 0, 4}, {8 + 2, 6}, {8 + 3, 5}, {1, 8 + 7}, {3, 8 + 5}, {8 + 1, 7},
-};
+/* The states in the order in which they are worked on, which makes vectors of all arithmetic: those that a coefficient
+ * leads into pairwise, {0, 2} from 0 and 4, {1, 3} from 2 and 6, {5, 7} from 1 and 7, {6, 4} from 3 and 5, come from
+ * the same place of either half. The first of a pair takes an even index from the first half or an odd one from the
+ * second half, the other one the reverse. */
+static const uint8_t STATES[LANES] = {0, 2, 1, 3, 4, 6, 7, 5};
+/* Where the pairs' first states stand, then the other ones. */
+static const uint8_t PLACES[LANES] = {0, 2, 7, 5, 1, 3, 6, 4};
 
 static int64_t least(int64_t a, int64_t b) {
     return a < b ? a : b;
@@ -122,36 +127,34 @@ struct choice {
     const double *relative;
     const int8_t *classes;
     const float *rates;
-    float half;    /* how far below an index its point lies in the odd quantiser */
-    float weight;  /* of a squared error */
-    float up[2];   /* what is fed back of errors one and two rows above, */
-    float left[2]; /* and one and two columns to the left */
-    float *above;  /* errors of the two rows above the row of blocks, the upper one first, filtered along the rows */
+    float half[LANES]; /* how far below an index its point lies */
+    float weight;      /* of a squared error */
+    float up[2];       /* what is fed back of errors one and two rows above, */
+    float left[2];     /* and one and two columns to the left */
+    float *above; /* errors of the two rows above the row of blocks, the upper one first, filtered along the rows */
     int32_t *chosen;
     double *counts;
-    int32_t *indices;
-    uint8_t *from;
+    int16_t *ways;
 };
 
 /* The ways through a row of a block, by the state that they lead to. */
 struct survivors {
-    float cost[TRELLIS_STATES];
-    float last[TRELLIS_STATES], second[TRELLIS_STATES]; /* errors one and two columns before, in the row */
-    uint8_t root[TRELLIS_STATES];                       /* the state at the row's begin */
+    float cost[LANES];
+    float last[LANES], second[LANES]; /* errors one and two columns before, in the row */
+    int32_t root[LANES];              /* the lane at the row's begin */
 };
 
 /* What a way has left behind, for the rows to come. */
 struct trail {
-    float edges[BLOCK]
-               [2]; /* the last two errors of each row, in this block where that is done, else in the one before */
+    float edges[BLOCK][2]; /* last two errors of each row: of this block where that is done, else of the one before */
     float above[2][BLOCK]; /* errors two rows and one row above, filtered along the row */
 };
 
-/* What it takes to give a coefficient an index. */
+/* What it takes to give a coefficient an even index and an odd one. */
 struct branches {
-    float cost[BRANCHES];
-    float error[BRANCHES];
-    int32_t index[BRANCHES];
+    float cost[2][LANES];
+    float error[2][LANES];
+    int32_t index[2][LANES];
 };
 
 /* A coefficient without an even number that all its indices have in common: float32 then has enough places. */
@@ -171,62 +174,84 @@ static struct part part_of(double value) {
 }
 
 /* Of each survivor the best even and the best odd index: the nearest below, the nearest above, and none. */
-static void find_branches(const struct choice *c, const struct survivors *ways, float rest, const float *fed,
-                          const float *rates, struct branches *found) {
-    for (int state = 0; state < TRELLIS_STATES; state++) {
-        const float *own = rates + ODD[state] * (LODE_CLASSES * LODE_RATES);
-        float half = ODD[state] ? c->half : 0.0f;
-        float wanted =
-            rest + fed[ways->root[state] * BLOCK] + c->left[0] * ways->last[state] + c->left[1] * ways->second[state];
-        float size = __builtin_fabsf(wanted), sign = __builtin_copysignf(1.0f, wanted);
-        size = size < MOST ? size : MOST;
-        int32_t below = (int32_t)(size + half), flip = wanted < 0 ? -1 : 1;
-        float low = below ? (float)below - half : 0.0f, high = (float)(below + 1) - half;
-        float none = c->weight * (size * size) + own[0];
-        float low_cost = c->weight * ((size - low) * (size - low)) + own[below];
-        float high_cost = c->weight * ((high - size) * (high - size)) + own[below + 1];
-        bool odd = below & 1;
-        float even_cost = odd ? high_cost : low_cost;
-        bool zero = none < even_cost;
-        found->cost[state] = ways->cost[state] + (zero ? none : even_cost);
-        found->error[state] = rest - sign * (zero ? 0.0f : odd ? high : low);
-        found->index[state] = flip * (zero ? 0 : odd ? below + 1 : below);
-        found->cost[TRELLIS_STATES + state] = ways->cost[state] + (odd ? low_cost : high_cost);
-        found->error[TRELLIS_STATES + state] = rest - sign * (odd ? low : high);
-        found->index[TRELLIS_STATES + state] = flip * (odd ? below : below + 1);
+LODE_INLINE void find_branches(const struct choice *c, const struct survivors *s, float rest, const float *fed,
+                               const float *rates, struct branches *found) {
+    float wanted[LANES], size[LANES], low_rate[LANES], high_rate[LANES];
+    int32_t below[LANES];
+    for (int lane = 0; lane < LANES; lane++)
+        wanted[lane] = fed[s->root[lane] * BLOCK];
+    for (int lane = 0; lane < LANES; lane++) {
+        wanted[lane] += rest + c->left[0] * s->last[lane] + c->left[1] * s->second[lane];
+        float magnitude = wanted[lane] < 0 ? -wanted[lane] : wanted[lane];
+        size[lane] = magnitude < MOST ? magnitude : MOST;
+        below[lane] = (int32_t)(size[lane] + c->half[lane]);
+    }
+    const float *even_rates = rates, *odd_rates = rates + LODE_CLASSES * LODE_RATES;
+    for (int lane = 0; lane < LANES; lane++) {
+        const float *own = (lane & 2 ? odd_rates : even_rates) + below[lane];
+        low_rate[lane] = own[0], high_rate[lane] = own[1];
+    }
+    float none_rates[2] = {even_rates[0], odd_rates[0]};
+    for (int lane = 0; lane < LANES; lane++) {
+        float low = (float)below[lane] - c->half[lane], high = low + 1.0f;
+        low = low < 0 ? 0 : low; /* index 0 */
+        float none_cost = c->weight * (size[lane] * size[lane]) + none_rates[lane >> 1 & 1];
+        float low_cost = c->weight * ((size[lane] - low) * (size[lane] - low)) + low_rate[lane];
+        float high_cost = c->weight * ((high - size[lane]) * (high - size[lane])) + high_rate[lane];
+        int32_t odd = below[lane] & 1, flip = wanted[lane] < 0 ? -1 : 1;
+        float even_cost = odd ? high_cost : low_cost, odd_cost = odd ? low_cost : high_cost;
+        float even = odd ? high : low;
+        int32_t even_index = below[lane] + odd;
+        bool zero = none_cost < even_cost;
+        even = zero ? 0 : even;
+        even_index = zero ? 0 : even_index;
+        found->cost[0][lane] = s->cost[lane] + (zero ? none_cost : even_cost);
+        found->cost[1][lane] = s->cost[lane] + odd_cost;
+        found->error[0][lane] = rest - (float)flip * even;
+        found->error[1][lane] = rest - (float)flip * (odd ? low : high);
+        found->index[0][lane] = flip * even_index;
+        found->index[1][lane] = flip * (below[lane] + 1 - odd);
     }
 }
 
-/* One coefficient further: of the two branches into each state the cheaper one. */
-static void advance(struct survivors *ways, const struct branches *found, int32_t common, float *errors, uint8_t *from,
-                    int32_t *indices) {
-    struct survivors next;
-    for (int state = 0; state < TRELLIS_STATES; state++) {
-        int first = ARRIVALS[state][0], second = ARRIVALS[state][1];
-        int branch = found->cost[second] < found->cost[first] ? second : first, before = branch % TRELLIS_STATES;
-        next.cost[state] = found->cost[branch];
-        next.last[state] = errors[state] = found->error[branch];
-        next.second[state] = ways->last[before];
-        next.root[state] = ways->root[before];
-        from[state] = (uint8_t)before;
-        indices[state] = common + found->index[branch];
+/* One coefficient further: of the two branches into each state the cheaper one. A way is an index times LANES, plus the
+ * lane that it comes from. */
+LODE_INLINE void advance(struct survivors *s, const struct branches *found, float *errors, int16_t *ways) {
+    float cost[LANES], error[LANES], last[LANES];
+    int32_t root[LANES], way[LANES];
+    for (int other = 0; other < 2; other++)
+        for (int i = 0; i < PAIRS; i++) {
+            int to = other * PAIRS + i, j = PAIRS + i;
+            bool takes = found->cost[1 - other][j] < found->cost[other][i];
+            cost[to] = takes ? found->cost[1 - other][j] : found->cost[other][i];
+            error[to] = takes ? found->error[1 - other][j] : found->error[other][i];
+            way[to] = takes ? found->index[1 - other][j] * LANES + j : found->index[other][i] * LANES + i;
+            last[to] = takes ? s->last[j] : s->last[i];
+            root[to] = takes ? s->root[j] : s->root[i];
+        }
+    for (int to = 0; to < LANES; to++) {
+        int lane = PLACES[to];
+        s->cost[lane] = cost[to];
+        s->last[lane] = errors[lane] = error[to];
+        s->second[lane] = last[to];
+        s->root[lane] = root[to];
+        ways[lane] = (int16_t)way[to];
     }
-    *ways = next;
 }
 
 /* After row i of a block: hand the trails on to the survivors, each with the row's errors. */
-static void follow(const struct choice *c, int64_t i, int64_t columns, float (*errors)[TRELLIS_STATES],
-                   const uint8_t *from, struct trail *trails) {
-    struct trail next[TRELLIS_STATES];
-    for (int end = 0; end < TRELLIS_STATES; end++) {
+static void follow(const struct choice *c, int64_t i, int64_t columns, float (*errors)[LANES], const int16_t *ways,
+                   struct trail *trails) {
+    struct trail next[LANES];
+    for (int end = 0; end < LANES; end++) {
         float own[2 + BLOCK];
-        int state = end;
+        int lane = end;
         for (int64_t j = columns - 1; j >= 0; j--) {
-            own[2 + j] = errors[j][state];
-            state = from[j * TRELLIS_STATES + state];
+            own[2 + j] = errors[j][lane];
+            lane = ways[j * LANES + lane] & (LANES - 1);
         }
         struct trail *trail = next + end;
-        *trail = trails[state];
+        *trail = trails[lane];
         memcpy(own, trail->edges[i], sizeof trail->edges[i]);
         memcpy(trail->edges[i], own + columns, sizeof trail->edges[i]);
         memcpy(trail->above[0], trail->above[1], sizeof trail->above[0]);
@@ -242,52 +267,54 @@ static int64_t class_at(const struct choice *c, int64_t at) {
 
 /* Row i of a block, whose first coefficient is number `number` of the row of blocks. */
 static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t columns, int64_t number,
-                       struct survivors *ways, struct trail *trails) {
-    float fed[TRELLIS_STATES][BLOCK], errors[BLOCK][TRELLIS_STATES];
-    for (int state = 0; state < TRELLIS_STATES; state++) {
-        const struct trail *trail = trails + state;
+                       struct survivors *s, struct trail *trails) {
+    float fed[LANES][BLOCK], errors[BLOCK][LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+        const struct trail *trail = trails + lane;
         for (int j = 0; j < BLOCK; j++)
-            fed[state][j] = c->up[0] * trail->above[1][j] + c->up[1] * trail->above[0][j];
-        ways->second[state] = trail->edges[i][0], ways->last[state] = trail->edges[i][1];
-        ways->root[state] = (uint8_t)state;
+            fed[lane][j] = c->up[0] * trail->above[1][j] + c->up[1] * trail->above[0][j];
+        s->second[lane] = trail->edges[i][0], s->last[lane] = trail->edges[i][1];
+        s->root[lane] = lane;
     }
+    int16_t *ways = c->ways + number * LANES;
     for (int64_t j = 0; j < columns; j++) {
-        struct part part = part_of(c->relative[at + j]);
         struct branches found;
-        find_branches(c, ways, part.rest, fed[0] + j, c->rates + class_at(c, at + j) * LODE_RATES, &found);
-        int64_t place = (number + j) * TRELLIS_STATES;
-        advance(ways, &found, part.common, errors[j], c->from + place, c->indices + place);
+        const float *rates = c->rates + class_at(c, at + j) * LODE_RATES;
+        find_branches(c, s, part_of(c->relative[at + j]).rest, fed[0] + j, rates, &found);
+        advance(s, &found, errors[j], ways + j * LANES);
     }
-    follow(c, i, columns, errors, c->from + number * TRELLIS_STATES, trails);
+    follow(c, i, columns, errors, ways, trails);
 }
 
 /* Survivors and trails at the begin of a block: costs count from the least, so that they stay small. */
-static void begin_block(const struct choice *c, int64_t left, struct survivors *ways, struct trail *trails) {
+static void begin_block(const struct choice *c, int64_t left, struct survivors *s, struct trail *trails) {
     int64_t across = c->band[BAND_COLUMNS];
-    float lowest = ways->cost[0];
-    for (int state = 1; state < TRELLIS_STATES; state++)
-        lowest = ways->cost[state] < lowest ? ways->cost[state] : lowest;
-    for (int state = 0; state < TRELLIS_STATES; state++) {
-        ways->cost[state] -= lowest;
+    float lowest = s->cost[0];
+    for (int lane = 1; lane < LANES; lane++)
+        lowest = s->cost[lane] < lowest ? s->cost[lane] : lowest;
+    for (int lane = 0; lane < LANES; lane++) {
+        s->cost[lane] -= lowest;
         for (int64_t j = 0; j < least(BLOCK, across - left); j++)
             for (int row = 0; row < 2; row++)
-                trails[state].above[row][j] = c->above[row * across + left + j];
+                trails[lane].above[row][j] = c->above[row * across + left + j];
     }
 }
 
-/* Take the way that leads into a state at the end of a row of blocks, and keep the errors of its last two rows. */
-static void take(const struct choice *c, int64_t top, int64_t end, int64_t number, int state) {
+/* Take the way that ends in a lane at the end of a row of blocks, and keep the errors of its last two rows. */
+static void take(const struct choice *c, int64_t top, int64_t end, int64_t number, int lane) {
     int64_t columns = c->band[BAND_COLUMNS];
     for (int64_t left = (columns - 1) / BLOCK * BLOCK; left >= 0; left -= BLOCK)
         for (int64_t i = end - 1; i >= top; i--)
             for (int64_t j = least(left + BLOCK, columns) - 1; j >= left; j--) {
                 int64_t at = c->band[BAND_OFFSET] + i * c->band[BAND_STRIDE] + j;
-                int32_t index = c->indices[--number * TRELLIS_STATES + state], size = index < 0 ? -index : index;
-                state = c->from[number * TRELLIS_STATES + state];
+                int32_t way = c->ways[--number * LANES + lane];
+                lane = way & (LANES - 1);
+                int32_t index = part_of(c->relative[at]).common + (way - lane) / LANES;
+                int32_t size = index < 0 ? -index : index;
+                int odd = ODD[STATES[lane]];
                 c->chosen[at] = index;
-                c->counts[(ODD[state] * LODE_CLASSES + class_at(c, at)) * LODE_INDICES +
-                          least(size, LODE_INDICES - 1)] += 1.0;
-                double point = size ? (double)size - (ODD[state] ? (double)c->half : 0.0) : 0.0;
+                c->counts[(odd * LODE_CLASSES + class_at(c, at)) * LODE_INDICES + least(size, LODE_INDICES - 1)] += 1.0;
+                double point = size ? (double)size - (double)c->half[lane] : 0.0;
                 if (i >= end - 2)
                     c->above[(i - end + 2) * columns + j] = (float)(c->relative[at] - (index < 0 ? -point : point));
             }
@@ -309,43 +336,46 @@ static void filter_rows(const struct choice *c) {
 static void choose(const struct choice *c, int64_t top) {
     const int64_t *band = c->band;
     int64_t end = least(top + BLOCK, band[BAND_ROWS]), columns = band[BAND_COLUMNS], number = 0;
-    struct survivors ways;
-    struct trail trails[TRELLIS_STATES];
+    struct survivors s;
+    struct trail trails[LANES];
     memset(trails, 0, sizeof trails);
-    for (int state = 0; state < TRELLIS_STATES; state++)
-        ways.cost[state] = state ? __builtin_inff() : 0.0f;
+    for (int lane = 0; lane < LANES; lane++)
+        s.cost[lane] = lane ? __builtin_inff() : 0.0f;
     for (int64_t left = 0; left < columns; left += BLOCK) {
         int64_t width = least(BLOCK, columns - left);
-        begin_block(c, left, &ways, trails);
+        begin_block(c, left, &s, trails);
         for (int64_t i = top; i < end; i++, number += width)
-            choose_row(c, i - top, band[BAND_OFFSET] + i * band[BAND_STRIDE] + left, width, number, &ways, trails);
+            choose_row(c, i - top, band[BAND_OFFSET] + i * band[BAND_STRIDE] + left, width, number, &s, trails);
     }
-    int state = 0;
-    for (int other = 1; other < TRELLIS_STATES; other++)
-        state = ways.cost[other] < ways.cost[state] ? other : state;
-    take(c, top, end, number, state);
+    int lane = 0;
+    for (int other = 1; other < LANES; other++)
+        lane = s.cost[other] < s.cost[lane] ? other : lane;
+    take(c, top, end, number, lane);
     filter_rows(c);
 }
 
 int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
                     const double *relative, int64_t relative_count, const int8_t *classes, int64_t classes_count,
                     const float *rates, int64_t rates_count, int32_t *chosen, int64_t chosen_count, double *counts,
-                    int64_t counts_count, int32_t *indices, int64_t indices_count, uint8_t *from, int64_t from_count,
-                    float *above, int64_t above_count) {
+                    int64_t counts_count, int16_t *ways, int64_t ways_count, float *above, int64_t above_count) {
     if (classes_count != relative_count || chosen_count != relative_count || bands_count % BAND_FIELDS ||
         rules_count != bands_count / BAND_FIELDS * RULE || rates_count != 2 * LODE_CLASSES * LODE_RATES ||
-        counts_count != 2 * LODE_CLASSES * LODE_INDICES || from_count != indices_count)
+        counts_count != 2 * LODE_CLASSES * LODE_INDICES)
         return LODE_REFUSED;
     for (int64_t number = 0; number < bands_count / BAND_FIELDS; number++) {
         const int64_t *band = bands + number * BAND_FIELDS;
         const float *rule = rules + number * RULE;
         int64_t columns = band[BAND_COLUMNS];
         if (!is_band(band, relative_count) || !(rule[0] >= 0.0f && rule[0] <= 1.0f) ||
-            columns > indices_count / (BLOCK * TRELLIS_STATES) || columns > above_count / 2)
+            columns > ways_count / (BLOCK * LANES) || columns > above_count / 2)
             return LODE_REFUSED;
-        struct choice choice = {
-            band,  relative, classes, rates,   rule[0], rule[1], {rule[2], rule[3]}, {rule[4], rule[5]},
-            above, chosen,   counts,  indices, from};
+        struct choice choice = {.band = band, .relative = relative, .classes = classes, .rates = rates};
+        choice.weight = rule[1];
+        for (int k = 0; k < 2; k++)
+            choice.up[k] = rule[2 + k], choice.left[k] = rule[4 + k];
+        for (int lane = 0; lane < LANES; lane++)
+            choice.half[lane] = ODD[STATES[lane]] ? rule[0] : 0.0f;
+        choice.above = above, choice.chosen = chosen, choice.counts = counts, choice.ways = ways;
         for (int64_t j = 0; j < 2 * columns; j++)
             above[j] = 0.0f;
         for (int64_t top = 0; top < band[BAND_ROWS]; top += BLOCK)

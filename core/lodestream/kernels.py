@@ -266,7 +266,7 @@ def _described(values: tuple[Any, ...]) -> str:
     return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
-_BOOL, _I8, _U8, _I32, _I64 = np.bool_, np.int8, np.uint8, np.int32, np.int64
+_BOOL, _I8, _U8, _I16, _I32, _I64 = np.bool_, np.int8, np.uint8, np.int16, np.int32, np.int64
 _F32, _F64 = np.float32, np.float64
 
 # lifting.c
@@ -296,7 +296,7 @@ classify = Kernel("classify", reads(_I64), reads(_I64), reads(_I32), writes(_F64
 choose = Kernel(
     "choose",
     *[reads(_I64), reads(_F32), reads(_F64), reads(_I8), reads(_F32)],
-    *[writes(_I32), writes(_F64), writes(_I32), writes(_U8), writes(_F32)],
+    *[writes(_I32), writes(_F64), writes(_I16), writes(_F32)],
 )
 
 # lzf.c

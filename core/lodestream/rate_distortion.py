@@ -57,8 +57,7 @@ class IndexChooser:
         self._bits = _laplace()
         widest = int(table.bands[:, COLUMNS].max(initial=0))
         # What the kernel works in: of a row of blocks, for each survivor.
-        room = 8 * TRANSITIONS.shape[0] * widest
-        self._room = np.empty(room, np.int32), np.empty(room, np.uint8), np.empty(2 * widest, np.float32)
+        self._room = np.empty(8 * len(TRANSITIONS) * widest, np.int16), np.empty(2 * widest, np.float32)
 
     def begin(self, quantiser: Quantiser) -> None:
         """Choose all indices anew; what was learned of the last ones serves, with other steps, too."""
