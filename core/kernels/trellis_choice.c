@@ -20,20 +20,42 @@ enum {
     BLOCK = 8,       /* rows and columns of the blocks in whose order a band is coded */
     FIRST_CLASS = 8, /* of coefficients of about a step */
     LANES = TRELLIS_STATES,
-    PAIRS = LANES / 2,
-    RULE = 6,   /* numbers that a band's rule has */
-    SMALL = 32, /* below it, coefficients are worked on as they are */
-    MOST = 61,  /* in the search for an index: two above it have a rate, too */
+    PLACES = LANES / 2, /* of a half */
+    RULE = 6,           /* numbers that a band's rule has */
+    SMALL = 32,         /* below it, coefficients are worked on as they are */
+    MOST = 61,          /* in the search for an index: two above it have a rate, too */
     LARGEST = (1 << 28) - 2 * LODE_RATES,
 };
 
-/* The states in the order in which they are worked on, which makes vectors of all arithmetic: those that a coefficient
- * leads into pairwise, {0, 2} from 0 and 4, {1, 3} from 2 and 6, {5, 7} from 1 and 7, {6, 4} from 3 and 5, come from
- * the same place of either half. The first of a pair takes an even index from the first half or an odd one from the
- * second half, the other one the reverse. */
-static const uint8_t STATES[LANES] = {0, 2, 1, 3, 4, 6, 7, 5};
-/* Where the pairs' first states stand, then the other ones. */
-static const uint8_t PLACES[LANES] = {0, 2, 7, 5, 1, 3, 6, 4};
+/* States are worked on four at a time, as two halves. What a coefficient leads into comes pairwise from the same place
+ * of either half: {0, 2} from 0 and 4, {1, 3} from 2 and 6, {5, 7} from 1 and 7, {6, 4} from 3 and 5. The first of a
+ * pair takes an even index from the first half or an odd one from the second half, the other one the reverse. */
+static const uint8_t STATES[TRELLIS_STATES] = {0, 2, 1, 3, 4, 6, 7, 5};
+
+typedef float floats_t __attribute__((vector_size(16)));
+typedef int32_t ints_t __attribute__((vector_size(16)));
+
+/* Of each place the first where the mask is set, else the second. */
+LODE_INLINE ints_t either(ints_t mask, ints_t first, ints_t second) {
+    return (mask & first) | (~mask & second);
+}
+
+LODE_INLINE floats_t either_float(ints_t mask, floats_t first, floats_t second) {
+    return (floats_t)either(mask, (ints_t)first, (ints_t)second);
+}
+
+/* The halves after a coefficient, from the first and the second state of each pair. */
+LODE_INLINE void arrange(const ints_t *pairs, ints_t *halves) {
+    ints_t x = pairs[0], y = pairs[1];
+    halves[0] = (ints_t){x[0], y[0], x[1], y[1]};
+    halves[1] = (ints_t){y[3], x[3], y[2], x[2]};
+}
+
+LODE_INLINE void arrange_floats(const floats_t *pairs, floats_t *halves) {
+    floats_t x = pairs[0], y = pairs[1];
+    halves[0] = (floats_t){x[0], y[0], x[1], y[1]};
+    halves[1] = (floats_t){y[3], x[3], y[2], x[2]};
+}
 
 static int64_t least(int64_t a, int64_t b) {
     return a < b ? a : b;
@@ -127,11 +149,11 @@ struct choice {
     const double *relative;
     const int8_t *classes;
     const float *rates;
-    float half[LANES]; /* how far below an index its point lies */
-    float weight;      /* of a squared error */
-    float up[2];       /* what is fed back of errors one and two rows above, */
-    float left[2];     /* and one and two columns to the left */
-    float *above; /* errors of the two rows above the row of blocks, the upper one first, filtered along the rows */
+    floats_t half; /* how far below an index its point lies, by the place of a state */
+    float weight;  /* of a squared error */
+    float up[2];   /* what is fed back of errors one and two rows above, */
+    float left[2]; /* and one and two columns to the left */
+    float *above;  /* errors of the two rows above the row of blocks, the upper one first, filtered along the rows */
     int32_t *chosen;
     double *counts;
     int16_t *ways;
@@ -139,9 +161,9 @@ struct choice {
 
 /* The ways through a row of a block, by the state that they lead to. */
 struct survivors {
-    float cost[LANES];
-    float last[LANES], second[LANES]; /* errors one and two columns before, in the row */
-    int32_t root[LANES];              /* the lane at the row's begin */
+    floats_t cost[2];
+    floats_t last[2], second[2]; /* errors one and two columns before, in the row */
+    ints_t root[2];              /* the lane at the row's begin */
 };
 
 /* What a way has left behind, for the rows to come. */
@@ -150,11 +172,11 @@ struct trail {
     float above[2][BLOCK]; /* errors two rows and one row above, filtered along the row */
 };
 
-/* What it takes to give a coefficient an even index and an odd one. */
+/* What it takes to give a coefficient an even index and an odd one, for each half. */
 struct branches {
-    float cost[2][LANES];
-    float error[2][LANES];
-    int32_t index[2][LANES];
+    floats_t cost[2][2];
+    floats_t error[2][2];
+    ints_t index[2][2];
 };
 
 /* A coefficient without an even number that all its indices have in common: float32 then has enough places. */
@@ -176,67 +198,62 @@ static struct part part_of(double value) {
 /* Of each survivor the best even and the best odd index: the nearest below, the nearest above, and none. */
 LODE_INLINE void find_branches(const struct choice *c, const struct survivors *s, float rest, const float *fed,
                                const float *rates, struct branches *found) {
-    float wanted[LANES], size[LANES], low_rate[LANES], high_rate[LANES];
-    int32_t below[LANES];
-    for (int lane = 0; lane < LANES; lane++)
-        wanted[lane] = fed[s->root[lane] * BLOCK];
-    for (int lane = 0; lane < LANES; lane++) {
-        wanted[lane] += rest + c->left[0] * s->last[lane] + c->left[1] * s->second[lane];
-        float magnitude = wanted[lane] < 0 ? -wanted[lane] : wanted[lane];
-        size[lane] = magnitude < MOST ? magnitude : MOST;
-        below[lane] = (int32_t)(size[lane] + c->half[lane]);
-    }
-    const float *even_rates = rates, *odd_rates = rates + LODE_CLASSES * LODE_RATES;
-    for (int lane = 0; lane < LANES; lane++) {
-        const float *own = (lane & 2 ? odd_rates : even_rates) + below[lane];
-        low_rate[lane] = own[0], high_rate[lane] = own[1];
-    }
-    float none_rates[2] = {even_rates[0], odd_rates[0]};
-    for (int lane = 0; lane < LANES; lane++) {
-        float low = (float)below[lane] - c->half[lane], high = low + 1.0f;
-        low = low < 0 ? 0 : low; /* index 0 */
-        float none_cost = c->weight * (size[lane] * size[lane]) + none_rates[lane >> 1 & 1];
-        float low_cost = c->weight * ((size[lane] - low) * (size[lane] - low)) + low_rate[lane];
-        float high_cost = c->weight * ((high - size[lane]) * (high - size[lane])) + high_rate[lane];
-        int32_t odd = below[lane] & 1, flip = wanted[lane] < 0 ? -1 : 1;
-        float even_cost = odd ? high_cost : low_cost, odd_cost = odd ? low_cost : high_cost;
-        float even = odd ? high : low;
-        int32_t even_index = below[lane] + odd;
-        bool zero = none_cost < even_cost;
-        even = zero ? 0 : even;
-        even_index = zero ? 0 : even_index;
-        found->cost[0][lane] = s->cost[lane] + (zero ? none_cost : even_cost);
-        found->cost[1][lane] = s->cost[lane] + odd_cost;
-        found->error[0][lane] = rest - (float)flip * even;
-        found->error[1][lane] = rest - (float)flip * (odd ? low : high);
-        found->index[0][lane] = flip * even_index;
-        found->index[1][lane] = flip * (below[lane] + 1 - odd);
+    const float *even = rates, *odd = rates + LODE_CLASSES * LODE_RATES;
+    const floats_t none_rate = {even[0], even[0], odd[0], odd[0]}, zeros = {0};
+    for (int h = 0; h < 2; h++) {
+        ints_t root = s->root[h] * BLOCK;
+        floats_t wanted = {fed[root[0]], fed[root[1]], fed[root[2]], fed[root[3]]};
+        wanted += rest + c->left[0] * s->last[h] + c->left[1] * s->second[h];
+        ints_t sign = (ints_t)wanted & INT32_MIN;
+        floats_t size = (floats_t)((ints_t)wanted ^ sign);
+        size = either_float(size < MOST, size, zeros + MOST);
+        ints_t below = __builtin_convertvector(size + c->half, ints_t);
+        floats_t low = __builtin_convertvector(below, floats_t) - c->half, high = low + 1.0f;
+        low = either_float(low > 0.0f, low, zeros); /* index 0 */
+        const float *at[PLACES] = {even + below[0], even + below[1], odd + below[2], odd + below[3]};
+        floats_t low_cost = {at[0][0], at[1][0], at[2][0], at[3][0]};
+        floats_t high_cost = {at[0][1], at[1][1], at[2][1], at[3][1]};
+        floats_t none_cost = c->weight * (size * size) + none_rate;
+        low_cost += c->weight * ((size - low) * (size - low));
+        high_cost += c->weight * ((high - size) * (high - size));
+        ints_t is_odd = -(below & 1), flip = sign >> 31;
+        floats_t even_cost = either_float(is_odd, high_cost, low_cost);
+        floats_t even_point = either_float(is_odd, high, low), odd_point = either_float(is_odd, low, high);
+        ints_t even_index = below + (below & 1), odd_index = below | 1;
+        ints_t some = ~(none_cost < even_cost);
+        found->cost[0][h] = s->cost[h] + either_float(some, even_cost, none_cost);
+        found->cost[1][h] = s->cost[h] + either_float(is_odd, low_cost, high_cost);
+        found->error[0][h] = rest - (floats_t)((some & (ints_t)even_point) ^ sign);
+        found->error[1][h] = rest - (floats_t)((ints_t)odd_point ^ sign);
+        found->index[0][h] = ((some & even_index) ^ flip) - flip;
+        found->index[1][h] = (odd_index ^ flip) - flip;
     }
 }
 
 /* One coefficient further: of the two branches into each state the cheaper one. A way is an index times LANES, plus the
  * lane that it comes from. */
 LODE_INLINE void advance(struct survivors *s, const struct branches *found, float *errors, int16_t *ways) {
-    float cost[LANES], error[LANES], last[LANES];
-    int32_t root[LANES], way[LANES];
-    for (int other = 0; other < 2; other++)
-        for (int i = 0; i < PAIRS; i++) {
-            int to = other * PAIRS + i, j = PAIRS + i;
-            bool takes = found->cost[1 - other][j] < found->cost[other][i];
-            cost[to] = takes ? found->cost[1 - other][j] : found->cost[other][i];
-            error[to] = takes ? found->error[1 - other][j] : found->error[other][i];
-            way[to] = takes ? found->index[1 - other][j] * LANES + j : found->index[other][i] * LANES + i;
-            last[to] = takes ? s->last[j] : s->last[i];
-            root[to] = takes ? s->root[j] : s->root[i];
-        }
-    for (int to = 0; to < LANES; to++) {
-        int lane = PLACES[to];
-        s->cost[lane] = cost[to];
-        s->last[lane] = errors[lane] = error[to];
-        s->second[lane] = last[to];
-        s->root[lane] = root[to];
-        ways[lane] = (int16_t)way[to];
+    const ints_t first = {0, 1, 2, 3}, second = {4, 5, 6, 7};
+    floats_t cost[2], error[2], last[2];
+    ints_t root[2], way[2];
+    for (int other = 0; other < 2; other++) {
+        int k = 1 - other; /* whether an index from the second half is odd */
+        ints_t takes = found->cost[k][1] < found->cost[other][0];
+        cost[other] = either_float(takes, found->cost[k][1], found->cost[other][0]);
+        error[other] = either_float(takes, found->error[k][1], found->error[other][0]);
+        way[other] = either(takes, found->index[k][1] * LANES + second, found->index[other][0] * LANES + first);
+        last[other] = either_float(takes, s->last[1], s->last[0]);
+        root[other] = either(takes, s->root[1], s->root[0]);
     }
+    arrange_floats(cost, s->cost);
+    arrange_floats(error, s->last);
+    arrange_floats(last, s->second);
+    arrange(root, s->root);
+    ints_t arranged[2];
+    arrange(way, arranged);
+    memcpy(errors, s->last, sizeof s->last);
+    for (int lane = 0; lane < LANES; lane++)
+        ways[lane] = (int16_t)arranged[lane / PLACES][lane % PLACES];
 }
 
 /* After row i of a block: hand the trails on to the survivors, each with the row's errors. */
@@ -273,8 +290,9 @@ static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t co
         const struct trail *trail = trails + lane;
         for (int j = 0; j < BLOCK; j++)
             fed[lane][j] = c->up[0] * trail->above[1][j] + c->up[1] * trail->above[0][j];
-        s->second[lane] = trail->edges[i][0], s->last[lane] = trail->edges[i][1];
-        s->root[lane] = lane;
+        s->second[lane / PLACES][lane % PLACES] = trail->edges[i][0];
+        s->last[lane / PLACES][lane % PLACES] = trail->edges[i][1];
+        s->root[lane / PLACES][lane % PLACES] = lane;
     }
     int16_t *ways = c->ways + number * LANES;
     for (int64_t j = 0; j < columns; j++) {
@@ -286,18 +304,21 @@ static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t co
     follow(c, i, columns, errors, ways, trails);
 }
 
+static float cost_of(const struct survivors *s, int lane) {
+    return s->cost[lane / PLACES][lane % PLACES];
+}
+
 /* Survivors and trails at the begin of a block: costs count from the least, so that they stay small. */
 static void begin_block(const struct choice *c, int64_t left, struct survivors *s, struct trail *trails) {
     int64_t across = c->band[BAND_COLUMNS];
-    float lowest = s->cost[0];
+    float least_cost = s->cost[0][0];
     for (int lane = 1; lane < LANES; lane++)
-        lowest = s->cost[lane] < lowest ? s->cost[lane] : lowest;
-    for (int lane = 0; lane < LANES; lane++) {
-        s->cost[lane] -= lowest;
+        least_cost = cost_of(s, lane) < least_cost ? cost_of(s, lane) : least_cost;
+    s->cost[0] -= least_cost, s->cost[1] -= least_cost;
+    for (int lane = 0; lane < LANES; lane++)
         for (int64_t j = 0; j < least(BLOCK, across - left); j++)
             for (int row = 0; row < 2; row++)
                 trails[lane].above[row][j] = c->above[row * across + left + j];
-    }
 }
 
 /* Take the way that ends in a lane at the end of a row of blocks, and keep the errors of its last two rows. */
@@ -314,7 +335,7 @@ static void take(const struct choice *c, int64_t top, int64_t end, int64_t numbe
                 int odd = ODD[STATES[lane]];
                 c->chosen[at] = index;
                 c->counts[(odd * LODE_CLASSES + class_at(c, at)) * LODE_INDICES + least(size, LODE_INDICES - 1)] += 1.0;
-                double point = size ? (double)size - (double)c->half[lane] : 0.0;
+                double point = size ? (double)size - (double)c->half[lane % PLACES] : 0.0;
                 if (i >= end - 2)
                     c->above[(i - end + 2) * columns + j] = (float)(c->relative[at] - (index < 0 ? -point : point));
             }
@@ -339,8 +360,9 @@ static void choose(const struct choice *c, int64_t top) {
     struct survivors s;
     struct trail trails[LANES];
     memset(trails, 0, sizeof trails);
-    for (int lane = 0; lane < LANES; lane++)
-        s.cost[lane] = lane ? __builtin_inff() : 0.0f;
+    float unreached = __builtin_inff();
+    s.cost[0] = (floats_t){0.0f, unreached, unreached, unreached};
+    s.cost[1] = (floats_t){unreached, unreached, unreached, unreached};
     for (int64_t left = 0; left < columns; left += BLOCK) {
         int64_t width = least(BLOCK, columns - left);
         begin_block(c, left, &s, trails);
@@ -349,7 +371,7 @@ static void choose(const struct choice *c, int64_t top) {
     }
     int lane = 0;
     for (int other = 1; other < LANES; other++)
-        lane = s.cost[other] < s.cost[lane] ? other : lane;
+        lane = cost_of(&s, other) < cost_of(&s, lane) ? other : lane;
     take(c, top, end, number, lane);
     filter_rows(c);
 }
@@ -373,8 +395,7 @@ int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rule
         choice.weight = rule[1];
         for (int k = 0; k < 2; k++)
             choice.up[k] = rule[2 + k], choice.left[k] = rule[4 + k];
-        for (int lane = 0; lane < LANES; lane++)
-            choice.half[lane] = ODD[STATES[lane]] ? rule[0] : 0.0f;
+        choice.half = (floats_t){0.0f, 0.0f, rule[0], rule[0]};
         choice.above = above, choice.chosen = chosen, choice.counts = counts, choice.ways = ways;
         for (int64_t j = 0; j < 2 * columns; j++)
             above[j] = 0.0f;
