@@ -256,26 +256,24 @@ LODE_INLINE void advance(struct survivors *s, const struct branches *found, floa
         ways[lane] = (int16_t)arranged[lane / PLACES][lane % PLACES];
 }
 
-/* After row i of a block: hand the trails on to the survivors, each with the row's errors. */
+/* After row i of a block: the trails of the survivors, each with the row's errors, from those at the row's begin. */
 static void follow(const struct choice *c, int64_t i, int64_t columns, float (*errors)[LANES], const int16_t *ways,
-                   struct trail *trails) {
-    struct trail next[LANES];
+                   const struct trail *before, struct trail *after) {
     for (int end = 0; end < LANES; end++) {
-        float own[2 + BLOCK];
+        float own[2 + BLOCK] = {0};
         int lane = end;
         for (int64_t j = columns - 1; j >= 0; j--) {
             own[2 + j] = errors[j][lane];
             lane = ways[j * LANES + lane] & (LANES - 1);
         }
-        struct trail *trail = next + end;
-        *trail = trails[lane];
+        struct trail *trail = after + end;
+        *trail = before[lane];
         memcpy(own, trail->edges[i], sizeof trail->edges[i]);
         memcpy(trail->edges[i], own + columns, sizeof trail->edges[i]);
-        memcpy(trail->above[0], trail->above[1], sizeof trail->above[0]);
-        for (int64_t j = 0; j < columns; j++)
+        memcpy(trail->above[0], before[lane].above[1], sizeof trail->above[0]);
+        for (int j = 0; j < BLOCK; j++)
             trail->above[1][j] = own[2 + j] + c->left[0] * own[1 + j] + c->left[1] * own[j];
     }
-    memcpy(trails, next, sizeof next);
 }
 
 static int64_t class_at(const struct choice *c, int64_t at) {
@@ -284,7 +282,7 @@ static int64_t class_at(const struct choice *c, int64_t at) {
 
 /* Row i of a block, whose first coefficient is number `number` of the row of blocks. */
 static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t columns, int64_t number,
-                       struct survivors *s, struct trail *trails) {
+                       struct survivors *s, const struct trail *trails, struct trail *after) {
     float fed[LANES][BLOCK], errors[BLOCK][LANES];
     for (int lane = 0; lane < LANES; lane++) {
         const struct trail *trail = trails + lane;
@@ -301,7 +299,7 @@ static void choose_row(const struct choice *c, int64_t i, int64_t at, int64_t co
         find_branches(c, s, part_of(c->relative[at + j]).rest, fed[0] + j, rates, &found);
         advance(s, &found, errors[j], ways + j * LANES);
     }
-    follow(c, i, columns, errors, ways, trails);
+    follow(c, i, columns, errors, ways, trails, after);
 }
 
 static float cost_of(const struct survivors *s, int lane) {
@@ -358,16 +356,18 @@ static void choose(const struct choice *c, int64_t top) {
     const int64_t *band = c->band;
     int64_t end = least(top + BLOCK, band[BAND_ROWS]), columns = band[BAND_COLUMNS], number = 0;
     struct survivors s;
-    struct trail trails[LANES];
+    struct trail trails[2][LANES]; /* in turn at the begin of a row and after it */
     memset(trails, 0, sizeof trails);
+    int now = 0;
     float unreached = __builtin_inff();
     s.cost[0] = (floats_t){0.0f, unreached, unreached, unreached};
     s.cost[1] = (floats_t){unreached, unreached, unreached, unreached};
     for (int64_t left = 0; left < columns; left += BLOCK) {
         int64_t width = least(BLOCK, columns - left);
-        begin_block(c, left, &s, trails);
-        for (int64_t i = top; i < end; i++, number += width)
-            choose_row(c, i - top, band[BAND_OFFSET] + i * band[BAND_STRIDE] + left, width, number, &s, trails);
+        begin_block(c, left, &s, trails[now]);
+        for (int64_t i = top; i < end; i++, number += width, now = 1 - now)
+            choose_row(c, i - top, band[BAND_OFFSET] + i * band[BAND_STRIDE] + left, width, number, &s, trails[now],
+                       trails[1 - now]);
     }
     int lane = 0;
     for (int other = 1; other < LANES; other++)
