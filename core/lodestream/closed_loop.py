@@ -8,17 +8,20 @@ orthogonal: no error of one could be made good by another.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .band_fields import COLUMNS, KIND, OFFSET, ROWS, STRIDE
+from .layout import Layout
+from .noise_shaping import feedback_rules
+from .predictors import predictor
 from .quantiser import Quantiser
 from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
 from .spreading import spread_bands
 from .tiles import TileTable
-from .transform import PADDING, allocate, bare_level, inverse_level, take_details, take_nodes
+from .transform import PADDING, allocate, bare_level, inverse_level, take_details, take_nodes, third_step
 
 __all__ = ["ClosedLoop", "quantise"]
 
@@ -27,20 +30,6 @@ _LIKELY_STEP = 6
 #: How often all indices are chosen with the first step, to learn what they cost.
 _FIRST_TURNS = 2
 _BOTH = 3  # details along both axes, in `band_fields.KIND`
-
-
-class _Stage(NamedTuple):
-    """Bands of a level that do not depend on each other.
-
-    Attributes
-    ----------
-    level : int
-    bands : dict of int to int64 array
-        By grid, in the order of the layout: their numbers in the table.
-    """
-
-    level: int
-    bands: dict[int, NDArray[np.int64]]
 
 
 class ClosedLoop:
@@ -63,32 +52,84 @@ class ClosedLoop:
         self._chooser = IndexChooser(table)
         self._turns = _FIRST_TURNS
 
-    def indices(self, quantiser: Quantiser, pictures: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
-        """The index of every coefficient, flat; and what the reader will have of the grids, into ``pictures``."""
+    def indices(
+        self, steps: NDArray[np.int64], rules: NDArray[np.float32], pictures: Sequence[NDArray[np.int32]]
+    ) -> NDArray[np.int32]:
+        """The index of every coefficient, flat; and what the reader will have of the grids, into ``pictures``.
+
+        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        """
         for _ in range(self._turns):
-            chosen = self._chosen(quantiser, pictures)
+            chosen = self._chosen(steps, rules, pictures)
         self._turns = 1  # what was learned of one choice serves the next one, with other steps, too
         return chosen
 
-    def _chosen(self, quantiser: Quantiser, pictures: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
+    def _chosen(
+        self, steps: NDArray[np.int64], rules: NDArray[np.float32], pictures: Sequence[NDArray[np.int32]]
+    ) -> NDArray[np.int32]:
         table, predictors = self._table, self._predictors
         for picture in pictures:
             picture.fill(0)
-        self._chooser.begin(quantiser)
-        coder = _Coder(table, self._chooser, table.steps(quantiser), self._aims, pictures)
-        for first, second in _stages(table):
-            level = first.level
+        self._chooser.begin(steps, rules)
+        coder = _Coder(table, self._chooser, steps, self._aims, pictures)
+        for level, of_grid in _bands(table):
             if level == 0:
-                coder.code(first, predictors)
+                coder.code(of_grid, {})
                 take_nodes(pictures, table.layout)
                 continue
-            for number in first.bands:
+            for number in of_grid:
                 take_details(pictures, table.layout, predictors, number, level)
-            coder.code(first, predictors)
-            coder.code(second, predictors)
-            for number in first.bands:
+            details = {
+                number: _Details(table.layout, predictors, number, level, pictures[number]) for number in of_grid
+            }
+            both = {number: table.bands[own, KIND] == _BOTH for number, own in of_grid.items()}
+            coder.code({k: own[~both[k]] for k, own in of_grid.items()}, {k: d.along_one() for k, d in details.items()})
+            coder.code({k: own[both[k]] for k, own in of_grid.items()}, {k: d.along_both() for k, d in details.items()})
+            for number in of_grid:
                 inverse_level(pictures[number], table.layout, predictors, number, level)
         return self._chooser.end()
+
+
+def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]]]:
+    """Level by level, curves before the parts that take their sides from them: the numbers of each grid's bands."""
+    layout = table.layout
+    levels = np.array([tile.level for tile in layout.tiles])[table.windows[:, 0]]
+    every = list(range(len(layout.grids)))
+    curves = sum(grid.curve for grid in layout.grids)
+    for level in range(layout.levels + 1):
+        groups = [every] if level == 0 else [every[:curves], every[curves:]]
+        for group in groups:
+            yield level, {k: table.of_grid[k][levels[table.of_grid[k]] == level] for k in group}
+
+
+class _Details:
+    """What the third step predicts of the details of a level of a grid, from what the reader has in ``picture``."""
+
+    def __init__(
+        self, layout: Layout, predictors: NDArray[np.int8], grid: int, level: int, picture: NDArray[np.int32]
+    ) -> None:
+        self._steps, (rows, columns) = layout.steps(grid, level), layout.shape(grid, level)
+        self._rules = [predictor(predictors, layout.grids[grid], step, level, a) for a, step in enumerate(self._steps)]
+        self._picture, (self._top, self._left) = picture[:rows, :columns], layout.shape(grid, level - 1)
+        self._predicted = allocate((rows, columns))
+
+    def along_one(self) -> NDArray[np.int32]:
+        """Those along one axis, from the nodes; int32, shape (row, column) of the level."""
+        nodes = self._picture[: self._top, : self._left]
+        self._predicted[: self._top, self._left :] = self._third_step(nodes, 1)
+        self._predicted[self._top :, : self._left] = self._third_step(nodes, 0)
+        return self._predicted
+
+    def along_both(self) -> NDArray[np.int32]:
+        """Those along both, once those along one axis are known, too."""
+        details = self._predicted[: self._top, self._left :] + self._picture[: self._top, self._left :]
+        both = self._predicted[self._top :, self._left :]
+        both[...] = self._third_step(details, 0)
+        both += self._third_step(self._picture[self._top :, : self._left], 1)
+        return self._predicted
+
+    def _third_step(self, nodes: NDArray[np.int32], axis: int) -> NDArray[np.int32]:
+        return third_step(nodes, axis, self._steps[axis], self._rules[axis])
 
 
 class _Coder:
@@ -109,45 +150,30 @@ class _Coder:
         self._early = np.zeros(table.size, np.uint8)
         self._complete = np.zeros(len(table.layout.tiles), np.int8)
 
-    def code(self, stage: _Stage, predictors: NDArray[np.int8]) -> None:
-        """Code the bands of a stage: what is to be reached less what the reader predicts."""
-        for grid, numbers in stage.bands.items():
-            if not numbers.size:
-                continue
-            predicted = self._predicted(grid, stage.level, predictors) if stage.level else None
+    def code(self, of_grid: dict[int, NDArray[np.int64]], predicted: dict[int, NDArray[np.int32]]) -> None:
+        """Code some bands of each grid: what is to be reached less what is predicted, if it is."""
+        for grid, numbers in of_grid.items():
             for number in numbers.tolist():
                 target, window = self._own(self._targets, number), self._window(number)
                 target[...] = self._aims[grid][window]
-                if predicted is not None:
-                    target -= predicted[window]
-        every = np.concatenate(list(stage.bands.values()))
+                if predicted:
+                    target -= predicted[grid][window]
+        every = np.concatenate([np.zeros(0, np.int64), *of_grid.values()])
         if not every.size:
             return
         self._chooser.choose(every, self._targets)
         for number in every.tolist():
             chosen = self._own(self._chooser.chosen, number)
             np.abs(chosen, out=self._own(self._sizes, number))
-            np.sign(chosen, out=self._own(self._signs, number), casting="unsafe")
+            np.sign(chosen, out=self._own(self._signs, number), casting="same_kind")
         known = self._sizes, self._signs, self._early, self._table.bands, self._table.windows, self._steps
-        for grid, numbers in stage.bands.items():
+        for grid, numbers in of_grid.items():
             spread_bands(*known, numbers, self._complete, self._complete.size, self._pictures[grid], (0, 0))
 
-    def _predicted(self, grid: int, level: int, predictors: NDArray[np.int8]) -> NDArray[np.int32]:
-        """Details before the third step that the reader has when those coded so far are known, the others 0."""
-        layout = self._table.layout
-        rows, columns = layout.shape(grid, level)
-        picture = allocate((rows, columns))
-        picture[...] = self._pictures[grid][:rows, :columns]
-        inverse_level(picture, layout, predictors, grid, level)
-        bare_level(picture, layout, grid, level)
-        return picture
-
-    def _own(self, flat: NDArray[np.generic], number: int) -> NDArray[np.generic]:
+    def _own(self, flat: NDArray[Any], number: int) -> NDArray[Any]:
         """A band in a flat array, shape (row, column), a view."""
         place, stride, rows, columns = self._table.bands[number, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
-        return np.lib.stride_tricks.as_strided(
-            flat[place:], (rows, columns), (stride * flat.itemsize, flat.itemsize)
-        )
+        return flat[place : place + rows * stride].reshape(rows, stride)[:, :columns]
 
     def _window(self, number: int) -> tuple[slice, slice]:
         """Where a band lies among the coefficients of its grid."""
@@ -156,29 +182,8 @@ class _Coder:
         return slice(top, top + rows), slice(left, left + columns)
 
 
-def _stages(table: TileTable) -> Iterator[tuple[_Stage, _Stage]]:
-    """The bands in the order in which they can be coded.
-
-    Level by level, curves before the parts that take their sides from them; of these first what has nodes along an
-    axis, then the details along both.
-    """
-    layout = table.layout
-    levels = np.array([tile.level for tile in layout.tiles])[table.windows[:, 0]]
-    both = table.bands[:, KIND] == _BOTH
-    every = list(range(len(layout.grids)))
-    curves = [number for number in every if layout.grids[number].curve]
-    parts = every[len(curves) :]
-    for level in range(layout.levels + 1):
-        groups = [every] if level == 0 else [curves, parts] if curves else [parts]
-        for group in groups:
-            own = {k: table.of_grid[k][levels[table.of_grid[k]] == level] for k in group}
-            yield (
-                _Stage(level, {k: numbers[~both[numbers]] for k, numbers in own.items()}),
-                _Stage(level, {k: numbers[both[numbers]] for k, numbers in own.items()}),
-            )
-
-
 def quantise(
+    table: TileTable,
     loops: Sequence[ClosedLoop],
     canvases: Sequence[NDArray[np.int32]],
     error_of: Callable[[], float],
@@ -190,6 +195,7 @@ def quantise(
 
     Parameters
     ----------
+    table : TileTable
     loops : one for each coordinate
     canvases : int32, shape (coordinate, row, column or more), one for each grid
         Room for what the reader will have.
@@ -204,9 +210,10 @@ def quantise(
     done: list[int] = []
 
     def error(base: int) -> float:
+        steps, rules = table.steps(Quantiser(base)), feedback_rules(table, Quantiser(base))
         found = []
         for number, loop in enumerate(loops):
-            found.append(loop.indices(Quantiser(base), [canvas[number, :, :-PADDING] for canvas in canvases]))
+            found.append(loop.indices(steps, rules, [canvas[number, :, :-PADDING] for canvas in canvases]))
         done.append(base)
         progress(len(done) / MOST_TRIES)
         rms = error_of()

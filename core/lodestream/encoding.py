@@ -27,7 +27,7 @@ from .quantiser import Quantiser
 from .reconstruction import Picture, channel_picture, initial_state, to_values
 from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
-from .tiles import Tiles, TileTable, gather
+from .tiles import TileTable, gather
 from .transform import PADDING, forward, synthesis_norms
 from .window_errors import KIND as WINDOW_ERRORS
 from .window_errors import is_divided, layer_codes, no_errors, serialize_window_errors
@@ -150,7 +150,9 @@ class Encoding:
         def error() -> float:
             return told(self._distances_of(canvases, [0] * self.geometric)[0][0])
 
-        found = quantise(self._loops, canvases, error, wanted, self.fineness, lambda done: self.progress(0.1 + 0.2 * done))
+        found = quantise(
+            table, self._loops, canvases, error, wanted, self.fineness, lambda done: self.progress(0.1 + 0.2 * done)
+        )
         if found is None:
             raise UnreachableError
         self.quantiser, indices = found

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from . import kernels
 from .band_fields import COLUMNS, ROWS
 from .kernels import CLASSES, INDICES, RATES
-from .noise_shaping import feedback_rules
-from .quantiser import MOST_BASE, Quantiser
+from .quantiser import MOST_BASE
 from .tiles import TileTable
 from .trellis import TRANSITIONS
 
@@ -59,13 +58,15 @@ class IndexChooser:
         # What the kernel works in: of a row of blocks, for each survivor.
         self._room = np.empty(8 * len(TRANSITIONS) * widest, np.int16), np.empty(2 * widest, np.float32)
 
-    def begin(self, quantiser: Quantiser) -> None:
-        """Choose all indices anew; what was learned of the last ones serves, with other steps, too."""
-        table = self._table
-        self._steps, self._rules = table.steps(quantiser), feedback_rules(table, quantiser)
-        self._relative = np.zeros(table.size)
-        self._classes = np.zeros(table.size, np.int8)
-        self.chosen = np.zeros(table.size, np.int32)
+    def begin(self, steps: NDArray[np.int64], rules: NDArray[np.float32]) -> None:
+        """Choose all indices anew; what was learned of the last ones serves, with other steps, too.
+
+        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        """
+        self._steps, self._rules = steps, rules
+        self._relative = np.zeros(self._table.size)
+        self._classes = np.zeros(self._table.size, np.int8)
+        self.chosen = np.zeros(self._table.size, np.int32)
         self._rates = _rates(self._bits)
         self._counts = _PRIOR * np.exp2(-_laplace())
 

@@ -31,6 +31,7 @@ __all__ = [
     "synthesised",
     "take_details",
     "take_nodes",
+    "third_step",
 ]
 
 #: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
@@ -132,7 +133,9 @@ def inverse_level(
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in (1, 0):
         if steps[axis].midpoints:
-            inverse_step(corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis))
+            inverse_step(
+                corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
+            )
 
 
 def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
@@ -141,6 +144,29 @@ def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int
     for axis in range(2):
         if steps[axis].midpoints:
             forward_step(corner, axis, steps[axis], (0, 0))
+
+
+def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> NDArray[np.int32]:
+    """What the third step predicts of the details from the nodes of the coarser level: floor((v_k + 128) / 256).
+
+    Parameters
+    ----------
+    nodes : int32, shape (row, column)
+        ``step.coarse`` of them along ``axis``.
+
+    Returns
+    -------
+    int32, shape (row, column)
+        ``step.midpoints`` of them along ``axis``.
+    """
+    rows, columns = nodes.shape
+    values = allocate((step.length, columns) if axis == 0 else (rows, step.length))
+    if nodes.size and predictor != (0, 0):
+        # Undone with the third step and done without it, a step leaves of no details what that predicts.
+        values[:rows, :columns] = nodes
+        inverse_step(values, axis, step, predictor)
+        forward_step(values, axis, step, (0, 0))
+    return values[step.coarse :] if axis == 0 else values[:, step.coarse :]
 
 
 def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
