@@ -27,8 +27,6 @@ __all__ = ["ClosedLoop", "quantise"]
 
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
-#: How often all indices are chosen with the first step, to learn what they cost.
-_FIRST_TURNS = 2
 _BOTH = 3  # details along both axes, in `band_fields.KIND`
 
 
@@ -49,8 +47,8 @@ class ClosedLoop:
         for level in range(table.layout.levels, 0, -1):
             for number, array in enumerate(arrays):
                 bare_level(array, table.layout, number, level)
+        self._levels = list(_bands(table))
         self._chooser = IndexChooser(table)
-        self._turns = _FIRST_TURNS
 
     def indices(
         self, steps: NDArray[np.int64], rules: NDArray[np.float32], pictures: Sequence[NDArray[np.int32]]
@@ -59,20 +57,12 @@ class ClosedLoop:
 
         For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
-        for _ in range(self._turns):
-            chosen = self._chosen(steps, rules, pictures)
-        self._turns = 1  # what was learned of one choice serves the next one, with other steps, too
-        return chosen
-
-    def _chosen(
-        self, steps: NDArray[np.int64], rules: NDArray[np.float32], pictures: Sequence[NDArray[np.int32]]
-    ) -> NDArray[np.int32]:
         table, predictors = self._table, self._predictors
         for picture in pictures:
             picture.fill(0)
         self._chooser.begin(steps, rules)
         coder = _Coder(table, self._chooser, steps, self._aims, pictures)
-        for level, of_grid in _bands(table):
+        for level, of_grid in self._levels:
             if level == 0:
                 coder.code(of_grid, {})
                 take_nodes(pictures, table.layout)
@@ -186,10 +176,9 @@ def quantise(
     table: TileTable,
     loops: Sequence[ClosedLoop],
     canvases: Sequence[NDArray[np.int32]],
-    error_of: Callable[[], float],
+    error_of: Callable[[float], float],
     wanted: float,
     fineness: int,
-    progress: Callable[[float], None],
 ) -> tuple[Quantiser, list[NDArray[np.int32]]] | None:
     """The longest steps whose error is at most the one wanted, and the indices then; None where no step is that short.
 
@@ -200,11 +189,9 @@ def quantise(
     canvases : int32, shape (coordinate, row, column or more), one for each grid
         Room for what the reader will have.
     error_of : callable
-        The error of what the canvases hold.
+        The error of what the canvases hold; it is given the share of all tries that is done.
     fineness : int
         Lattice steps that make the error wanted in one coordinate.
-    progress : callable
-        Called now and then with the fraction done, 0 to 1.
     """
     kept: dict[int, list[NDArray[np.int32]]] = {}
     done: list[int] = []
@@ -215,8 +202,7 @@ def quantise(
         for number, loop in enumerate(loops):
             found.append(loop.indices(steps, rules, [canvas[number, :, :-PADDING] for canvas in canvases]))
         done.append(base)
-        progress(len(done) / MOST_TRIES)
-        rms = error_of()
+        rms = error_of(len(done) / MOST_TRIES)
         if rms <= wanted:
             kept.clear()
             kept[base] = found

@@ -28,7 +28,7 @@ from .reconstruction import Picture, channel_picture, initial_state, to_values
 from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
 from .tiles import TileTable, gather
-from .transform import PADDING, forward, synthesis_norms
+from .transform import PADDING, copied, forward, synthesis_norms
 from .window_errors import KIND as WINDOW_ERRORS
 from .window_errors import is_divided, layer_codes, no_errors, serialize_window_errors
 
@@ -147,35 +147,35 @@ class Encoding:
         """Choose indices, with the longest steps whose error is at most the one wanted."""
         table, canvases = self.tables[0], self._canvases()
 
-        def error() -> float:
+        def error(tries: float) -> float:
+            self.progress(0.1 + 0.2 * tries)
             return told(self._distances_of(canvases, [0] * self.geometric)[0][0])
 
-        found = quantise(
-            table, self._loops, canvases, error, wanted, self.fineness, lambda done: self.progress(0.1 + 0.2 * done)
-        )
+        found = quantise(table, self._loops, canvases, error, wanted, self.fineness)
         if found is None:
             raise UnreachableError
         self.quantiser, indices = found
         self._loops.clear()
         squares = table.steps(self.quantiser).astype(np.float64) ** 2
         for channel, own in zip(self.channels, indices, strict=False):  # those behind the coordinates stay
-            channel.true, channel.weights = own, channel.weights * squares
-            channel.top = np.array([planes_of(table, own, tile) for tile in range(len(self.layout.tiles))], np.int8)
+            channel.true, channel.weights, channel.top = own, channel.weights * squares, self._tops(table, own)
 
     def _transform(self, number: int, lattice: Lattice) -> tuple[Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
         quantised = self.prepared.rms is not None and number < self.geometric
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
-            coordinates = [array.copy() for array in arrays] if quantised else []
+            given = [copied(array) for array in arrays] if quantised else []
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
         table = self._table(number)
-        true = gather(table, arrays)
         if quantised:
-            self._loops.append(ClosedLoop(table, predictors, coordinates))
+            self._loops.append(ClosedLoop(table, predictors, given))
+            true = np.zeros(table.size, np.int32)  # until indices have been chosen
+        else:
+            true = gather(table, arrays)
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
         span = self.prepared.extent if number < self.geometric else self._span(number)
@@ -187,8 +187,11 @@ class Encoding:
                 for band in bands
             ]
         )
-        top = np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
-        return Channel(true, weights, top), predictors
+        return Channel(true, weights, self._tops(table, true)), predictors
+
+    def _tops(self, table: TileTable, true: NDArray[np.int32]) -> NDArray[np.int8]:
+        """Bit-planes of each tile."""
+        return np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
 
     def _table(self, channel: int) -> TileTable:
         return self.tables[0 if channel < self.geometric else 1]
@@ -240,15 +243,11 @@ class Encoding:
         return self._distances_of(canvases, fractions, cells)
 
     def _distances_of(
-        self,
-        canvases: list[NDArray[np.int32]],
-        fractions: list[int],
-        cells: list[NDArray[np.float64]] | None = None,
+        self, shown: list[NDArray[np.int32]], fractions: list[int], cells: list[NDArray[np.float64]] | None = None
     ) -> list[tuple[float, float]]:
         """Errors of coordinates over two to these powers."""
-        lattices = self.lattices[: self.geometric]
-        shown = canvases[self._curves_first :]
-        return coordinate_distances(self.prepared.originals, lattices, shown, fractions, cells=cells)
+        lattices, parts = self.lattices[: self.geometric], shown[self._curves_first :]
+        return coordinate_distances(self.prepared.originals, lattices, parts, fractions, cells=cells)
 
     def _errors(
         self, state: State, canvases: list[NDArray[np.int32]], cells: list[NDArray[np.float64]] | None = None

@@ -158,7 +158,7 @@ def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) ->
             below = max(below, base)
         else:
             above = min(above, base)
-        if _CLOSE * wanted <= error <= wanted:
+        if _CLOSE * wanted <= error <= wanted or above * _CLOSE < below:
             break
         known.append((math.log(max(error, 1e-300) / aim), math.log(base)))
         known.sort(key=lambda point: abs(point[0]))

@@ -24,6 +24,7 @@ __all__ = [
     "PADDING",
     "allocate",
     "bare_level",
+    "copied",
     "forward",
     "inverse",
     "inverse_level",
@@ -52,6 +53,13 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
     """
     rows, columns = shape
     return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
+
+
+def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A copy from `allocate`."""
+    copy = allocate(array.shape)
+    copy[...] = array
+    return copy
 
 
 def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
