@@ -339,16 +339,12 @@ static void take(const struct choice *c, int64_t top, int64_t end, int64_t numbe
             }
 }
 
-/* Errors to what is fed back of them along each of two rows, from the end on, as those to the left are still wanted. */
+/* Errors of two rows to what is fed back of them along the row, from the end on: those to the left are still wanted. */
 static void filter_rows(const struct choice *c) {
     int64_t columns = c->band[BAND_COLUMNS];
-    for (int row = 0; row < 2; row++) {
-        float *errors = c->above + row * columns;
-        for (int64_t j = columns - 1; j >= 2; j--)
-            errors[j] += c->left[0] * errors[j - 1] + c->left[1] * errors[j - 2];
-        if (columns > 1)
-            errors[1] += c->left[0] * errors[0];
-    }
+    for (float *row = c->above; row < c->above + 2 * columns; row += columns)
+        for (int64_t j = columns - 1; j > 0; j--)
+            row[j] = row[j] + c->left[0] * row[j - 1] + c->left[1] * (j > 1 ? row[j - 2] : 0.0f);
 }
 
 /* Choose the indices of a row of blocks. */

@@ -29,7 +29,6 @@ __all__ = [
     "inverse",
     "inverse_level",
     "synthesis_norms",
-    "synthesised",
     "take_details",
     "take_nodes",
     "third_step",
@@ -363,13 +362,13 @@ def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[
     nodes[0, 8] = 1.0
     (details if stepping[0][0] == first else nodes)[1, 8] = 1.0
     for _, a, b in stepping[:_NORM_LEVELS]:
-        nodes = synthesised(nodes, details, a, b)
+        nodes = _synthesised(nodes, details, a, b)
         details = np.zeros_like(nodes)
     squares = (nodes * nodes).sum(axis=1) * 2.0 ** max(0, len(stepping) - _NORM_LEVELS)
     return float(squares[0]), float(squares[1])
 
 
-def synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
+def _synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
     """One inverse step of closed lines without rounding; float64, shape (line, sample)."""
     count = nodes.shape[1]
     c = np.concatenate([nodes[:, -2:], nodes, nodes[:, :3]], axis=1)
