@@ -265,7 +265,7 @@ def cost_of(
             errors[i, j] = values[i, j] - math.copysign(point_of(k, odd, half), chosen[i, j])
             total += float(RATES_OF_INDICES[odd, classes[i, j], min(k, RATES - 1)])
             state = int(TRANSITIONS[state, k & 1])
-    return total + weight * float((shaped(errors, taps) ** 2).sum())
+    return total + float(weight * (shaped(errors, taps) ** 2).sum())
 
 
 @given(
