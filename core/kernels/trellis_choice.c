@@ -347,10 +347,49 @@ static void filter_rows(const struct choice *c) {
             row[j] = row[j] + c->left[0] * row[j - 1] + c->left[1] * (j > 1 ? row[j - 2] : 0.0f);
 }
 
+/* Whether the coefficients of a row of blocks are so small, with all that is fed back, that 0 is the nearest point of
+ * both quantisers. */
+static bool is_negligible(const struct choice *c, int64_t top, int64_t end) {
+    const int64_t *band = c->band;
+    double up = magnitude((double)c->up[0]) + magnitude((double)c->up[1]);
+    double left = magnitude((double)c->left[0]) + magnitude((double)c->left[1]);
+    double above = 0.0, half = (double)c->half[PLACES - 1];
+    for (int64_t j = 0; j < 2 * band[BAND_COLUMNS]; j++) {
+        double size = magnitude((double)c->above[j]);
+        above = size > above ? size : above;
+    }
+    double limit = ((1.0 - half) / 2.0 - up * above) / ((1.0 + up) * (1.0 + left));
+    for (int64_t i = top; i < end; i++) {
+        const double *row = c->relative + band[BAND_OFFSET] + i * band[BAND_STRIDE];
+        for (int64_t j = 0; j < band[BAND_COLUMNS]; j++)
+            if (!(magnitude(row[j]) < limit))
+                return false;
+    }
+    return true;
+}
+
+/* Give all coefficients of a row of blocks index 0, which leaves the trellis in state 0. */
+static void choose_nothing(const struct choice *c, int64_t top, int64_t end) {
+    int64_t columns = c->band[BAND_COLUMNS];
+    for (int64_t i = top; i < end; i++)
+        for (int64_t j = 0; j < columns; j++) {
+            int64_t at = c->band[BAND_OFFSET] + i * c->band[BAND_STRIDE] + j;
+            c->chosen[at] = 0;
+            c->counts[class_at(c, at) * LODE_INDICES] += 1.0;
+            if (i >= end - 2)
+                c->above[(i - end + 2) * columns + j] = (float)c->relative[at];
+        }
+}
+
 /* Choose the indices of a row of blocks. */
 static void choose(const struct choice *c, int64_t top) {
     const int64_t *band = c->band;
     int64_t end = least(top + BLOCK, band[BAND_ROWS]), columns = band[BAND_COLUMNS], number = 0;
+    if (is_negligible(c, top, end)) {
+        choose_nothing(c, top, end);
+        filter_rows(c);
+        return;
+    }
     struct survivors s;
     struct trail trails[2][LANES]; /* in turn at the begin of a row and after it */
     memset(trails, 0, sizeof trails);
