@@ -150,15 +150,13 @@ LODE_API int64_t lode_relax(double *values, int64_t values_count, const uint8_t 
                             int64_t rows, int64_t columns, int64_t first, int64_t last, int64_t rows_wrap,
                             int64_t columns_wrap);
 
-/* trellis_choice.c ----------------------------------------------------------------------------------------------- */
+/* coefficient_classes.c ------------------------------------------------------------------------------------------ */
 
 /* `bands` are rows of the table of bands (band_fields.h); `relative`, `classes` and the like are the flat arrays that
  * the table describes, all of one length. Results are undefined for a band whose parents come later.
  */
 
 #define LODE_CLASSES 30
-#define LODE_INDICES 16
-#define LODE_RATES 64
 
 /* Coefficients of some bands in steps, and their classes by the size of what is around them.
  *
@@ -170,6 +168,11 @@ LODE_API int64_t lode_relax(double *values, int64_t values_count, const uint8_t 
 LODE_API int64_t lode_classify(const int64_t *bands, int64_t bands_count, const int64_t *steps, int64_t steps_count,
                                const int32_t *coefficients, int64_t coefficients_count, double *relative,
                                int64_t relative_count, int8_t *classes, int64_t classes_count);
+
+/* trellis_choice.c ----------------------------------------------------------------------------------------------- */
+
+#define LODE_INDICES 16
+#define LODE_RATES 64
 
 /* The cheapest indices of some bands, each row of blocks from state 0 of the trellis on.
  *

@@ -7,9 +7,7 @@
  * and what a filter feeds back of those before it, above and to the left. So each survivor of the algorithm keeps its
  * errors.
  */
-#include <stdbool.h>
-
-#include "band_fields.h"
+#include "bands.h"
 #include "copying.h"
 #include "lodestream.h"
 #include "trellis.h"
@@ -17,8 +15,7 @@
 #define LODE_INLINE static inline __attribute__((always_inline))
 
 enum {
-    BLOCK = 8,       /* rows and columns of the blocks in whose order a band is coded */
-    FIRST_CLASS = 8, /* of coefficients of about a step */
+    BLOCK = 8, /* rows and columns of the blocks in whose order a band is coded */
     LANES = TRELLIS_STATES,
     PLACES = LANES / 2, /* of a half */
     RULE = 6,           /* numbers that a band's rule has */
@@ -49,98 +46,6 @@ LODE_INLINE void arrange(const ints_t *pairs, ints_t *halves) {
     ints_t x = pairs[0], y = pairs[1];
     halves[0] = (ints_t){x[0], y[0], x[1], y[1]};
     halves[1] = (ints_t){y[3], x[3], y[2], x[2]};
-}
-
-LODE_INLINE void arrange_floats(const floats_t *pairs, floats_t *halves) {
-    floats_t x = pairs[0], y = pairs[1];
-    halves[0] = (floats_t){x[0], y[0], x[1], y[1]};
-    halves[1] = (floats_t){y[3], x[3], y[2], x[2]};
-}
-
-static int64_t least(int64_t a, int64_t b) {
-    return a < b ? a : b;
-}
-
-static double magnitude(double value) {
-    return __builtin_fabs(value);
-}
-
-/* Whether rows x columns elements from `place` on, rows `stride` apart and none in another, lie within `size`. */
-static bool holds(int64_t size, int64_t place, int64_t stride, int64_t rows, int64_t columns) {
-    if (place < 0 || place > size || rows < 1 || columns < 1 || columns > size - place)
-        return false;
-    return rows == 1 || (stride >= columns && rows - 1 <= (size - place - columns) / stride);
-}
-
-/* Whether a band lies within `size` elements. */
-static bool is_band(const int64_t *band, int64_t size) {
-    return band[BAND_ROWS] <= INT32_MAX && band[BAND_COLUMNS] <= INT32_MAX &&
-           holds(size, band[BAND_OFFSET], band[BAND_STRIDE], band[BAND_ROWS], band[BAND_COLUMNS]);
-}
-
-/* Whether what is around a band and its parents lie within `size` elements, too. */
-static bool has_surroundings(const int64_t *band, int64_t size) {
-    int64_t down = band[BAND_ROW_SHIFT], right = band[BAND_COLUMN_SHIFT];
-    if (band[BAND_STRIDE] < 0 || band[BAND_STRIDE] >= band[BAND_OFFSET] || down < 0 || down > 31 || right < 0 ||
-        right > 31)
-        return false;
-    return holds(size, band[BAND_OFFSET] - band[BAND_STRIDE] - 1, band[BAND_STRIDE], band[BAND_ROWS] + 2,
-                 band[BAND_COLUMNS] + 2) &&
-           holds(size, band[BAND_PARENT], band[BAND_PARENT_STRIDE], ((band[BAND_ROWS] - 1) >> down) + 1,
-                 ((band[BAND_COLUMNS] - 1) >> right) + 1);
-}
-
-static void divide(const int64_t *band, int64_t step, const int32_t *coefficients, double *relative) {
-    double scale = 1.0 / (double)step;
-    for (int64_t i = 0; i < band[BAND_ROWS]; i++) {
-        int64_t start = band[BAND_OFFSET] + i * band[BAND_STRIDE];
-        for (int64_t j = 0; j < band[BAND_COLUMNS]; j++)
-            relative[start + j] = coefficients[start + j] * scale;
-    }
-}
-
-/* Half octaves: 2 log2(size) + FIRST_CLASS rounded down, from the exponent, and whether the rest is sqrt(2) or more. */
-static int8_t class_of(double size) {
-    const uint64_t root = 0x6A09E667F3BCD; /* the fraction of sqrt(2) */
-    size += 1e-3;
-    uint64_t bits;
-    memcpy(&bits, &size, sizeof bits);
-    int64_t exponent = (int64_t)(bits >> 52 & 2047) - 1023;
-    int64_t found = 2 * exponent + ((bits & ((UINT64_C(1) << 52) - 1)) >= root) + FIRST_CLASS;
-    return (int8_t)(found < 0 ? 0 : least(found, LODE_CLASSES - 1));
-}
-
-/* Classes of a band's coefficients, by their eight neighbours and their parent. */
-static void classify(const int64_t *band, const double *relative, int8_t *classes) {
-    int64_t stride = band[BAND_STRIDE];
-    for (int64_t i = 0; i < band[BAND_ROWS]; i++) {
-        int64_t start = band[BAND_OFFSET] + i * stride;
-        const double *parents = relative + band[BAND_PARENT] + (i >> band[BAND_ROW_SHIFT]) * band[BAND_PARENT_STRIDE];
-        for (int64_t j = 0; j < band[BAND_COLUMNS]; j++) {
-            const double *at = relative + start + j;
-            double near = magnitude(at[-1]) + magnitude(at[1]) + magnitude(at[-stride]) + magnitude(at[stride]);
-            double corners = magnitude(at[-stride - 1]) + magnitude(at[-stride + 1]) + magnitude(at[stride - 1]) +
-                             magnitude(at[stride + 1]);
-            double above = magnitude(parents[j >> band[BAND_COLUMN_SHIFT]]);
-            classes[start + j] = class_of((2.0 * near + corners + 2.0 * above) / 14.0);
-        }
-    }
-}
-
-int64_t lode_classify(const int64_t *bands, int64_t bands_count, const int64_t *steps, int64_t steps_count,
-                      const int32_t *coefficients, int64_t coefficients_count, double *relative, int64_t relative_count,
-                      int8_t *classes, int64_t classes_count) {
-    if (relative_count != coefficients_count || classes_count != coefficients_count || bands_count % BAND_FIELDS ||
-        steps_count != bands_count / BAND_FIELDS)
-        return LODE_REFUSED;
-    for (int64_t number = 0; number < steps_count; number++) {
-        const int64_t *band = bands + number * BAND_FIELDS;
-        if (steps[number] < 1 || !is_band(band, coefficients_count) || !has_surroundings(band, coefficients_count))
-            return LODE_REFUSED;
-        divide(band, steps[number], coefficients, relative);
-        classify(band, relative, classes);
-    }
-    return 0;
 }
 
 /* A band whose indices are chosen. Errors are in steps. */
@@ -245,9 +150,9 @@ LODE_INLINE void advance(struct survivors *s, const struct branches *found, floa
         last[other] = either_float(takes, s->last[1], s->last[0]);
         root[other] = either(takes, s->root[1], s->root[0]);
     }
-    arrange_floats(cost, s->cost);
-    arrange_floats(error, s->last);
-    arrange_floats(last, s->second);
+    arrange((const ints_t *)cost, (ints_t *)s->cost);
+    arrange((const ints_t *)error, (ints_t *)s->last);
+    arrange((const ints_t *)last, (ints_t *)s->second);
     arrange(root, s->root);
     ints_t arranged[2];
     arrange(way, arranged);

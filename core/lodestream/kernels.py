@@ -290,9 +290,12 @@ pull = Kernel("pull", reads(_F64), reads(_BOOL), *[INTEGER] * 4, writes(_F64), w
 push = Kernel("push", writes(_F64), reads(_BOOL), *[INTEGER] * 6, reads(_F64))
 relax = Kernel("relax", writes(_F64), reads(_BOOL), *[INTEGER] * 6)
 
-# trellis_choice.c
-CLASSES, INDICES, RATES = 30, 16, 64
+# coefficient_classes.c
+CLASSES = 30
 classify = Kernel("classify", reads(_I64), reads(_I64), reads(_I32), writes(_F64), writes(_I8))
+
+# trellis_choice.c
+INDICES, RATES = 16, 64
 choose = Kernel(
     "choose",
     *[reads(_I64), reads(_F32), reads(_F64), reads(_I8), reads(_F32)],
