@@ -150,14 +150,13 @@ LODE_API int64_t lode_relax(double *values, int64_t values_count, const uint8_t 
                             int64_t rows, int64_t columns, int64_t first, int64_t last, int64_t rows_wrap,
                             int64_t columns_wrap);
 
-/* trellis_choice.c ----------------------------------------------------------------------------------------------- */
+/* coefficient_classes.c ------------------------------------------------------------------------------------------ */
 
 /* `bands` are rows of the table of bands (band_fields.h); `relative`, `classes` and the like are the flat arrays that
  * the table describes, all of one length. Results are undefined for a band whose parents come later.
  */
 
 #define LODE_CLASSES 30
-#define LODE_INDICES 16
 
 /* Coefficients of some bands in steps, and their classes by the size of what is around them.
  *
@@ -170,22 +169,29 @@ LODE_API int64_t lode_classify(const int64_t *bands, int64_t bands_count, const 
                                const int32_t *coefficients, int64_t coefficients_count, double *relative,
                                int64_t relative_count, int8_t *classes, int64_t classes_count);
 
+/* trellis_choice.c ----------------------------------------------------------------------------------------------- */
+
+#define LODE_INDICES 16
+#define LODE_RATES 64
+
 /* The cheapest indices of some bands, each row of blocks from state 0 of the trellis on.
  *
+ * rules:    six numbers of each band: how far below an index its point lies in the odd quantiser, 0 to 1; the weight of
+ *           a squared error; what is fed back of errors one and two rows above, one and two columns to the left.
  * relative, classes: as `lode_classify` makes them.
- * bits:   (2, LODE_CLASSES, LODE_INDICES): what an index takes without its sign, by quantiser and class; the last one
- *         stands for all that are larger.
- * worth:  the squared error, in squared steps, that a bit is worth.
- * chosen: the indices with their signs.
- * counts: as `bits`: increased by 1 for each index that was chosen.
- * indices, ways: room to work in, 4 and 1 for each coefficient of the largest band.
+ * rates:    (2, LODE_CLASSES, LODE_RATES): what an index costs, by quantiser and class.
+ * chosen:   the indices with their signs.
+ * counts:   (2, LODE_CLASSES, LODE_INDICES): increased by 1 for each index that was chosen; the last one of a class
+ *           stands for all that are larger.
+ * ways, above: room to work in, 64 and 2 for each column of the widest band.
  *
  * Returns 0.
  */
-LODE_API int64_t lode_choose(const int64_t *bands, int64_t bands_count, const double *relative, int64_t relative_count,
-                             const int8_t *classes, int64_t classes_count, const double *bits, int64_t bits_count,
-                             double worth, int32_t *chosen, int64_t chosen_count, double *counts, int64_t counts_count,
-                             int32_t *indices, int64_t indices_count, uint8_t *ways, int64_t ways_count);
+LODE_API int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
+                             const double *relative, int64_t relative_count, const int8_t *classes,
+                             int64_t classes_count, const float *rates, int64_t rates_count, int32_t *chosen,
+                             int64_t chosen_count, double *counts, int64_t counts_count, int16_t *ways,
+                             int64_t ways_count, float *above, int64_t above_count);
 
 /* lzf.c ---------------------------------------------------------------------------------------------------------- */
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .allocation import TileCurve, assign_layers
 from .band_fields import COLUMNS, ROWS
 from .bitplanes import pass_count, pass_gains
+from .closed_loop import ClosedLoop, quantise
 from .container.fields import told, told_roughly
 from .container.model import Errors, Header
 from .container.writer import CodedLayer, CodedSegment, write_container
@@ -24,12 +25,11 @@ from .piece_coder import as_returned, encode_pieces, piece_size
 from .predictors import COEFFICIENT_BITS, default_predictors
 from .preparation import Preparation
 from .quantiser import Quantiser
-from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
 from .reconstruction import Picture, channel_picture, initial_state, to_values
 from .surface import Surface
 from .tile_coder import Channel, TileCoder, planes_of
-from .tiles import Tiles, TileTable, gather
-from .transform import PADDING, forward, synthesis_norms
+from .tiles import TileTable, gather
+from .transform import PADDING, copied, forward, synthesis_norms
 from .window_errors import KIND as WINDOW_ERRORS
 from .window_errors import is_divided, layer_codes, no_errors, serialize_window_errors
 
@@ -38,9 +38,6 @@ __all__ = ["Encoding", "UnreachableError"]
 #: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
 #: whose tiles are all known is inverted without errors of rounding.
 _ROUNDING = 0.2
-
-#: The step of a stream made for one error, over the error, that is tried first.
-_LIKELY_STEP = 6
 
 #: The share of the bytes that errors of windows may take.
 _WINDOWS_SHARE = 0.005
@@ -76,6 +73,7 @@ class Encoding:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
         self.large = 0
+        self._loops: list[ClosedLoop] = []
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
@@ -149,47 +147,38 @@ class Encoding:
         )
 
     def _quantise(self, wanted: float) -> None:
-        """Put indices in the place of coefficients: with the longest steps whose error is at most the one wanted."""
-        table, channels = self.tables[0], self.channels[: self.geometric]
-        choosers = [IndexChooser(table, channel.true) for channel in channels]
-        state, canvases = np.zeros_like(self._all_passes()), self._canvases()
-        kept: dict[int, list[NDArray[np.int32]]] = {}
-        done: list[int] = []
+        """Choose indices, with the longest steps whose error is at most the one wanted."""
+        table, canvases = self.tables[0], self._canvases()
 
-        def error(base: int) -> float:
-            self.quantiser = Quantiser(base)
-            found = [chooser.indices(self.quantiser) for chooser in choosers]
-            self.tiles = [Tiles(table, self.quantiser) for _ in choosers]
-            for tiles, indices in zip(self.tiles, found, strict=True):
-                tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
-            self.header = self._header()
-            done.append(base)
-            self.progress(0.1 + 0.2 * len(done) / MOST_TRIES)
-            rms = told(self._distances(state, canvases)[0][0])
-            if rms <= wanted:
-                kept.clear()
-                kept[base] = found
-            return rms
+        def error(tries: float) -> float:
+            self.progress(0.1 + 0.2 * tries)
+            return told(self._distances_of(canvases, [0] * self.geometric)[0][0])
 
-        base = longest_base(error, wanted, _LIKELY_STEP * self.fineness)
-        if base is None:
+        found = quantise(table, self._loops, canvases, error, wanted, self.fineness)
+        if found is None:
             raise UnreachableError
-        self.quantiser = Quantiser(base)
+        self.quantiser, indices = found
+        self._loops.clear()
         squares = table.steps(self.quantiser).astype(np.float64) ** 2
-        for channel, indices in zip(channels, kept[base], strict=True):
-            channel.true, channel.weights = indices, channel.weights * squares
-            channel.top = np.array([planes_of(table, indices, tile) for tile in range(len(self.layout.tiles))], np.int8)
+        for channel, own in zip(self.channels, indices, strict=False):  # those behind the coordinates stay
+            channel.true, channel.weights, channel.top = own, channel.weights * squares, self._tops(table, own)
 
     def _transform(self, number: int, lattice: Lattice) -> tuple[Channel, NDArray[np.int8]]:
         """Lattice coordinates of a channel, transformed and cut into tiles."""
+        quantised = self.prepared.rms is not None and number < self.geometric
         for fit in (True, False):
             arrays = self.prepared.coordinates(number, lattice)
+            given = [copied(array) for array in arrays] if quantised else []
             predictors = forward(arrays, self.layout, fit)
             if max(_largest(array) for array in arrays) < 1 << COEFFICIENT_BITS:
                 break
         norms = [synthesis_norms(self.layout, predictors, grid) for grid in range(len(self.layout.grids))]
         table = self._table(number)
-        true = gather(table, arrays)
+        if quantised:
+            self._loops.append(ClosedLoop(table, predictors, given))
+            true = np.zeros(table.size, np.int32)  # until indices have been chosen
+        else:
+            true = gather(table, arrays)
         # Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an
         # attribute shares the stream in proportion to its own range.
         span = self.prepared.extent if number < self.geometric else self._span(number)
@@ -201,8 +190,11 @@ class Encoding:
                 for band in bands
             ]
         )
-        top = np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
-        return Channel(true, weights, top), predictors
+        return Channel(true, weights, self._tops(table, true)), predictors
+
+    def _tops(self, table: TileTable, true: NDArray[np.int32]) -> NDArray[np.int8]:
+        """Bit-planes of each tile."""
+        return np.array([planes_of(table, true, tile) for tile in range(len(self.layout.tiles))], np.int8)
 
     def _table(self, channel: int) -> TileTable:
         return self.tables[0 if channel < self.geometric else 1]
@@ -253,9 +245,14 @@ class Encoding:
         for number in range(self.geometric):
             places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
             fractions.append(self._picture(number, state, places)[1])
-        lattices = self.lattices[: self.geometric]
-        shown = canvases[self._curves_first :]
-        return coordinate_distances(self.prepared.originals, lattices, shown, fractions, cells=cells)
+        return self._distances_of(canvases, fractions, cells)
+
+    def _distances_of(
+        self, shown: list[NDArray[np.int32]], fractions: list[int], cells: list[NDArray[np.float64]] | None = None
+    ) -> list[tuple[float, float]]:
+        """Errors of coordinates over two to these powers."""
+        lattices, parts = self.lattices[: self.geometric], shown[self._curves_first :]
+        return coordinate_distances(self.prepared.originals, lattices, parts, fractions, cells=cells)
 
     def _errors(
         self, state: State, canvases: list[NDArray[np.int32]], cells: list[NDArray[np.float64]] | None = None

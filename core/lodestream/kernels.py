@@ -31,6 +31,7 @@ __all__ = [
     "PART_COLUMNS",
     "PART_ROWS",
     "PASSES_STATE",
+    "RATES",
     "TRELLIS_MODEL",
     "VALUE_TYPES",
     "choose",
@@ -265,15 +266,8 @@ def _described(values: tuple[Any, ...]) -> str:
     return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 
-_BOOL, _I8, _U8, _U16, _I32, _I64, _F64 = (
-    np.bool_,
-    np.int8,
-    np.uint8,
-    np.uint16,
-    np.int32,
-    np.int64,
-    np.float64,
-)
+_BOOL, _I8, _U8, _I16, _U16, _I32, _I64 = np.bool_, np.int8, np.uint8, np.int16, np.uint16, np.int32, np.int64
+_F32, _F64 = np.float32, np.float64
 
 # lifting.c
 LIFT_STRIP = 64
@@ -296,14 +290,16 @@ pull = Kernel("pull", reads(_F64), reads(_BOOL), *[INTEGER] * 4, writes(_F64), w
 push = Kernel("push", writes(_F64), reads(_BOOL), *[INTEGER] * 6, reads(_F64))
 relax = Kernel("relax", writes(_F64), reads(_BOOL), *[INTEGER] * 6)
 
-# trellis_choice.c
-CLASSES, INDICES = 30, 16
+# coefficient_classes.c
+CLASSES = 30
 classify = Kernel("classify", reads(_I64), reads(_I64), reads(_I32), writes(_F64), writes(_I8))
+
+# trellis_choice.c
+INDICES, RATES = 16, 64
 choose = Kernel(
     "choose",
-    *[reads(_I64), reads(_F64), reads(_I8), reads(_F64)],
-    REAL,
-    *[writes(_I32), writes(_F64), writes(_I32), writes(_U8)],
+    *[reads(_I64), reads(_F32), reads(_F64), reads(_I8), reads(_F32)],
+    *[writes(_I32), writes(_F64), writes(_I16), writes(_F32)],
 )
 
 # lzf.c

@@ -13,7 +13,7 @@ import numpy as np
 
 from .layout import Band, Layout
 
-__all__ = ["MOST_BASE", "Quantiser", "step_of"]
+__all__ = ["MOST_BASE", "Quantiser", "step_of", "steps_along"]
 
 #: Largest `Quantiser.base`.
 MOST_BASE = (1 << 24) - 1
@@ -39,17 +39,21 @@ class Quantiser:
 def step_of(band: Band, level: int, layout: Layout, quantiser: Quantiser) -> int:
     """The step of a band of a level, in lattice steps; at least 1 and below 2**26."""
     product = quantiser.base
-    first = max(level, 1)
     for axis in range(2):
-        if layout.grids[band.grid].curve and axis == 1:
-            # The points of a curve reach across the parts beside it, as nodes do.
-            count, detail = layout.levels + 1 - first, False
-        else:
-            every = range(first, layout.levels + 1)
-            count = sum(1 for k in every if layout.steps(band.grid, k)[axis].midpoints)
-            detail = band.kind[axis]
-        product *= _along(count, detail)
+        product *= _along(*steps_along(band, level, layout, axis))
     return max(1, product >> 32)
+
+
+def steps_along(band: Band, level: int, layout: Layout, axis: int) -> tuple[int, bool]:
+    """Steps of an axis from a band of a level to the finest level, and whether the band has details along it.
+
+    The points of a curve reach across the parts beside it, as nodes do.
+    """
+    first = max(level, 1)
+    if layout.grids[band.grid].curve and axis == 1:
+        return layout.levels + 1 - first, False
+    every = range(first, layout.levels + 1)
+    return sum(1 for k in every if layout.steps(band.grid, k)[axis].midpoints), band.kind[axis]
 
 
 def _along(count: int, detail: bool) -> int:

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from . import kernels
 from .band_fields import COLUMNS, ROWS
-from .kernels import CLASSES, INDICES
-from .quantiser import MOST_BASE, Quantiser
+from .kernels import CLASSES, INDICES, RATES
+from .quantiser import MOST_BASE
 from .tiles import TileTable
+from .trellis import TRANSITIONS
 
 __all__ = ["MOST_TRIES", "IndexChooser", "longest_base"]
 
-#: Squared error that a bit is worth, in squared steps.
+#: Squared error that a bit is worth, in squared steps of one point of the surface.
 _WORTH = 0.05
 _FIRST_CLASS = 8.0  # number of the class whose coefficients are about a step
-_TURNS = 2  # of the first choice
 #: How many coefficients the Laplace distribution counts for among those that were seen of a class.
 _PRIOR = 8.0
 #: Coefficients in one call of a kernel, unless a band has more.
@@ -37,40 +37,73 @@ _ERROR_TO_STEP = 1.2
 
 
 class IndexChooser:
-    """Chooses the indices of one channel.
+    """Chooses the indices of one channel, band by band: `begin`, then `choose` until all bands are done, then `end`.
 
     Parameters
     ----------
     table : TileTable
-    coefficients : int32, flat, see `tiles.gather`
+
+    Attributes
+    ----------
+    chosen : int32, flat
+        The indices chosen since `begin`.
     """
 
-    def __init__(self, table: TileTable, coefficients: NDArray[np.int32]) -> None:
-        self._table, self._coefficients = table, coefficients
-        self._bits = _laplace()
-        self._turns = _TURNS
-        sizes = table.bands[:, ROWS] * table.bands[:, COLUMNS]
-        self._runs = _runs(sizes)
-        # What the kernel works in: 4 indices and a byte for each coefficient of a band.
-        largest = int(sizes.max(initial=0))
-        self._room = np.empty((largest, 4), np.int32), np.empty(largest, np.uint8)
+    chosen: NDArray[np.int32]
 
-    def indices(self, quantiser: Quantiser) -> NDArray[np.int32]:
-        """The index of every coefficient, flat."""
-        table, steps = self._table, self._table.steps(quantiser)
-        relative = np.zeros(table.size)
-        classes = np.zeros(table.size, np.int8)
-        for first, last in self._runs:
-            kernels.classify(table.bands[first:last], steps[first:last], self._coefficients, relative, classes)
-        chosen = np.zeros(table.size, np.int32)
-        for _ in range(self._turns):
-            counts = _PRIOR * np.exp2(-_laplace())
-            for first, last in self._runs:
-                bands = table.bands[first:last]
-                kernels.choose(bands, relative, classes, self._bits, _WORTH, chosen, counts, *self._room)
-            self._bits = -np.log2(counts / counts.sum(axis=2, keepdims=True))
-        self._turns = 1  # what was learned of one choice serves the next one, with other steps, too
+    def __init__(self, table: TileTable) -> None:
+        self._table = table
+        self._bits = _laplace()
+        widest = int(table.bands[:, COLUMNS].max(initial=0))
+        # What the kernel works in: of a row of blocks, for each survivor.
+        self._room = np.empty(8 * len(TRANSITIONS) * widest, np.int16), np.empty(2 * widest, np.float32)
+
+    def begin(self, steps: NDArray[np.int64], rules: NDArray[np.float32]) -> None:
+        """Choose all indices anew; what was learned of the last ones serves, with other steps, too.
+
+        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        """
+        self._steps, self._rules = steps, rules
+        self._relative = np.zeros(self._table.size)
+        self._classes = np.zeros(self._table.size, np.int8)
+        self.chosen = np.zeros(self._table.size, np.int32)
+        self._rates = _rates(self._bits)
+        self._counts = _PRIOR * np.exp2(-_laplace())
+
+    def choose(self, numbers: NDArray[np.int64], coefficients: NDArray[np.int32]) -> None:
+        """Choose the indices of some bands, after those of their parents.
+
+        Parameters
+        ----------
+        numbers : int64
+            Of the bands in the table.
+        coefficients : int32, flat, see `tiles.gather`
+            What the indices are to stand for.
+        """
+        bands = self._table.bands[numbers]
+        relative, classes = self._relative, self._classes
+        for first, last in _runs(bands[:, ROWS] * bands[:, COLUMNS]):
+            run, own = bands[first:last], numbers[first:last]
+            kernels.classify(run, self._steps[own], coefficients, relative, classes)
+            kernels.choose(
+                run, self._rules[own], relative, classes, self._rates, self.chosen, self._counts, *self._room
+            )
+
+    def end(self) -> NDArray[np.int32]:
+        """All indices, flat; what they cost is estimated from them when others are chosen."""
+        self._bits = -np.log2(self._counts / self._counts.sum(axis=2, keepdims=True))
+        chosen = self.chosen
+        del self.chosen, self._relative, self._classes
         return chosen
+
+
+def _rates(bits: NDArray[np.float64]) -> NDArray[np.float32]:
+    """What each index costs with its sign: float32, shape (quantiser, class, `kernels.RATES`)."""
+    index = np.arange(RATES)
+    rates = bits[:, :, np.minimum(index, INDICES - 1)] + (index > 0)
+    rates += 2.0 * np.log2(np.maximum(index - INDICES + 3, 1)) * (index >= INDICES - 1)
+    found: NDArray[np.float32] = (_WORTH * rates).astype(np.float32, order="C")
+    return found
 
 
 def _runs(sizes: NDArray[np.int64]) -> list[tuple[int, int]]:
@@ -125,7 +158,7 @@ def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) ->
             below = max(below, base)
         else:
             above = min(above, base)
-        if _CLOSE * wanted <= error <= wanted:
+        if _CLOSE * wanted <= error <= wanted or above * _CLOSE < below:
             break
         known.append((math.log(max(error, 1e-300) / aim), math.log(base)))
         known.sort(key=lambda point: abs(point[0]))

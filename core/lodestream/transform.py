@@ -23,9 +23,15 @@ from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitte
 __all__ = [
     "PADDING",
     "allocate",
+    "bare_level",
+    "copied",
     "forward",
     "inverse",
+    "inverse_level",
     "synthesis_norms",
+    "take_details",
+    "take_nodes",
+    "third_step",
 ]
 
 #: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
@@ -46,6 +52,13 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
     """
     rows, columns = shape
     return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
+
+
+def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A copy from `allocate`."""
+    copy = allocate(array.shape)
+    copy[...] = array
+    return copy
 
 
 def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
@@ -106,27 +119,65 @@ def inverse(
 
     Of a channel that is no ``coordinate`` no side comes from a curve, and curves mean nothing.
     """
-    takes = coordinate and layout.shared
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.curve]
-    if takes:
-        _take_nodes(arrays, layout)
+    if coordinate:
+        take_nodes(arrays, layout)
     for finer in range(1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
                 corner = _corner(arrays[k], layout.shape(k, whole))
                 np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
                 corner <<= FRACTION_BITS
-            grid, steps = layout.grids[k], layout.steps(k, finer)
-            corner = _corner(arrays[k], layout.shape(k, finer))
-            if takes and not grid.curve:
-                _take_details(arrays, layout, predictors, k, finer)
-            for axis in (1, 0):
-                if steps[axis].midpoints:
-                    inverse_step(corner, axis, steps[axis], predictor(predictors, grid, steps[axis], finer, axis))
+            if coordinate:
+                take_details(arrays, layout, predictors, k, finer)
+            inverse_level(arrays[k], layout, predictors, k, finer)
 
 
-def _take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from curves: their common ends first, then the sides of parts."""
+def inverse_level(
+    array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
+) -> None:
+    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in (1, 0):
+        if steps[axis].midpoints:
+            inverse_step(
+                corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
+            )
+
+
+def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
+    """Turn a level of a grid into nodes of the level below and details before the third step, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in range(2):
+        if steps[axis].midpoints:
+            forward_step(corner, axis, steps[axis], (0, 0))
+
+
+def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> NDArray[np.int32]:
+    """What the third step predicts of the details from the nodes of the coarser level: floor((v_k + 128) / 256).
+
+    Parameters
+    ----------
+    nodes : int32, shape (row, column)
+        ``step.coarse`` of them along ``axis``.
+
+    Returns
+    -------
+    int32, shape (row, column)
+        ``step.midpoints`` of them along ``axis``.
+    """
+    rows, columns = nodes.shape
+    values = allocate((step.length, columns) if axis == 0 else (rows, step.length))
+    if nodes.size and predictor != (0, 0):
+        # Undone with the third step and done without it, a step leaves of no details what that predicts.
+        values[:rows, :columns] = nodes
+        inverse_step(values, axis, step, predictor)
+        forward_step(values, axis, step, (0, 0))
+    return values[step.coarse :] if axis == 0 else values[:, step.coarse :]
+
+
+def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
+    """Level 0 of what comes from curves, in place: their common ends first, then the sides of parts."""
     for k, grid in enumerate(layout.grids):
         rows, columns = layout.shape(k, 0)
         for side, source in enumerate(grid.sources):
@@ -147,11 +198,13 @@ def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source,
     return points[::-1] if source.reversed else points
 
 
-def _take_details(
+def take_details(
     arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], part: int, level: int
 ) -> None:
-    """The details along a part's sides that come from curves."""
+    """The details along a part's sides that come from curves, in place: curves are at ``level`` already."""
     grid, steps = layout.grids[part], layout.steps(part, level)
+    if grid.curve:
+        return
     rows, columns = (step.coarse for step in steps)
     for side, source in enumerate(grid.sources):
         axis = 1 if side < 2 else 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,10 @@ from lodestream.band_fields import (
     ROWS,
     STRIDE,
 )
-from lodestream.kernels import CLASSES, INDICES
+from lodestream.kernels import CLASSES, INDICES, RATES
 from lodestream.layout import Grid, Layout
+from lodestream.noise_shaping import feedback_rules
+from lodestream.predictors import COEFFICIENT_BITS
 from lodestream.quantiser import MOST_BASE, Quantiser
 from lodestream.rate_distortion import IndexChooser, longest_base
 from lodestream.tiles import TileTable
@@ -93,109 +96,196 @@ def _places(band: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(band[OFFSET] + i * band[STRIDE] + j)
 
 
-def in_blocks(values: NDArray[Any]) -> list[Any]:
-    """Values in the order in which a band is coded: blocks of 8 x 8 in raster order."""
-    rows, columns = values.shape
-    blocks = (values[i : i + 8, j : j + 8] for i in range(0, rows, 8) for j in range(0, columns, 8))
-    return [value for block in blocks for value in block.ravel().tolist()]
+def rates_of(bits: NDArray[np.float64]) -> NDArray[np.float32]:
+    """What indices cost without a table of them: float32, shape (quantiser, class, index)."""
+    rates = np.zeros((*bits.shape[:2], RATES), np.float32)
+    for k in range(RATES):
+        beyond = 2 * math.log2(k - INDICES + 3) if k >= INDICES - 1 else 0.0
+        rates[:, :, k] = WORTH * (bits[:, :, min(k, INDICES - 1)] + (k > 0) + beyond)
+    return rates
 
 
-def rows_of_blocks(values: NDArray[Any]) -> list[slice]:
-    """In each of which the trellis begins anew."""
-    return [slice(top, top + 8) for top in range(0, len(values), 8)]
+RATES_OF_INDICES = rates_of(BITS)
 
 
-def cost_of(size: float, group: int, odd: int, k: int) -> float:
-    """Squared error and bits of an index without its sign."""
-    rate = float(BITS[odd, group, min(k, INDICES - 1)]) + (1.0 if k else 0.0)
-    if k >= INDICES - 1:
-        rate += 2 * math.log2(k - INDICES + 3)
-    return (size - (k - 0.5 * odd if k else 0.0)) ** 2 + WORTH * rate
+def test_rates_are_bits_with_a_sign() -> None:
+    assert rate_distortion._rates(BITS) == pytest.approx(RATES_OF_INDICES, rel=1e-6)
 
 
-def least_cost(sizes: list[float], groups: list[int]) -> float:
-    """Of all ways through the trellis."""
-    costs = {0: 0.0}
-    for size, group in zip(sizes, groups, strict=True):
-        after: dict[int, float] = {}
-        for state, cost in costs.items():
-            odd = int(ODD[state])
-            for k in {0, int(size), int(size) + 1, int(size + 0.5) + 1}:
-                total = cost + cost_of(size, group, odd, k)
-                to = int(TRANSITIONS[state, k & 1])
-                after[to] = min(after.get(to, math.inf), total)
-        costs = after
-    return min(costs.values())
-
-
-def choose(values: NDArray[np.float64], classes: NDArray[np.int8]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def choose(
+    values: NDArray[np.float64], classes: NDArray[np.int8], rule: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Indices of a band, and how often each was chosen."""
     rows, columns = values.shape
     band = np.zeros((1, BAND_FIELDS), np.int64)
     band[0, [STRIDE, ROWS, COLUMNS]] = columns, rows, columns
     chosen, counts = np.zeros(values.shape, np.int32), np.zeros(BITS.shape)
-    room = np.empty(4 * values.size, np.int32), np.empty(values.size, np.uint8)
-    kernels.choose(band, values, classes, BITS, WORTH, chosen, counts, *room)
+    room = np.empty(64 * columns, np.int16), np.empty(2 * columns, np.float32)
+    kernels.choose(band, rule, values, classes, RATES_OF_INDICES, chosen, counts, *room)
     return chosen, counts
 
 
-def check(values: NDArray[np.float64], classes: NDArray[np.int8]) -> float:
-    """The cost of what is chosen, which is counted and has the signs of the values."""
-    chosen, counts = choose(values, classes)
-    total, expected = 0.0, np.zeros(BITS.shape)
-    for rows in rows_of_blocks(values):
+def point_of(k: int, odd: int, half: float) -> float:
+    """Where an index without its sign lies."""
+    return k - half * odd if k else 0.0
+
+
+def check(
+    values: NDArray[np.float64], classes: NDArray[np.int8], rule: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], float]:
+    """What is chosen and what it costs, with what is fed back; counts are those of the indices."""
+    chosen, counts = choose(values, classes, rule)
+    half, weight, *taps = rule.tolist()
+    total, expected, errors = 0.0, np.zeros(BITS.shape), np.zeros(values.shape)
+    for top in range(0, len(values), 8):
         state = 0
-        arrays = np.abs(values[rows]), classes[rows], chosen[rows]
-        for size, group, index in zip(*map(in_blocks, arrays), strict=True):
-            odd, k = int(ODD[state]), abs(index)
-            total += cost_of(size, group, odd, k)
-            expected[odd, group, min(k, INDICES - 1)] += 1
+        for i, j in in_blocks(len(values), values.shape[1], top):
+            odd, k = int(ODD[state]), abs(int(chosen[i, j]))
+            errors[i, j] = values[i, j] - math.copysign(point_of(k, odd, half), chosen[i, j])
+            total += float(RATES_OF_INDICES[odd, classes[i, j], min(k, RATES - 1)])
+            expected[odd, classes[i, j], min(k, INDICES - 1)] += 1
             state = int(TRANSITIONS[state, k & 1])
     assert np.array_equal(counts, expected)
-    assert (np.sign(chosen) * np.where(values >= 0, 1, -1) >= 0).all()
-    return total
+    return chosen, total + weight * float((shaped(errors, taps) ** 2).sum())
 
 
-@settings(max_examples=35)
+def shaped(errors: NDArray[np.float64], taps: Sequence[float]) -> NDArray[np.float64]:
+    """Errors, and what is fed back of those above and to the left."""
+    for axis, (first, second) in enumerate([taps[:2], taps[2:]]):
+        padded = np.pad(errors, [(2, 0) if axis == 0 else (0, 0), (2, 0) if axis == 1 else (0, 0)])
+        n = errors.shape[axis]
+        zero, one, two = (padded.take(range(2 - k, 2 - k + n), axis) for k in range(3))
+        errors = zero + first * one + second * two
+    return errors
+
+
+def in_blocks(rows: int, columns: int, top: int) -> list[tuple[int, int]]:
+    """Places of a row of blocks in the order in which they are coded."""
+    bottom = min(top + 8, rows)
+    return [
+        (i, j) for left in range(0, columns, 8) for i in range(top, bottom) for j in range(left, min(left + 8, columns))
+    ]
+
+
+def cheapest(values: NDArray[np.float64], classes: NDArray[np.int8], rule: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Viterbi's algorithm, each of whose survivors is a whole band with its errors."""
+    half, weight, *taps = rule.tolist()
+    rows, columns = values.shape
+    indices, errors = np.zeros(values.shape, np.int32), np.zeros(values.shape)
+    for top in range(0, rows, 8):
+        survivors = {0: (0.0, indices, errors)}
+        for i, j in in_blocks(rows, columns, top):
+            after: dict[int, tuple[float, int, int, float]] = {}
+            for state, (cost, _, known) in sorted(survivors.items()):
+                odd = int(ODD[state])
+                around = np.zeros((3, 3))
+                around[max(2 - i, 0) :, max(2 - j, 0) :] = known[max(i - 2, 0) : i + 1, max(j - 2, 0) : j + 1]
+                around[2, 2] = 0.0
+                wanted = values[i, j] + shaped(around, taps)[2, 2]
+                for k in {0, int(abs(wanted) + half * odd), int(abs(wanted) + half * odd) + 1}:
+                    point = point_of(k, odd, half)
+                    rate = float(RATES_OF_INDICES[odd, classes[i, j], min(k, RATES - 1)])
+                    total = cost + weight * (abs(wanted) - point) ** 2 + rate
+                    to = int(TRANSITIONS[state, k & 1])
+                    if to not in after or total < after[to][0]:
+                        after[to] = total, state, int(math.copysign(k, wanted)), math.copysign(point, wanted)
+            grown = {}
+            for to, (total, state, k, point) in after.items():
+                _, own, known = survivors[state]
+                grown[to] = total, own.copy(), known.copy()
+                grown[to][1][i, j], grown[to][2][i, j] = k, values[i, j] - point
+            survivors = grown
+        _, indices, errors = min(survivors.values(), key=lambda survivor: survivor[0])
+    return indices
+
+
+rules = st.builds(
+    lambda half, weight, taps: np.array([half, weight, *taps], np.float32),
+    st.sampled_from([0.5, 0.5, 0.625, 1.0]),
+    st.floats(0.25, 4.0, width=32),
+    st.sampled_from([(0, 0, 0, 0), (0.17, 0, -0.34, 0.09), (-0.17, 0.03, 0.27, 0), (-0.34, 0.09, -0.27, 0.06)]),
+)
+
+
+@settings(max_examples=30)
 @given(
     sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
     classes=st.lists(st.integers(0, CLASSES - 1), min_size=5, max_size=5),
+    half=st.sampled_from([0.5, 0.75]),
 )
-def test_the_cheapest_of_all_indices_are_found(sizes: list[float], classes: list[int]) -> None:
-    groups = classes[: len(sizes)]
-
+def test_without_feedback_the_cheapest_of_all_indices_are_found(
+    sizes: list[float], classes: list[int], half: float
+) -> None:
     def cost(indices: tuple[int, ...]) -> float:
         state, total = 0, 0.0
-        for size, group, k in zip(sizes, groups, indices, strict=True):
-            total += cost_of(abs(size), group, int(ODD[state]), k)
+        for size, group, k in zip(sizes, classes, indices, strict=False):
+            odd = int(ODD[state])
+            total += (abs(size) - point_of(k, odd, half)) ** 2 + float(RATES_OF_INDICES[odd, group, k])
             state = int(TRANSITIONS[state, k & 1])
         return total
 
-    nearest = [sorted({0, int(abs(size)), int(abs(size)) + 1, int(abs(size) + 0.5) + 1}) for size in sizes]
+    nearest = [sorted({0, int(abs(size)), int(abs(size)) + 1, int(abs(size) + half) + 1}) for size in sizes]
     best = min(cost(way) for way in itertools.product(*nearest))
-    assert check(np.array([sizes]), np.array([groups], np.int8)) == pytest.approx(best, abs=1e-9)
-    assert least_cost([abs(size) for size in sizes], groups) == pytest.approx(best, abs=1e-9)
+    rule = np.array([half, 1, 0, 0, 0, 0], np.float32)
+    _, found = check(np.array([sizes]), np.array([classes[: len(sizes)]], np.int8), rule)
+    assert found == pytest.approx(best, rel=1e-5, abs=1e-5)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
-    shape=st.tuples(st.integers(1, 19), st.integers(1, 19)),
-    scale=st.floats(-4, 12).map(lambda power: 2.0**power),
+    shape=st.tuples(st.integers(1, 18), st.integers(1, 19)),
+    scale=st.floats(-7, 6).map(lambda power: 2.0**power),
+    rule=rules,
     seed=st.integers(0, 2**32),
 )
-def test_the_cheapest_way_through_a_band_is_found(shape: tuple[int, int], scale: float, seed: int) -> None:
+def test_each_survivor_keeps_its_errors(
+    shape: tuple[int, int], scale: float, rule: NDArray[np.float32], seed: int
+) -> None:
     rng = np.random.default_rng(seed)
-    values, classes = rng.laplace(0, scale, shape), rng.integers(0, CLASSES, shape).astype(np.int8)
-    rows = rows_of_blocks(values)
-    best = sum(least_cost(in_blocks(np.abs(values[row])), in_blocks(classes[row])) for row in rows)
-    # Bits of large indices are taken from a table of logarithms.
-    assert check(values, classes) == pytest.approx(best, rel=1e-12, abs=1e-6 * values.size)
+    # Few binary places: float32 then makes no difference but in what is fed back.
+    values = np.rint(64 * np.clip(rng.laplace(0, scale, shape), -30, 30)) / 64
+    values[8:16] *= rng.integers(0, 2)  # a row of blocks without anything
+    classes = rng.integers(0, CLASSES, shape).astype(np.int8)
+    chosen, cost = check(values, classes, rule)
+    expected = cheapest(values, classes, rule)
+    if not np.array_equal(chosen, expected):  # two ways cost the same but for the rounding of float32
+        assert (chosen != expected).mean() < 0.2 or values.size < 40
+        assert cost == pytest.approx(cost_of(values, classes, expected, rule), rel=0.02)
+
+
+def cost_of(
+    values: NDArray[np.float64], classes: NDArray[np.int8], chosen: NDArray[np.int32], rule: NDArray[np.float32]
+) -> float:
+    """What some indices cost."""
+    half, weight, *taps = rule.tolist()
+    total, errors = 0.0, np.zeros(values.shape)
+    for top in range(0, len(values), 8):
+        state = 0
+        for i, j in in_blocks(len(values), values.shape[1], top):
+            odd, k = int(ODD[state]), abs(int(chosen[i, j]))
+            errors[i, j] = values[i, j] - math.copysign(point_of(k, odd, half), chosen[i, j])
+            total += float(RATES_OF_INDICES[odd, classes[i, j], min(k, RATES - 1)])
+            state = int(TRANSITIONS[state, k & 1])
+    return total + float(weight * (shaped(errors, taps) ** 2).sum())
+
+
+@given(
+    value=st.floats(30, 2.0**27).flatmap(lambda value: st.sampled_from([value, -value])),
+    half=st.sampled_from([0.5, 1.0]),
+    seed=st.integers(0, 99),
+)
+def test_indices_of_large_coefficients_are_near(value: float, half: float, seed: int) -> None:
+    values = value + np.random.default_rng(seed).normal(size=(9, 9))
+    rule = np.array([half, 1, -0.34, 0.09, 0.27, 0], np.float32)
+    chosen, _ = choose(values, np.full((9, 9), CLASSES - 1, np.int8), rule)
+    assert np.abs(chosen - values).max() < 3
 
 
 @pytest.mark.parametrize("value", [2.0**31, -(2.0**31), 1e300, -np.inf, np.nan])
-def test_what_no_index_reaches_gets_the_largest(value: float) -> None:
-    chosen, counts = choose(np.array([[value]]), np.array([[3]], np.int8))
-    assert abs(int(chosen[0, 0])) in (2**31 - 2, 2**31 - 1)
+def test_no_index_is_larger_than_a_coefficient_may_be(value: float) -> None:
+    rule = np.array([0.5, 1, -0.34, 0.09, -0.34, 0.09], np.float32)
+    chosen, counts = choose(np.array([[value]]), np.array([[3]], np.int8), rule)
+    assert 2**27 < abs(int(chosen[0, 0])) < 2**COEFFICIENT_BITS
     assert counts[0, 3, -1] == counts.sum() == 1
 
 
@@ -206,18 +296,27 @@ def test_indices_do_not_depend_on_how_bands_are_cut_into_calls(
 ) -> None:
     table = TileTable.of(layout)
     flat = coefficients_of(table, np.random.default_rng(seed))
-    whole = IndexChooser(table, flat)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rate_distortion, "_AT_ONCE", at_once)
-        cut = IndexChooser(table, flat)
+    whole, cut = IndexChooser(table), IndexChooser(table)
     for turn in range(2):
-        expected = whole.indices(Quantiser(base + turn))
-        assert np.array_equal(cut.indices(Quantiser(base + turn)), expected)
+        quantiser = Quantiser(base + turn)
+        steps, rules = table.steps(quantiser), feedback_rules(table, quantiser)
+        expected = chosen_by(whole, steps, rules, flat)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(rate_distortion, "_AT_ONCE", at_once)
+            assert np.array_equal(chosen_by(cut, steps, rules, flat), expected)
         error = np.zeros(table.size)
-        for band, step in zip(table.bands, table.steps(Quantiser(base + turn)), strict=True):
+        for band, step in zip(table.bands, steps, strict=True):
             own = _places(band)
             error[own] = np.abs(flat[own] / step - expected[own])
-        assert error.max() < 2.5
+        assert error.max() < 3
+
+
+def chosen_by(
+    chooser: IndexChooser, steps: NDArray[np.int64], rules: NDArray[np.float32], flat: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    chooser.begin(steps, rules)
+    chooser.choose(np.arange(len(steps)), flat)
+    return chooser.end()
 
 
 SIZE = 90
@@ -235,14 +334,16 @@ def guarded(count: int, dtype: str) -> tuple[NDArray[Any], NDArray[Any]]:
 class Arrays:
     """What the two kernels are given, and what lies around what they write."""
 
-    def __init__(self, changed: dict[int, int], size: int = SIZE, room: int = 50) -> None:
+    def __init__(self, changed: dict[int, int], size: int = SIZE, room: int = 10) -> None:
         self.bands = np.zeros((1, BAND_FIELDS), np.int64)
         for field, value in (BAND | changed).items():
             self.bands[0, field] = value
         self.steps = np.array([3])
         self.coefficients = np.random.default_rng(size).integers(-99, 99, size).astype(np.int32)
         kinds = {"relative": (size, "f8"), "classes": (size, "i1"), "chosen": (size, "i4")}
-        kinds |= {"counts": (BITS.size, "f8"), "indices": (4 * room, "i4"), "ways": (room, "u1")}
+        kinds |= {"counts": (BITS.size, "f8"), "ways": (64 * room, "i2"), "above": (2 * room, "f4")}
+        self.rules = np.array([0.5, 1, -0.34, 0.09, 0.27, 0], np.float32)
+        self.rates = RATES_OF_INDICES
         self.written = {name: guarded(*kind) for name, kind in kinds.items()}
 
     def __getattr__(self, name: str) -> NDArray[Any]:
@@ -252,8 +353,8 @@ class Arrays:
         return kernels.classify(self.bands, self.steps, self.coefficients, self.relative, self.classes)
 
     def choose(self) -> int:
-        rest = self.chosen, self.counts, self.indices, self.ways
-        return kernels.choose(self.bands, self.relative, self.classes, BITS, WORTH, *rest)
+        rest = self.chosen, self.counts, self.ways, self.above
+        return kernels.choose(self.bands, self.rules, self.relative, self.classes, self.rates, *rest)
 
     def check(self) -> None:
         """Nothing around what may be written was written."""
@@ -348,9 +449,14 @@ def test_classes_that_do_not_fit_are_refused(name: str, value: NDArray[Any]) -> 
         ("relative", np.zeros(SIZE + 1)),
         ("classes", np.zeros(SIZE - 1, np.int8)),
         ("chosen", np.zeros(SIZE - 1, np.int32)),
+        ("rules", np.zeros(5, np.float32)),
+        ("rules", np.full(6, -0.125, np.float32)),
+        ("rules", np.full(6, 1.125, np.float32)),
+        ("rules", np.full(6, np.nan, np.float32)),
+        ("rates", np.zeros(2 * CLASSES * RATES - 1, np.float32)),
         ("counts", np.zeros(BITS.size - 1)),
-        ("indices", np.zeros(199, np.int32)),
-        ("ways", np.zeros(49, np.uint8)),
+        ("ways", np.zeros(639, np.int16)),
+        ("above", np.zeros(19, np.float32)),
     ],
 )
 def test_choices_that_do_not_fit_are_refused(name: str, value: NDArray[Any]) -> None:
@@ -366,9 +472,11 @@ def test_choices_that_do_not_fit_are_refused(name: str, value: NDArray[Any]) -> 
         st.one_of(st.integers(-5, 100), st.integers(-(2**63) + 1, 2**63 - 1)),
     ),
     classes=st.lists(st.integers(-128, 127), min_size=SIZE, max_size=SIZE),
+    taps=st.lists(st.floats(width=32), min_size=5, max_size=5),
 )
-def test_no_band_and_no_class_leads_outside(changed: dict[int, int], classes: list[int]) -> None:
+def test_no_band_and_no_class_leads_outside(changed: dict[int, int], classes: list[int], taps: list[float]) -> None:
     arrays = Arrays(changed, room=SIZE * 4)
+    arrays.rules[1:] = taps
     for run in (arrays.classify, arrays.choose):
         with contextlib.suppress(ValueError):  # refused
             run()
