@@ -85,6 +85,19 @@ end_header
 """
 
 
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("rows", [0, 1, 3])
+def test_an_element_may_have_no_property(tmp_path: Path, order: str, rows: int) -> None:
+    path = tmp_path / "a.ply"
+    header = f"ply\nformat {order} 1.0\nelement nothing {rows}\nelement vertex 1\nproperty uchar c\nend_header\n"
+    path.write_bytes(header.encode() + (b"\n" * rows + b"7\n" if order == "ascii" else b"\x07"))
+    tables = read_elements(path, read_header(path))
+    assert tables["nothing"] == {}
+    read = tables["vertex"]["c"]
+    assert not isinstance(read, Lists)
+    assert read.tolist() == [7]
+
+
 @pytest.mark.parametrize(
     ("header", "body", "message"),
     [
@@ -101,6 +114,11 @@ end_header
         (HEADER, "1 2\n3\n1 77777\n", "line 10: expected 2 numbers of vertex, got '3'"),
         (HEADER, "1 2\n3 x\n0\n", "line 10: expected numbers of vertex, got '3 x'"),
         (HEADER, "1 2\n3 256\n0\n", "line 10: expected an integer from 0 to 255 (c) of vertex"),
+        (
+            HEADER.replace("property list uchar int v\n", ""),
+            "1 2\n3 4\n0\n",
+            "line 10: expected 0 numbers of face, got '0'",
+        ),
         (HEADER, "1 2\n3 4\n3 5 6\n", "line 11: expected lists after their lengths of face"),
         (HEADER, "1 2\n3 4\n1 5 6\n", "line 11: expected 2 numbers of face"),
         (HEADER, "1 2\n3 4\n1 5e9\n", "expected v of face as integers"),

@@ -108,7 +108,8 @@ class _Words:
             for offset, row in enumerate(words):
                 if len(row) != width:
                     raise self._refusal(start + offset, f"{width} numbers")
-            yield start, self._floats(words, start).reshape(-1, width)
+            # Not -1 rows: an element may have rows without any number.
+            yield start, self._floats(words, start).reshape(len(words), width)
 
     def _floats(self, words: list[list[bytes]], start: int) -> NDArray[np.float64]:
         try:
