@@ -1,133 +1,169 @@
-"""Section 8 of docs/format.md: the reconstruction of every state, and section 13: states come in any order."""
+"""A surface from segments: sections 8 to 10 of docs/format.md put together."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .container import Container, Exactness, Segment, windows
+from .bands import Band
+from .coefficients import quantiser_step, reconstructed
+from .container import Container, Segment, read_container, windows_of
 from .exactness import restore
 from .header import Header
-from .levels import Levels
-from .masks import Masks, no_holes
-from .reconstruction import EIGHTHS, Channel, Values, block_places, plane_value, put_together, rounded, value
-from .tiles import units_of
-
-__all__ = ["Decoder", "Shown", "decode"]
+from .large_units import LargeUnit
+from .masks import Masks
+from .reconstruction import places, plane_values, reconstruct, values_of
+from .small_units import SmallUnit
+from .tiles import Parents
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a block shows: its points, then its attributes, shape (row, column[, component]); and the valid points."""
+    """The values of a state.
 
-    arrays: list[Values]
-    valid: Values
+    Attributes
+    ----------
+    points : list of array
+        For each block (h, w) or (h, w, C), in the type of the points.
+    attributes : list of dict of str to array
+        For each block its arrays by name: (h, w) or (h, w, components).
+    """
+
+    points: list[NDArray[Any]]
+    attributes: list[dict[str, NDArray[Any]]]
 
 
 class Decoder:
-    """Decodes segments in any order that the page allows.
+    """Decodes units as their segments come, and shows the surface as it is after any number of their passes.
 
-    `states` has, after 0, 1, 2, ... calls of `take`, the passes that remain of each unit; -1 where it is not known.
+    Parameters
+    ----------
+    header : Header
+        Of the container.
+    masks : Masks or None
+        Holes.
     """
 
     def __init__(self, header: Header, masks: Masks | None = None) -> None:
         self.header = header
-        self.masks = masks or no_holes(header.blocks)
-        self.levels = Levels(header)
-        self.units = units_of(header, self.levels)
-        self.states = [self._state(-1)]
+        self.masks = masks
+        self.units: dict[int, SmallUnit | LargeUnit] = {}
+        self._bands: dict[int, list[Band]] = {}
 
-    def take(self, segments: Iterable[Segment], certain: int = -1) -> None:
-        """Decode segments, after which nothing more comes of the levels up to `certain`: a new state.
+    def add(self, segment: Segment) -> None:
+        """Decode the next passes of a unit; those of its parent's same planes must have been added."""
+        number = segment.unit
+        if segment.top:
+            channels = len(self.header.types)
+            indices = self.header.base > 0 and number % channels < self.header.coordinates
+            large = self.header.tiles.large[self.header.tiles.tiles[number // channels].level] and not indices
+            bands = self.bands(number)
+            self.units[number] = LargeUnit(bands, segment.top) if large else SmallUnit(bands, segment.top, indices)
+        self.units[number].decode(segment.data, segment.passes)
 
-        StreamError where a unit has not so many passes.
-        """
-        for segment in segments:
-            self.units[segment.unit].decode(segment.top, segment.passes, segment.data)
-        self.states.append(self._state(certain))
+    def bands(self, unit: int) -> list[Band]:
+        """Give the bands of a unit, before its first segment all 0."""
+        if unit not in self._bands:
+            header = self.header
+            tile_number, channel = divmod(unit, len(header.types))
+            tile, attribute = header.tiles.tiles[tile_number], channel >= header.coordinates
+            above = {}
+            if tile.parent >= 0:
+                shares = header.tiles.tiles[tile.parent].shares[attribute]
+                bands = self.bands(tile.parent * len(header.types) + channel)
+                above = {(share.grid, share.kind): (share, band) for share, band in zip(shares, bands, strict=True)}
+            self._bands[unit] = []
+            for share in tile.shares[attribute]:
+                parents = None
+                if (share.grid, share.kind) in above:
+                    other, band = above[share.grid, share.kind]
+                    parents = Parents(header.grids[share.grid], tile.level, share, other), band
+                self._bands[unit].append(Band(share.shape, share.kind, parents))
+        return self._bands[unit]
 
-    def _state(self, certain: int) -> list[int]:
-        state = []
-        for number, unit in enumerate(self.units):
-            is_empty = self.header.empty[number % self.header.channels] >> unit.level & 1
-            is_zero = unit.remaining < 0 and (is_empty or not unit.bands or unit.level <= certain)
-            state.append(0 if is_zero else unit.remaining)
-        return state
-
-    def channel(self, number: int, level: int, state: Sequence[int]) -> list[Values]:
-        """The values of a channel at a level, in one of the states or one before it.
+    def show(self, remaining: dict[int, int], complete: bool, level: int | None = None) -> Shown:
+        """Reconstruct the surface.
 
         Parameters
         ----------
-        number, level : int
-        state : sequence of int
-            Passes that remain of each unit, as in `states`.
-
-        Returns
-        -------
-        list of arrays, shape (row, column)
-            One for each block, in the channel's type, little-endian; holes hold anything.
+        remaining : dict of int to int
+            For each unit that has passes in this state, how many remain.
+        complete : bool
+            All layers are there, so units without passes have only coefficients 0.
+        level : int, optional
+            The level that is made; the finest one if it is not given.
         """
         header = self.header
-        own = list(zip(self.units, state, strict=True))[number :: header.channels]
-        unknown = [unit.level for unit, remaining in own if remaining and 0 < unit.level <= level]
-        whole = min(unknown, default=level + 1) - 1  # F of the page
-        channel = Channel(header, self.levels, number, level)
-        for unit, remaining in own:
-            if unit.level <= level and remaining >= 0:
-                channel.put(unit, remaining, EIGHTHS if unit.level > whole else 1)
-        channel.refine(whole)
-        over = EIGHTHS if whole < level else 1
-        grids = (put_together(header, self.levels, block, level, channel.arrays) for block in range(len(header.blocks)))
-        return [rounded(value(header.lattices[number], grid / over), header.types[number]) for grid in grids]
+        level = header.finest if level is None else level
+        channels = len(header.types)
+        arrays: list[list[NDArray[Any]]] = []
 
-    def shown(self, state: int = -1, level: int | None = None, exactness: Exactness | None = None) -> list[Shown]:
-        """The blocks in a state, by its place in `states`; those of a coarser level, or those that were written."""
+        def coefficients(tile: int, channel: int) -> list[NDArray[np.int64]]:
+            unit = tile * channels + channel
+            shares = header.tiles.tiles[tile].shares[channel >= header.coordinates]
+            if unit not in remaining:
+                return [np.zeros(share.shape, np.int64) for share in shares]
+            found = []
+            for share, band in zip(shares, self.bands(unit), strict=True):
+                step = 0
+                if header.base and channel < header.coordinates:
+                    step = quantiser_step(header.base, header.grids[share.grid], header.tiles.tiles[tile].level, share)
+                found.append(reconstructed(band, remaining[unit], step))
+            return found
+
+        for channel in range(channels):
+            whole = self._whole(channel, remaining, complete, level)
+            grids = reconstruct(header, channel, level, whole, coefficients)
+            arrays.append([values_of(q, whole < level, header.lattices[channel], header.types[channel]) for q in grids])
+        return self._assembled(arrays, level)
+
+    def _whole(self, channel: int, remaining: dict[int, int], complete: bool, level: int) -> int:
+        """Find the largest level up to which all coefficients are known."""
         header = self.header
-        level = self.levels.last if level is None else level
-        channels = [self.channel(number, level, self.states[state]) for number in range(header.channels)]
-        if exactness is not None:
-            for piece, window in zip(exactness.pieces, windows(header, self.masks), strict=True):
-                values = channels[window.channel][window.block][window.rows, window.columns]
-                masks = self.masks.kept if window.kept else self.masks.valid
-                chosen = masks[window.block][window.rows, window.columns]
-                values[chosen] = restore(piece, values[chosen])
-        return [
-            self._block(number, [blocks[number] for blocks in channels], level, exactness is not None)
-            for number in range(len(header.blocks))
-        ]
+        channels = len(header.types)
+        for number, tile in enumerate(header.tiles.tiles):
+            if tile.level > level:
+                break
+            if tile.level and not header.empty[channel] >> tile.level & 1:
+                unit = number * channels + channel
+                if unit in remaining:
+                    known = remaining[unit] == 0
+                else:
+                    known = complete or not tile.shares[channel >= header.coordinates]
+                if not known:
+                    return tile.level - 1
+        return level
 
-    def _block(self, number: int, channels: list[Values], level: int, exact: bool) -> Shown:
-        """A block as it is handed out, from the values of its channels: with x and y, and with holes."""
+    def _assembled(self, arrays: list[list[NDArray[Any]]], level: int) -> Shown:
         header = self.header
-        rows, columns = block_places(header, self.levels, number, level)
-        valid = self.masks.valid[number][np.ix_(rows, columns)]
-        holes = ~(valid | self.masks.kept[number]) if exact else ~valid
-        points, first = channels[: header.points_channels], header.points_channels
-        if header.plane is not None and level == self.levels.last:
-            size = header.blocks[number].rows, header.blocks[number].columns
-            for axis, rule in enumerate(reversed(header.plane["grid"])):
-                numbers = [plane_value(rule, axis, (row, column), size) for row in rows for column in columns]
-                points.insert(0, rounded(np.array(numbers).reshape(valid.shape), header.type))
-        arrays = [_with_holes(points, holes, self.masks.hole, header.flat and header.plane is None)]
-        for attribute in header.attributes:
-            own = channels[first : first + attribute.channels]
-            arrays.append(_with_holes(own, holes, 0, not attribute.components))
-            first += attribute.channels
-        return Shown(arrays, valid)
+        points, attributes = [], []
+        for number in range(len(header.blocks)):
+            lines, parts = places(header, number, level)
+            channels = []
+            for channel, grids in enumerate(arrays):
+                values = np.zeros([len(line) for line in lines], header.types[channel])
+                for grid, index in parts:
+                    values[index] = grids[grid]
+                channels.append(values)
+            first = channels[: header.channels]
+            if header.plane is not None:
+                first = plane_values(header, level) + first
+            points.append(first[0] if header.flat and header.plane is None else np.stack(first, axis=-1))
+            found = {}
+            at = header.channels
+            for name, _, components in header.attributes:
+                count = max(components, 1)
+                found[name] = np.stack(channels[at : at + count], axis=-1) if components else channels[at]
+                at += count
+            attributes.append(found)
+            if self.masks is not None and self.masks.valid[number] is not None:
+                holes = ~self.masks.valid[number][np.ix_(*lines)]
+                self._mark(points[-1], found, holes)
+        return Shown(points, attributes)
 
-
-def _with_holes(channels: list[Values], holes: Values, hole: int, flat: bool) -> Values:
-    array = np.stack(channels, axis=-1)
-    array[holes] = np.nan if array.dtype.kind == "f" else hole
-    return array[..., 0] if flat else array
-
-
-def decode(container: Container) -> Decoder:
-    """Decode all layers of a container, or of the beginning of one: a state for each."""
-    decoder = Decoder(container.header, container.masks)
-    for number, layer in enumerate(container.layers, 1):
-        decoder.take(layer.segments, decoder.levels.last if number == container.header.layers else -1)
-    return decoder
+    def _mark(self, points: NDArray[Any], attributes: dict[str, NDArray[Any]], holes: NDArray[np.bool_]) -> None:
+        assert self.masks is not None
+        points[holes] = np.nan if points.dtype.kind == "f" else self.masks.hole
+        for values in attributes.values():
+            values[holes] = np.nan if values.dtype.kind == "f" else 0

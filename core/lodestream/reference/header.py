@@ -1,198 +1,353 @@
-"""Sections 3, 3.1 and 3.2 of docs/format.md: what the header says of a surface."""
-
-from __future__ import annotations
+"""The header: sections 3 to 3.2 of docs/format.md."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
-import msgpack
+import numpy as np
 
-from ..errors import StreamError, UnsupportedVersionError
-from .fields import Fields
+from ..errors import UnsupportedVersionError
+from .fields import Fields, unpack_map
+from .levels import Axis, Grid, fitted_steps, levels_of
+from .tiles import Tiles, tiles_of
 
-__all__ = ["Block", "Grid", "Header", "Lattice", "read_header"]
+CODECS = 6
+"""Codecs 1 to 6 are decoded here."""
 
-TYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-
-CODECS = {1, 3, 4, 5, 6}
-
-Bits = tuple[bool, ...]
-
-
-class Block(NamedTuple):
-    """A grid of points, and which of its axes wrap."""
-
-    rows: int
-    columns: int
-    closed: Bits
-
-
-class Side(NamedTuple):
-    """The curve from which a part takes a side."""
-
-    curve: int
-    reversed: bool
+TYPES = [
+    np.dtype(name)
+    for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64")
+]
 
 
 @dataclass(frozen=True)
-class Grid:
-    """What is coded as a grid: a curve, or a part, which is a window of a block.
+class Block:
+    """A block: rows, columns, and whether both wrap."""
 
-    Sides are the first row, the last row, the first column, the last column.
+    rows: int
+    columns: int
+    wraps: tuple[bool, bool]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve: its points, whether it stops, whether it is closed."""
+
+    length: int
+    stops: bool
+    closed: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part.
+
+    Attributes
+    ----------
+    block : int
+        Number of its block.
+    wraps, reverse, stops : (bool, bool)
+        Of axis 0 and axis 1: it wraps, is stored in reverse order, stops.
+    clamped : (bool, bool, bool, bool)
+        First row, last row, first column, last column.
+    window : (int, int, int, int)
+        First row, rows, first column, columns of its block.
+    curves : list of (int, bool) or None
+        For each side in the order of `clamped` the curve it comes from and whether that is reversed.
     """
 
-    block: int  # -1: it is a curve
-    shape: tuple[int, int]
-    first: tuple[int, int] = (0, 0)
-    closed: Bits = (False, False)
-    backwards: Bits = (False, False)
-    stops: Bits = (False, False)
-    clamped: Bits = (False,) * 4
-    sides: tuple[Side | None, ...] = (None,) * 4
-
-    @property
-    def is_curve(self) -> bool:
-        """Whether it is a curve."""
-        return self.block < 0
-
-
-class Attribute(NamedTuple):
-    """An array beside the points."""
-
-    name: str
-    type: str
-    components: int
-
-    @property
-    def channels(self) -> int:
-        """How many channels it takes."""
-        return max(self.components, 1)
-
-
-class Lattice(NamedTuple):
-    """The rule that turns the integers of a channel into values."""
-
-    decimal: bool
-    origin: float
-    step: float
+    block: int
+    wraps: tuple[bool, bool]
+    reverse: tuple[bool, bool]
+    stops: tuple[bool, bool]
+    clamped: tuple[bool, bool, bool, bool]
+    window: tuple[int, int, int, int]
+    curves: list[tuple[int, bool] | None]
 
 
 @dataclass(frozen=True)
 class Header:
-    """Section 3, in the words of the page; `predictors` are the pairs of each channel."""
+    """What the header says.
+
+    Attributes
+    ----------
+    flat, exact, exactness, masks : bool
+        The points are arrays (H, W); the complete stream is exact; an exactness section follows; masks follow.
+    types : list of dtype
+        Of each of the N channels, attributes last.
+    channels, layers : int
+        Channels of the points, C; number of layers.
+    tile, piece : (int, int)
+        Binary logarithms of rows and columns of a tile, and of a piece of exactness.
+    base : int
+        0, or that of the quantisers.
+    extent : float
+        The d of a tolerance.
+    blocks, curves, parts : list
+        The arrangement.
+    attributes : list of (str, dtype, int)
+        Name, type and components (0: an array (H, W)) of each array beside the points.
+    plane : list or None
+        The rules of x and y.
+    joints : list or None
+        As in the extras.
+    lattices : list of (int, float, float)
+        Rule, origin and step of each channel.
+    empty : list of int
+        Of each channel, a bit for each level.
+    predictors : list of dict
+        Of each channel: (lower level, 0 or 1 for the axes of parts, 2 for curves) to (a, b).
+    """
 
     flat: bool
     exact: bool
-    has_exactness: bool
-    has_masks: bool
-    type: str
-    points_channels: int
+    exactness: bool
+    masks: bool
+    types: list[np.dtype[Any]]
+    channels: int
     layers: int
     tile: tuple[int, int]
     piece: tuple[int, int]
-    base: int  # 0 where coordinates are not quantised
+    base: int
+    extent: float
     blocks: list[Block]
-    grids: list[Grid]  # curves first
-    attributes: list[Attribute]
-    plane: dict[str, Any] | None
-    lattices: list[Lattice]
+    curves: list[Curve]
+    parts: list[Part]
+    attributes: list[tuple[str, np.dtype[Any], int]]
+    plane: list[list[Any]] | None
+    joints: list[Any] | None
+    lattices: list[tuple[int, float, float]]
     empty: list[int]
-    predictors: list[list[tuple[int, int]]]
-
-    @property
-    def channels(self) -> int:
-        """N of the page."""
-        return len(self.lattices)
+    predictors: list[dict[tuple[int, int], tuple[int, int]]]
+    grids: list[Grid]
 
     @property
     def coordinates(self) -> int:
         """How many of the first channels are coordinates."""
-        return min(self.points_channels, 3)
+        return min(self.channels, 3)
 
     @property
-    def types(self) -> list[str]:
-        """The type of every channel."""
-        return [self.type] * self.points_channels + [a.type for a in self.attributes for _ in range(a.channels)]
+    def finest(self) -> int:
+        """The finest level, L."""
+        return len(self.grids[0].axes) - 1
+
+    @cached_property
+    def tiles(self) -> Tiles:
+        """All tiles."""
+        return tiles_of(self.grids, self.tile)
+
+    @cached_property
+    def holders(self) -> dict[tuple[int, int], tuple[int, int]]:
+        """For each end of a curve that another holds, (curve, 0 or 1), the end that holds it."""
+        return common_ends(self.curves, self.parts)
 
 
-def _bits(number: int, first: int, count: int) -> Bits:
-    return tuple(bool(number >> bit & 1) for bit in range(first, first + count))
+def read_header(payload: bytes, offset: int = 0) -> Header:
+    """Read the payload of the header's section.
 
+    Parameters
+    ----------
+    payload : bytes
+        What the frame encloses.
+    offset : int
+        Where it begins in the container.
 
-def _read_curve(fields: Fields) -> Grid:
-    number = fields.varint()
-    closed, stops = bool(number & 1), bool(number & 2)
-    open_ends = not closed, not closed, False, False
-    return Grid(-1, (number >> 2, 1), closed=(closed, False), stops=(stops, False), clamped=open_ends)
-
-
-def _read_part(fields: Fields, blocks: list[Block]) -> Grid:
-    block = fields.varint()
-    flags, ends = fields.number("B"), fields.number("B")
-    row, rows, column, columns = 0, blocks[block].rows, 0, blocks[block].columns
+    Raises
+    ------
+    CorruptStreamError
+        The header is damaged.
+    UnsupportedVersionError
+        The container needs a codec that is not known here.
+    """
+    fields = Fields(payload, offset)
+    for codec in [fields.varint() for _ in range(fields.count())]:
+        if not 1 <= codec <= CODECS:
+            raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
+    flags, kind, channels, layers = fields.u8(), fields.u8(), fields.varint(), fields.varint()
+    tile, piece = _sizes(fields), _sizes(fields)
+    base, extent = fields.varint(), fields.float()
+    if kind >= len(TYPES) or not channels or not layers or base >= 1 << 24:
+        raise fields.damaged("type, channels, layers, base or flags are out of range")
     if flags & 64:
-        row, rows, column, columns = (fields.varint() for _ in range(4))
-    numbers = [fields.varint() if has_curve else None for has_curve in _bits(ends, 4, 4)]
-    return Grid(
-        block=block,
-        shape=(rows, columns),
-        first=(row, column),
-        closed=_bits(flags, 0, 2),
-        backwards=_bits(flags, 2, 2),
-        stops=_bits(flags, 4, 2),
-        clamped=_bits(ends, 0, 4),
-        sides=tuple(None if number is None else Side(number >> 1, bool(number & 1)) for number in numbers),
-    )
-
-
-def _read_block(fields: Fields) -> Block:
-    return Block(fields.varint(), fields.varint(), _bits(fields.number("B"), 0, 2))
-
-
-def read_header(payload: bytes) -> Header:
-    """The header, from the payload of its section; StreamError where its bytes end early."""
-    fields = Fields(payload)
-    codecs = [fields.varint() for _ in range(fields.varint())]
-    if not CODECS.issuperset(codecs):
-        raise UnsupportedVersionError(f"expected codecs among {sorted(CODECS)}, got {codecs}")
-    flags = fields.number("B")
-    kind = TYPES[fields.number("B")]
-    points_channels, layers = fields.varint(), fields.varint()
-    tile, piece = fields.number("B"), fields.number("B")
-    base = fields.varint()
-    if base >= 2**24:
-        raise StreamError(f"expected a base below 2^24, got {base}")
-    fields.short_f64()  # the extent, which decoding does not use
-    if flags & 64:
-        blocks = [_read_block(fields) for _ in range(fields.varint())]
-        grids = [_read_curve(fields) for _ in range(fields.varint())]
-        grids += [_read_part(fields, blocks) for _ in range(fields.varint())]
+        blocks, curves, parts = _arrangement(fields)
     else:
-        blocks = [Block(fields.varint(), fields.varint(), _bits(flags, 0, 2))]
-        grids = [Grid(0, blocks[0][:2], closed=blocks[0].closed)]
-    extras = msgpack.unpackb(fields.take(fields.varint())) if flags & 128 else {}
-    attributes = [Attribute(name, TYPES[number], count) for name, number, count in extras.get("attributes", [])]
-    channels = range(points_channels + sum(attribute.channels for attribute in attributes))
-    lattices = [Lattice(fields.number("B") == 1, fields.short_f64(), fields.short_f64()) for _ in channels]
-    empty = [fields.varint() for _ in channels]
-    predictors = [[(fields.number("b"), fields.number("b")) for _ in range(fields.varint())] for _ in channels]
-    fields.finish()
+        wraps = (bool(flags & 1), bool(flags & 2))
+        blocks, curves = [Block(fields.varint(), fields.varint(), wraps)], []
+        no = (False, False)
+        window = (0, blocks[0].rows, 0, blocks[0].columns)
+        parts = [Part(0, wraps, no, no, (False,) * 4, window, [None] * 4)]
+    attributes, plane, joints = _extras(fields, fields.take(fields.varint())) if flags & 128 else ([], None, None)
+    if (flags & 4 or plane) and channels != 1 or plane and (len(blocks) > 1 or not flags & 4):
+        raise fields.damaged("an array (H, W) of several channels, or a plane of several blocks")
+    points = sum(block.rows * block.columns for block in blocks)
+    total = channels + sum(max(components, 1) for _, _, components in attributes)
+    if points < 2 or points * total >= 1 << 63:
+        raise fields.damaged(f"{points} points of {total} channels")
+    for long in (tile, piece):
+        pieces = sum(max(1, b.rows >> long[0]) * max(1, b.columns >> long[1]) for b in blocks)
+        if pieces > 64 + len(blocks) + (points >> max(long)):
+            raise fields.damaged("tiles or pieces are too long for the blocks")
+    if total > fields.left:
+        raise fields.damaged("the header ends before its lattices")
+    lattices = [(fields.u8(), fields.float(), fields.float()) for _ in range(total)]
+    if any(rule > 1 or step <= 0 for rule, _, step in lattices):
+        raise fields.damaged("a lattice of no known rule, or without a step")
+    empty = [fields.varint() for _ in range(total)]
+    grids = _grids(curves, parts)
+    predictors = []
+    for channel in range(total):
+        steps = fitted_steps(grids, channel < min(channels, 3))
+        if fields.varint() != len(steps):
+            raise fields.damaged("not as many predictors as fitted steps")
+        predictors.append({step: (fields.number("b"), fields.number("b")) for step in steps})
+    if any(-128 in pair for fitted in predictors for pair in fitted.values()):
+        raise fields.damaged("a predictor is out of range")
+    fields.end()
+    types = [TYPES[kind]] * channels
+    for _, dtype, components in attributes:
+        types += [dtype] * max(components, 1)
+    bits = [bool(flags & 1 << bit) for bit in range(8)]
     return Header(
-        flat=bool(flags & 4),
-        exact=bool(flags & 8),
-        has_exactness=bool(flags & 16),
-        has_masks=bool(flags & 32),
-        type=kind,
-        points_channels=points_channels,
-        layers=layers,
-        tile=(tile & 15, tile >> 4),
-        piece=(piece & 15, piece >> 4),
-        base=base,
-        blocks=blocks,
-        grids=grids,
-        attributes=attributes,
-        plane=extras.get("plane"),
-        lattices=lattices,
-        empty=empty,
-        predictors=predictors,
+        *(bits[2], bits[3], bits[4], bits[5], types, channels, layers, tile, piece, base, extent, blocks, curves),
+        *(parts, attributes, plane, joints, lattices, empty, predictors, grids),
     )
+
+
+def _sizes(fields: Fields) -> tuple[int, int]:
+    byte = fields.u8()
+    first, second = byte & 15, byte >> 4
+    if not first or not second or not 8 <= first + second <= 16:
+        raise fields.damaged("a size of tiles or pieces is out of range")
+    return first, second
+
+
+def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
+    blocks = []
+    for _ in range(fields.count(3)):
+        rows, columns, bits = fields.varint(), fields.varint(), fields.u8()
+        blocks.append(Block(rows, columns, (bool(bits & 1), bool(bits & 2))))
+        if bits > 3 or not rows or not columns:
+            raise fields.damaged("a block without points, or with unknown flags")
+    curves = []
+    for _ in range(fields.count()):
+        value = fields.varint()
+        curves.append(Curve(value >> 2, bool(value & 2), bool(value & 1)))
+        if not value >> 2:
+            raise fields.damaged("a curve without points")
+    parts = [_part(fields, blocks, curves) for _ in range(fields.count(3))]
+    if {part.block for part in parts} != set(range(len(blocks))):
+        raise fields.damaged("a block without a part")
+    return blocks, curves, parts
+
+
+def _part(fields: Fields, blocks: list[Block], curves: list[Curve]) -> Part:
+    number, flags, ends = fields.varint(), fields.u8(), fields.u8()
+    if number >= len(blocks) or flags > 127:
+        raise fields.damaged("a part of no block, or with unknown flags")
+    block = blocks[number]
+    window = (0, block.rows, 0, block.columns)
+    if flags & 64:
+        window = (fields.varint(), fields.varint(), fields.varint(), fields.varint())
+    wraps = (bool(flags & 1), bool(flags & 2))
+    sides: list[tuple[int, bool] | None] = []
+    for side in range(4):
+        value = fields.varint() if ends & 16 << side else None
+        sides.append(None if value is None else (value >> 1, bool(value & 1)))
+    for axis, size in enumerate((block.rows, block.columns)):
+        first, count = window[2 * axis : 2 * axis + 2]
+        if not 0 < count <= size or first >= size or (first + count > size and not block.wraps[axis]):
+            raise fields.damaged("a window beyond its block")
+        if wraps[axis] and not (count == size and block.wraps[axis] and not ends >> 2 * axis & 3):
+            raise fields.damaged("an axis that wraps has a side, or is a piece of its block's")
+        for side in (2 * axis, 2 * axis + 1):
+            _check_side(fields, sides[side], ends, side, curves, window[3 - 2 * axis], wraps[1 - axis], flags >> (5 - axis))
+    return Part(
+        *(number, wraps, (bool(flags & 4), bool(flags & 8)), (bool(flags & 16), bool(flags & 32))),
+        *((bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)), window, sides),
+    )
+
+
+def _check_side(
+    fields: Fields,
+    side: tuple[int, bool] | None,
+    ends: int,
+    number: int,
+    curves: list[Curve],
+    points: int,
+    wraps: bool,
+    stops: int,
+) -> None:
+    if side is None:
+        return
+    if not ends >> number & 1 or side[0] >= len(curves):
+        raise fields.damaged("a side of no curve, or not clamped")
+    curve = curves[side[0]]
+    if curve.length != 1 and (curve.length, curve.closed, curve.stops) != (points, wraps, bool(stops & 1)):
+        raise fields.damaged("a curve unlike its side")
+
+
+def _grids(curves: list[Curve], parts: list[Part]) -> list[Grid]:
+    axes = [(Axis(c.length, c.closed, (not c.closed, not c.closed)), Axis(1, False)) for c in curves]
+    stops = [(curve.stops, False) for curve in curves]
+    for part in parts:
+        c = part.clamped
+        first, second = Axis(part.window[1], part.wraps[0], c[:2]), Axis(part.window[3], part.wraps[1], c[2:])
+        axes.append((first, second))
+        stops.append(part.stops)
+    held = common_ends(curves, parts)
+    left = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
+    left += [tuple(side is not None for side in part.curves) for part in parts]  # type: ignore[misc]
+    return [
+        Grid(number < len(curves), chain, left[number]) for number, chain in enumerate(levels_of(axes, stops))
+    ]
+
+
+def common_ends(curves: list[Curve], parts: list[Part]) -> dict[tuple[int, int], tuple[int, int]]:
+    """Find the ends of curves that another end holds.
+
+    Returns
+    -------
+    dict of (int, int) to (int, int)
+        From (curve, 0 for its first point and 1 for its last) to the end that holds it. A curve of one point has one end, 0.
+    """
+    same: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def first(end: tuple[int, int]) -> tuple[int, int]:
+        while end in same:
+            end = same[end]
+        return end
+
+    for part in parts:
+        if any(part.wraps):
+            continue
+        for corner in range(4):
+            down, across = corner >> 1, corner & 1
+            met = []
+            for side, along in ((part.curves[down], across), (part.curves[2 + across], down)):
+                if side is not None:
+                    curve, turned = side
+                    met.append(first((curve, (along ^ turned) if curves[curve].length > 1 else 0)))
+            if len(met) == 2 and met[0] != met[1]:
+                same[max(met)] = min(met)
+    return {end: first(end) for end in same}
+
+
+def _extras(
+    fields: Fields, data: bytes
+) -> tuple[list[tuple[str, np.dtype[Any], int]], list[list[Any]] | None, list[Any] | None]:
+    extras = unpack_map(data, fields.offset + fields.position - len(data))
+    attributes = []
+    plane = None
+    try:
+        for name, kind, components in extras.get("attributes", []):
+            if not isinstance(name, str) or not 0 <= int(kind) < len(TYPES) or not 0 <= int(components) < 1 << 31:
+                raise ValueError("an attribute of no known type")
+            attributes.append((name, TYPES[int(kind)], int(components)))
+        if "plane" in extras:
+            plane = [list(rule) for rule in extras["plane"]["grid"]]
+            if len(plane) != 2 or not all(plane):
+                raise ValueError("a plane of other than two rules")
+        joints = extras.get("joints")
+    except (TypeError, ValueError, KeyError) as error:
+        raise fields.damaged(f"extras: {error}") from None
+    return attributes, plane, joints
