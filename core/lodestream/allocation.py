@@ -20,18 +20,18 @@ from .layout import Layout
 __all__ = ["TileCurve", "assign_layers", "step_slopes"]
 
 #: A segment takes so many bits besides its passes: in the layer's table, in the index, and to start and end a coder.
-_SEGMENT = 96.0
+_SEGMENT = 48.0
 #: Two steps are one where as two they save less than this share of the tile's bits so far, or than a segment takes;
 #: early in the stream, where many segments are in the same layer anyway, less than a share of the stream's bits.
-_SHARE_OF_TILE = 0.06
-_SHARE_OF_STREAM = 0.02
+_SHARE_OF_TILE = 0.02
+_SHARE_OF_STREAM = 0.005
 #: What a step adds to a layer besides its passes, in bytes.
 _ENTRY = 5
 #: By how much the bytes grow from layer to layer, at least and at most, where there are more than so many ...
 _GROWTH = 1.12, 1.147
 _OFTEN = 3800
 #: ... and before: a layer's frame takes about 50 bytes with its share of the index, which counts there.
-_EARLY_GROWTH = 1.3, 1.5
+_EARLY_GROWTH = 1.4, 1.8
 _EARLY_STEP = 160
 _FIRST_LAYER = 48  # bytes of coefficients, at least where there are more layers
 # Of streams made for one error; one of fewer bytes than the first is one layer.

@@ -17,6 +17,7 @@ from .container.fields import told, told_roughly
 from .container.model import Errors, Header
 from .container.writer import CodedLayer, CodedSegment, write_container
 from .digest import DIGEST, values_digest
+from .large_units import large_level
 from .lattice import Lattice
 from .picture import Original, coordinate_distances, other_originals
 from .piece_coder import as_returned, encode_pieces, piece_size
@@ -74,6 +75,7 @@ class Encoding:
     ) -> None:
         self.prepared, self.progress = prepared, progress
         self.quantiser: Quantiser | None = None
+        self.large = 0
         self.geometric, self.layout = prepared.geometric, prepared.layout
         table = TileTable.of(self.layout)
         self.tables = table, TileTable.of(self.layout, False) if self.layout.shared else table
@@ -132,6 +134,7 @@ class Encoding:
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
             tile=self.layout.tile,
             piece=prepared.pieces[-1],
+            large=self.large,
             exact=False,
             corrected=False,
             layer_count=0,
@@ -216,7 +219,9 @@ class Encoding:
 
     def _curves(self) -> list[TileCurve]:
         """Cost and gain of every pass, by coding each tile once as a whole."""
-        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser)
+        coded = self._tables_of_channels(), self.channels, self.geometric, self.quantiser
+        self.large = large_level(*coded)
+        coder = TileCoder(*coded, self.large)
         self.tiles, self._strings = coder.tiles, coder.strings
         curves = []
         for tile in range(len(self.layout.tiles)):
@@ -350,7 +355,8 @@ class Encoding:
     def _coded(self, states: list[State], errors: list[Errors]) -> list[CodedLayer]:
         """Code the passes that each layer adds."""
         del self.tiles, self._last  # as large as what takes their place
-        coder = TileCoder(self._tables_of_channels(), self.channels, self.geometric, self.quantiser, self._strings)
+        coded = self._tables_of_channels(), self.channels, self.geometric, self.quantiser
+        coder = TileCoder(*coded, self.large, self._strings)
         before = start = self._all_passes()
         layers = []
         for state, measured in zip(states, errors, strict=True):

@@ -18,13 +18,10 @@ from .axis import AxisStep, axis_lengths, axis_step
 from .errors import InputError
 from .surface import Closed
 
-__all__ = ["LARGE", "REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
+__all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
 
 #: Layouts, and tables of their tiles, that are remembered: that of a surface in hand is asked for again and again.
 REMEMBERED = 4
-
-#: Points of all grids at a level from which on its units are large.
-LARGE = 1 << 15
 
 Sides = tuple[bool, bool, bool, bool]
 _NONE: Sides = (False, False, False, False)
@@ -285,17 +282,13 @@ class Layout:
         """Numbers of the tiles of a level."""
         return self._tile_ranges[level]
 
-    @cached_property
-    def first_large(self) -> int:
-        """The first tile whose units are large; the number of tiles where none is.
+    def points(self, level: int) -> int:
+        """Of all grids at a level."""
+        return sum(rows * columns for rows, columns in (shapes[level] for shapes in self._shapes))
 
-        All units of a level are large where the grids have together at least `LARGE` points at it; every finer level
-        has more. Units of indices never are.
-        """
-        for level in range(1, self.levels + 1):
-            if sum(rows * columns for rows, columns in (s[level] for s in self._shapes)) >= LARGE:
-                return self.tiles_of(level).start
-        return len(self.tiles)
+    def tiles_from(self, level: int) -> int:
+        """The first tile of a level; the number of tiles where there is none, as for level 0."""
+        return self.tiles_of(level).start if 0 < level <= self.levels else len(self.tiles)
 
     @cached_property
     def _tile_ranges(self) -> list[range]:

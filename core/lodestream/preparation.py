@@ -32,7 +32,7 @@ __all__ = ["Precisions", "Preparation", "given_channel"]
 TILE_BITS, PIECE_BITS = 12, 12
 #: The same for surfaces of at most so many points, where these take many bytes each.
 _SMALL_TILE, _SMALL_PIECE, _SMALL = 11, 10, 1 << 19
-#: Where no window is wanted, or small pieces would take many more bytes.
+#: Of x, y, z, where no window is wanted, or small pieces would take many more bytes.
 _WHOLE_TILE, _WHOLE_PIECE = 14, 16
 
 #: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
@@ -118,7 +118,8 @@ class Preparation:
             shape = first.shape
             self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
             small = self._takes_small_tiles()
-            self.layout = Layout.single(shape, first.closed, tile_exponents(shape, small))
+            bits = _SMALL_TILE if small else TILE_BITS if self.geometric == 1 else _WHOLE_TILE
+            self.layout = Layout.single(shape, first.closed, tile_exponents(shape, bits))
             self.pieces = piece_exponents(shape, small)
         else:
             # It is never read in windows: tiles and pieces may be as large as costs the fewest bytes.
@@ -270,18 +271,18 @@ class Preparation:
 _LONGEST_RULES = 16
 
 
-def tile_exponents(shape: tuple[int, int], small: bool = False) -> tuple[int, int]:
-    """Rows and columns of a tile, as exponents of two, for a surface of one grid: in nodes, half of the points.
+def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
+    """Rows and columns of a tile of 2**bits coefficients, as exponents of two, for a surface of one grid.
 
-    ``small``: of a surface that takes small tiles, since a window needs a larger share of it.
+    They are counted in nodes, half of the points.
     """
-    return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, _SMALL_TILE if small else TILE_BITS)
+    return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
 
 
 def piece_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
     """Rows and columns that pieces of exactness of a surface of one grid may have, as exponents of two.
 
-    The smallest first; ``small`` as in `tile_exponents`.
+    The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
     """
     sizes = [_SMALL_PIECE] * small + [PIECE_BITS, _WHOLE_PIECE]
     return [_fitting(*shape, bits) for bits in sizes]

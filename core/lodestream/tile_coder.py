@@ -47,6 +47,8 @@ class TileCoder:
         The first so many channels are coordinates.
     quantiser : Quantiser or None
         Of the coordinates.
+    large : int
+        The coarsest level whose units are large; 0: none are.
     strings : dict, optional
         What another coder of the same channels has made of large units, see `strings`.
 
@@ -63,11 +65,12 @@ class TileCoder:
         channels: list[Channel],
         geometric: int,
         quantiser: Quantiser | None,
+        large: int = 0,
         strings: Strings | None = None,
     ) -> None:
         self._channels = channels
         self.strings: Strings = {} if strings is None else strings
-        self.tiles = [Tiles(table, quantiser if k < geometric else None) for k, table in enumerate(tables)]
+        self.tiles = [Tiles(table, quantiser if k < geometric else None, large) for k, table in enumerate(tables)]
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""

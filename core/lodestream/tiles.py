@@ -113,10 +113,11 @@ class TileTable:
 class Tiles:
     """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`.
 
-    Where there is a quantiser, they are those of indices. From the tile ``large`` on all are large units.
+    Where there is a quantiser, they are those of indices; otherwise the units of level ``large`` and finer ones are
+    large, none if it is 0. The attribute ``large`` is the first such tile.
     """
 
-    def __init__(self, table: TileTable, quantiser: Quantiser | None = None) -> None:
+    def __init__(self, table: TileTable, quantiser: Quantiser | None = None, large: int = 0) -> None:
         self.table = table
         self.steps = np.zeros(len(table.bands), np.int64) if quantiser is None else table.steps(quantiser)
         self.known = np.zeros(table.size, np.int32)
@@ -124,7 +125,7 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
         self.trellis = quantiser is not None
-        self.large = len(table.members) if self.trellis else table.layout.first_large
+        self.large = len(table.members) if self.trellis else table.layout.tiles_from(large)
         self.models = new_models(len(table.members), self.trellis, self.large)
 
     def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:

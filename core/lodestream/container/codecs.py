@@ -31,8 +31,7 @@ def needed_codecs(header: Header, pieces: Iterable[bytes]) -> tuple[int, ...]:
         needed.add(MASKS)
     if header.quantiser is not None:
         needed.add(INDICES)
-    layout, coded = header.layout, header.channels if header.quantiser is None else header.channels - header.geometric
-    if coded and layout.first_large < len(layout.tiles):
+    if header.large and (header.quantiser is None or header.channels > header.geometric):
         needed.add(LARGE_UNITS)
     return tuple(sorted(needed | {BIT_PLANES}))
 

@@ -47,6 +47,7 @@ def serialize_header(header: Header) -> bytes:
     out.varint(header.layer_count)
     for exponents in (header.tile, header.piece):
         out.byte(exponents[0] | exponents[1] << 4)
+    out.byte(header.large)
     out.varint(0 if header.quantiser is None else header.quantiser.base)
     out.number(header.extent)
     if header.arrangement is None:
@@ -127,7 +128,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
     point_channels, layer_count = fields.varint(2**16), fields.varint()
-    tile, piece = _exponents(fields.byte()), _exponents(fields.byte())
+    tile, piece, large = _exponents(fields.byte()), _exponents(fields.byte()), fields.byte()
     base = fields.varint(MOST_BASE)
     extent = fields.number()
     arrangement = None
@@ -193,6 +194,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         empty=empty,
         tile=tile,
         piece=piece,
+        large=large,
         exact=bool(flags & 8),
         corrected=bool(flags & 16),
         layer_count=layer_count,

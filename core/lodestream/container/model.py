@@ -108,6 +108,8 @@ class Header:
         Exponents of two: rows and columns of a tile, in coefficients of one band.
     piece : (int, int)
         Exponents of two: rows and columns of points of a piece of the exactness section.
+    large : int
+        The coarsest level whose units are large; 0: none are. Those of indices never are.
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
@@ -151,6 +153,7 @@ class Header:
     empty: tuple[int, ...]
     tile: tuple[int, int]
     piece: tuple[int, int]
+    large: int
     exact: bool
     corrected: bool
     layer_count: int
