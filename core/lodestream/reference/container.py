@@ -161,9 +161,9 @@ def read_layer(payload: bytes, offset: int, header: Header, number: int, tops: d
         unit += 1 + skipped + (fields.varint() if skipped == 15 else 0)
         length = fields.varint()
         top = fields.u8() if first & 8 else 0
-        if unit >= channels * len(header.tiles.tiles):
+        if unit >= channels * len(header.tiles):
             raise fields.damaged("a layer names a unit that does not exist")
-        tile, channel = header.tiles.tiles[unit // channels], unit % channels
+        tile, channel = header.tiles[unit // channels], unit % channels
         count = coefficients_of(header, unit)
         if not count or header.empty[channel] >> tile.level & 1:
             raise fields.damaged("a layer names a unit without coefficients")
@@ -185,7 +185,7 @@ def read_layer(payload: bytes, offset: int, header: Header, number: int, tops: d
 def coefficients_of(header: Header, unit: int) -> int:
     """Count the coefficients of a unit."""
     channels = len(header.types)
-    shares = header.tiles.tiles[unit // channels].shares[unit % channels >= header.coordinates]
+    shares = header.tiles[unit // channels].shares[unit % channels >= header.coordinates]
     return sum(share.shape[0] * share.shape[1] for share in shares)
 
 

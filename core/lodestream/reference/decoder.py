@@ -57,7 +57,7 @@ class Decoder:
         if segment.top:
             channels = len(self.header.types)
             indices = self.header.base > 0 and number % channels < self.header.coordinates
-            large = self.header.tiles.large[self.header.tiles.tiles[number // channels].level] and not indices
+            large = 0 < self.header.large <= self.header.tiles[number // channels].level and not indices
             bands = self.bands(number)
             self.units[number] = LargeUnit(bands, segment.top) if large else SmallUnit(bands, segment.top, indices)
         self.units[number].decode(segment.data, segment.passes)
@@ -67,10 +67,10 @@ class Decoder:
         if unit not in self._bands:
             header = self.header
             tile_number, channel = divmod(unit, len(header.types))
-            tile, attribute = header.tiles.tiles[tile_number], channel >= header.coordinates
+            tile, attribute = header.tiles[tile_number], channel >= header.coordinates
             above = {}
             if tile.parent >= 0:
-                shares = header.tiles.tiles[tile.parent].shares[attribute]
+                shares = header.tiles[tile.parent].shares[attribute]
                 bands = self.bands(tile.parent * len(header.types) + channel)
                 above = {(share.grid, share.kind): (share, band) for share, band in zip(shares, bands, strict=True)}
             self._bands[unit] = []
@@ -82,7 +82,9 @@ class Decoder:
                 self._bands[unit].append(Band(share.shape, share.kind, parents))
         return self._bands[unit]
 
-    def show(self, remaining: dict[int, int], complete: bool, level: int | None = None) -> Shown:
+    def show(
+        self, remaining: dict[int, int], complete: bool, level: int | None = None, pieces: list[bytes] | None = None
+    ) -> Shown:
         """Reconstruct the surface.
 
         Parameters
@@ -101,14 +103,14 @@ class Decoder:
 
         def coefficients(tile: int, channel: int) -> list[NDArray[np.int64]]:
             unit = tile * channels + channel
-            shares = header.tiles.tiles[tile].shares[channel >= header.coordinates]
+            shares = header.tiles[tile].shares[channel >= header.coordinates]
             if unit not in remaining:
                 return [np.zeros(share.shape, np.int64) for share in shares]
             found = []
             for share, band in zip(shares, self.bands(unit), strict=True):
                 step = 0
                 if header.base and channel < header.coordinates:
-                    step = quantiser_step(header.base, header.grids[share.grid], header.tiles.tiles[tile].level, share)
+                    step = quantiser_step(header.base, header.grids[share.grid], header.tiles[tile].level, share)
                 found.append(reconstructed(band, remaining[unit], step))
             return found
 
@@ -116,13 +118,13 @@ class Decoder:
             whole = self._whole(channel, remaining, complete, level)
             grids = reconstruct(header, channel, level, whole, coefficients)
             arrays.append([values_of(q, whole < level, header.lattices[channel], header.types[channel]) for q in grids])
-        return self._assembled(arrays, level)
+        return self._assembled(arrays, level, pieces)
 
     def _whole(self, channel: int, remaining: dict[int, int], complete: bool, level: int) -> int:
         """Find the largest level up to which all coefficients are known."""
         header = self.header
         channels = len(header.types)
-        for number, tile in enumerate(header.tiles.tiles):
+        for number, tile in enumerate(header.tiles):
             if tile.level > level:
                 break
             if tile.level and not header.empty[channel] >> tile.level & 1:
@@ -135,35 +137,51 @@ class Decoder:
                     return tile.level - 1
         return level
 
-    def _assembled(self, arrays: list[list[NDArray[Any]]], level: int) -> Shown:
-        header = self.header
-        points, attributes = [], []
+    def _assembled(self, arrays: list[list[NDArray[Any]]], level: int, pieces: list[bytes] | None) -> Shown:
+        """Put the values of the grids together to blocks, restore them, and mark holes."""
+        header, masks = self.header, self.masks
+        blocks, lines = [], []
         for number in range(len(header.blocks)):
-            lines, parts = places(header, number, level)
-            channels = []
+            found, parts = places(header, number, level)
+            lines.append(found)
+            blocks.append([np.zeros([len(line) for line in found], dtype) for dtype in header.types])
             for channel, grids in enumerate(arrays):
-                values = np.zeros([len(line) for line in lines], header.types[channel])
                 for grid, index in parts:
-                    values[index] = grids[grid]
-                channels.append(values)
+                    blocks[-1][channel][index] = grids[grid]
+        if pieces is not None:
+            self._restore(blocks, pieces)
+        shown = Shown([], [])
+        for number, channels in enumerate(blocks):
             first = channels[: header.channels]
             if header.plane is not None:
                 first = plane_values(header, level) + first
-            points.append(first[0] if header.flat and header.plane is None else np.stack(first, axis=-1))
-            found = {}
+            points = first[0] if header.flat and header.plane is None else np.stack(first, axis=-1)
+            attributes = {}
             at = header.channels
             for name, _, components in header.attributes:
                 count = max(components, 1)
-                found[name] = np.stack(channels[at : at + count], axis=-1) if components else channels[at]
+                attributes[name] = np.stack(channels[at : at + count], axis=-1) if components else channels[at]
                 at += count
-            attributes.append(found)
-            if self.masks is not None and self.masks.valid[number] is not None:
-                holes = ~self.masks.valid[number][np.ix_(*lines)]
-                self._mark(points[-1], found, holes)
-        return Shown(points, attributes)
+            valid = masks.valid[number] if masks is not None else None
+            if masks is not None and valid is not None:
+                kept = masks.kept[number] if pieces is not None else None
+                holes = ~(valid if kept is None else valid | kept)[np.ix_(*lines[number])]
+                points[holes] = np.nan if points.dtype.kind == "f" else masks.hole
+                for values in attributes.values():
+                    values[holes] = np.nan if values.dtype.kind == "f" else 0
+            shown.points.append(points)
+            shown.attributes.append(attributes)
+        return shown
 
-    def _mark(self, points: NDArray[Any], attributes: dict[str, NDArray[Any]], holes: NDArray[np.bool_]) -> None:
-        assert self.masks is not None
-        points[holes] = np.nan if points.dtype.kind == "f" else self.masks.hole
-        for values in attributes.values():
-            values[holes] = np.nan if values.dtype.kind == "f" else 0
+    def _restore(self, blocks: list[list[NDArray[Any]]], pieces: list[bytes]) -> None:
+        """Put what the pieces of exactness give into the channels of the blocks."""
+        number = 0
+        for block, rows, columns, kept in windows_of(self.header, self.masks):
+            chosen = None
+            if self.masks is not None:
+                chosen = self.masks.kept[block] if kept else self.masks.valid[block]
+            for channel in blocks[block]:
+                window = channel[rows, columns]
+                here = np.ones(window.shape, np.bool_) if chosen is None else chosen[rows, columns]
+                window[here] = restore(window[here], pieces[number])
+                number += 1

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import UnsupportedVersionError
 from .fields import Fields, unpack_map
 from .levels import Axis, Grid, fitted_steps, levels_of
-from .tiles import Tiles, tiles_of
+from .tiles import Tile, tiles_of
 
 CODECS = 6
 """Codecs 1 to 6 are decoded here."""
@@ -79,6 +79,8 @@ class Header:
         Channels of the points, C; number of layers.
     tile, piece : (int, int)
         Binary logarithms of rows and columns of a tile, and of a piece of exactness.
+    large : int
+        The coarsest level whose units are large; 0: none are.
     base : int
         0, or that of the quantisers.
     extent : float
@@ -108,6 +110,7 @@ class Header:
     layers: int
     tile: tuple[int, int]
     piece: tuple[int, int]
+    large: int
     base: int
     extent: float
     blocks: list[Block]
@@ -132,8 +135,8 @@ class Header:
         return len(self.grids[0].axes) - 1
 
     @cached_property
-    def tiles(self) -> Tiles:
-        """All tiles."""
+    def tiles(self) -> list[Tile]:
+        """All tiles, by their number."""
         return tiles_of(self.grids, self.tile)
 
     @cached_property
@@ -164,7 +167,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         if not 1 <= codec <= CODECS:
             raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
     flags, kind, channels, layers = fields.u8(), fields.u8(), fields.varint(), fields.varint()
-    tile, piece = _sizes(fields), _sizes(fields)
+    tile, piece, large = _sizes(fields), _sizes(fields), fields.u8()
     base, extent = fields.varint(), fields.float()
     if kind >= len(TYPES) or not channels or not layers or base >= 1 << 24:
         raise fields.damaged("type, channels, layers, base or flags are out of range")
@@ -208,8 +211,8 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         types += [dtype] * max(components, 1)
     bits = [bool(flags & 1 << bit) for bit in range(8)]
     return Header(
-        *(bits[2], bits[3], bits[4], bits[5], types, channels, layers, tile, piece, base, extent, blocks, curves),
-        *(parts, attributes, plane, joints, lattices, empty, predictors, grids),
+        *(bits[2], bits[3], bits[4], bits[5], types, channels, layers, tile, piece, large, base, extent),
+        *(blocks, curves, parts, attributes, plane, joints, lattices, empty, predictors, grids),
     )
 
 

@@ -38,7 +38,7 @@ def reconstruct(
     """
     grids, coordinate = header.grids, channel < header.coordinates
     arrays = [np.zeros(grid.shape(level), np.int64) for grid in grids]
-    for number, tile in enumerate(header.tiles.tiles):
+    for number, tile in enumerate(header.tiles):
         if tile.level > level:
             break
         shares = tile.shares[not coordinate]

@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 
 from .levels import Grid
 
-LARGE = 1 << 15
-"""Points of a level, of all grids, from which its units are large."""
-
 
 @dataclass(frozen=True)
 class Share:
@@ -59,22 +56,6 @@ class Tile:
     shares: tuple[list[Share], list[Share]]
 
 
-@dataclass(frozen=True)
-class Tiles:
-    """All tiles of a surface.
-
-    Attributes
-    ----------
-    tiles : list of Tile
-        By their number.
-    large : list of bool
-        For each level whether its units are large.
-    """
-
-    tiles: list[Tile]
-    large: list[bool]
-
-
 def groups_of(grids: list[Grid], points: int) -> list[list[list[int]]]:
     """Give the groups of grids of the levels 0 to L; `points` is the most that several parts may have together."""
     above = [[number] for number in range(len(grids))]
@@ -94,7 +75,7 @@ def groups_of(grids: list[Grid], points: int) -> list[list[list[int]]]:
     return [[list(range(len(grids)))], *found[::-1]]
 
 
-def tiles_of(grids: list[Grid], tile: tuple[int, int]) -> Tiles:
+def tiles_of(grids: list[Grid], tile: tuple[int, int]) -> list[Tile]:
     """Divide all levels into tiles of 2^t0 rows and 2^t1 columns, (t0, t1) = `tile`."""
     whole = [(0, 1 << 62)]
     tiles = [Tile(0, -1, _shares(grids, range(len(grids)), 0, (0, 1 << 62), (0, 1 << 62)))]
@@ -115,11 +96,7 @@ def tiles_of(grids: list[Grid], tile: tuple[int, int]) -> Tiles:
                         s = [grids[group[0]].stepped(level - 1, axis) for axis in (0, 1)]
                         parent = first + min(i >> s[0], down - 1) * across + min(j >> s[1], across - 1)
                     tiles.append(Tile(level, parent, _shares(grids, group, level, rows, columns)))
-    large = [
-        sum(int(np.prod(grid.shape(level), dtype=object)) for grid in grids) >= LARGE
-        for level in range(len(grids[0].axes))
-    ]
-    return Tiles(tiles, large)
+    return tiles
 
 
 def _cut(nodes: int, size: int) -> list[tuple[int, int]]:
