@@ -1,20 +1,26 @@
-"""Sections, layers, pages, root and footer: sections 2, 6, 9 and 10 to 12 of docs/format.md."""
+"""The file up to its metadata: sections, layers, pieces: sections 2, 6, 9 and 10 of docs/format.md."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from ..errors import CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
 from .fields import Errors, Fields, crc, unpack_map
 from .header import Header, read_header
-from .masks import Masks, read_masks
+from .masks import Masks, no_holes, read_masks
 
 MAGIC = b"\xf5LODE\r\n"
 VERSION = 0
-END = b"LODEEND\n"
-FOOTER = 28
 HEADER, LAYER, EXACTNESS, METADATA, ROOT, MASKS, KEPT_MASKS, PAGES, OPTIONAL = 1, 2, 3, 4, 5, 6, 7, 8, 128
-WINDOW_ERRORS = 128
 METADATA_LIMIT = 65536
+
+
+class Section(NamedTuple):
+    """A section: its kind, what the frame encloses, where that begins in the container, where the section ends."""
+
+    kind: int
+    payload: bytes
+    offset: int
+    end: int
 
 
 @dataclass(frozen=True)
@@ -23,24 +29,18 @@ class Segment:
 
     Attributes
     ----------
-    unit, layer : int
-        Their numbers.
-    passes : int
-        How many.
-    top : int
-        Bit-planes of the unit; 0 if this is not its first segment.
+    unit, passes : int
+        Number of the unit; how many passes.
+    top : int or None
+        Bit-planes of the unit; None in a layer's segment that is not the unit's first.
     data : bytes
         The coded string.
-    offset : int
-        Where it begins in the container.
     """
 
     unit: int
-    layer: int
     passes: int
-    top: int
+    top: int | None
     data: bytes
-    offset: int = 0
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,14 @@ class Layer:
 
 
 @dataclass(frozen=True)
+class Exactness:
+    """The exactness section: remaining errors, and the pieces in order."""
+
+    errors: Errors
+    pieces: list[bytes]
+
+
+@dataclass(frozen=True)
 class Container:
     """What has been read of a container.
 
@@ -60,52 +68,28 @@ class Container:
     ----------
     header : Header
         The header.
-    masks : Masks or None
+    masks : Masks
         Holes.
     layers : list of Layer
         Those that are there, from the first.
-    remaining : Errors or None
-        Of the exactness section.
-    pieces : list of bytes or None
-        Its pieces.
+    exactness : Exactness or None
+        The exactness section, if there is one and it is there.
     metadata : dict or None
-        The metadata.
+        The metadata, if they are there.
     optional : list of (int, bytes)
-        Kind and payload of the optional sections.
-    index : Index or None
-        The index, in a whole container.
+        Kind and payload of the optional sections before the metadata.
     """
 
     header: Header
-    masks: Masks | None
+    masks: Masks
     layers: list[Layer]
-    remaining: Errors | None = None
-    pieces: list[bytes] | None = None
-    metadata: dict[str, Any] | None = None
-    optional: list[tuple[int, bytes]] = field(default_factory=list)
-    index: "Index | None" = None
+    exactness: Exactness | None
+    metadata: dict[str, Any] | None
+    optional: list[tuple[int, bytes]]
 
 
-def read_section(data: bytes, position: int) -> tuple[int, bytes, int, int]:
-    """Read a section.
-
-    Parameters
-    ----------
-    data : bytes
-        The container, or its beginning.
-    position : int
-        Where the section begins.
-
-    Returns
-    -------
-    kind : int
-        Its kind.
-    payload : bytes
-        What the frame encloses.
-    offset : int
-        Where the payload begins.
-    end : int
-        Where the section ends.
+def read_section(data: bytes, position: int) -> Section:
+    """Read the section that begins at a position of the container.
 
     Raises
     ------
@@ -128,58 +112,39 @@ def read_section(data: bytes, position: int) -> tuple[int, bytes, int, int]:
     if end > len(data):
         raise TruncatedStreamError("the container ends within a section")
     if crc(data[position : end - 4]) != int.from_bytes(data[end - 4 : end], "little"):
-        raise CorruptStreamError("a section's checksum does not fit", position)
-    return kind, data[offset : end - 4], offset, end
+        raise CorruptStreamError("the CRC of a section is another one", position)
+    return Section(kind, data[offset : end - 4], offset, end)
 
 
-def read_layer(payload: bytes, offset: int, header: Header, number: int, tops: dict[int, tuple[int, int]]) -> Layer:
-    """Read a layer's payload.
-
-    Parameters
-    ----------
-    payload : bytes
-        What the frame encloses.
-    offset : int
-        Where it begins in the container.
-    header : Header
-        The container's.
-    number : int
-        The layer's number.
-    tops : dict
-        For each unit that has segments in earlier layers its bit-planes and the passes that remain; is changed.
-    """
-    fields = Fields(payload, offset)
+def read_layer(section: Section, header: Header, remaining: dict[int, int]) -> Layer:
+    """Read a layer; `remaining`, which has the passes left of each unit that has segments, is brought up to date."""
+    fields = Fields(section.payload, section.offset)
     channels = len(header.types)
     errors = fields.errors(channels)
-    entries = []
+    entries: list[tuple[int, int, int | None, int]] = []
     unit = -1
     for _ in range(fields.count(2)):
         first = fields.u8()
-        passes = (first & 7) + 1
-        skipped = first >> 4
+        passes, skipped = (first & 7) + 1, first >> 4
         passes += fields.varint() if passes == 8 else 0
         unit += 1 + skipped + (fields.varint() if skipped == 15 else 0)
         length = fields.varint()
-        top = fields.u8() if first & 8 else 0
+        top = fields.u8() if first & 8 else None
         if unit >= channels * len(header.tiles):
             raise fields.damaged("a layer names a unit that does not exist")
-        tile, channel = header.tiles[unit // channels], unit % channels
         count = coefficients_of(header, unit)
-        if not count or header.empty[channel] >> tile.level & 1:
+        if not count or header.empty[unit % channels] >> header.tiles[unit // channels].level & 1:
             raise fields.damaged("a layer names a unit without coefficients")
-        if bool(top) != (unit not in tops) or top > 28 or (first & 8 and not top):
-            raise fields.damaged("bit-planes of a unit are missing, repeated or too many")
-        remaining = tops[unit][1] if not top else 2 * top - 1
-        if passes > remaining or not 1 <= length <= 64 + 4 * passes * count:
+        if (top is None) != (unit in remaining) or top is not None and not 1 <= top <= 28:
+            raise fields.damaged("bit-planes of a unit are missing, repeated or out of range")
+        left = (remaining[unit] if top is None else 2 * top - 1) - passes
+        if left < 0 or not 1 <= length <= 64 + 4 * passes * count:
             raise fields.damaged("a segment has too many passes or bytes, or none")
-        tops[unit] = (top or tops[unit][0], remaining - passes)
+        remaining[unit] = left
         entries.append((unit, passes, top, length))
-    segments = []
-    for unit, passes, top, length in entries:
-        place = offset + fields.position
-        segments.append(Segment(unit, number, passes, top, fields.take(length), place))
+    segments = [Segment(unit, passes, top, fields.take(length)) for unit, passes, top, length in entries]
     fields.end()
-    return Layer(errors, segments, offset + len(payload) + 4)
+    return Layer(errors, segments, section.end)
 
 
 def coefficients_of(header: Header, unit: int) -> int:
@@ -212,65 +177,65 @@ def read_container(data: bytes) -> Container:
         raise TruncatedStreamError("the container ends within its first bytes")
     if data[7] != VERSION:
         raise UnsupportedVersionError(f"version {data[7]}; this program reads {VERSION}")
-    kind, payload, offset, position = read_section(data, 8)
-    if kind != HEADER:
+    section = read_section(data, 8)
+    if section.kind != HEADER:
         raise CorruptStreamError("no header", 8)
-    header = read_header(payload, offset)
-    masks = None
-    if header.masks:
-        kind, payload, offset, after = read_section(data, position)
-        if kind not in (MASKS, KEPT_MASKS):
-            raise CorruptStreamError("no masks", position)
-        sizes = [(block.rows, block.columns) for block in header.blocks]
-        masks = read_masks(payload, offset, kind == KEPT_MASKS, sizes)
-        position = after
+    header = read_header(section.payload, section.offset)
+    sizes = [(block.rows, block.columns) for block in header.blocks]
+    masks = no_holes(sizes)
+    if header.has_masks:
+        section = read_section(data, section.end)
+        if section.kind not in (MASKS, KEPT_MASKS):
+            raise CorruptStreamError("no masks", section.offset)
+        masks = read_masks(section.payload, section.offset, section.kind == KEPT_MASKS, sizes)
+    if masks.keep_any and not header.has_exactness:
+        raise CorruptStreamError("kept holes without exactness", section.offset)
     layers: list[Layer] = []
-    found: dict[str, Any] = {"optional": []}
-    tops: dict[int, tuple[int, int]] = {}
-    while position < len(data):
-        try:
-            kind, payload, offset, position = read_section(data, position)
+    exactness, metadata = None, None
+    optional: list[tuple[int, bytes]] = []
+    remaining: dict[int, int] = {}
+    try:
+        while metadata is None:
+            section = read_section(data, section.end)
+            kind = section.kind
             if kind >= OPTIONAL:
-                found["optional"].append((kind, payload))
-            elif len(layers) < header.layers:
-                if kind != LAYER:
-                    raise CorruptStreamError("no layer", offset)
-                layers.append(read_layer(payload, offset, header, len(layers), tops))
-            elif kind == EXACTNESS and header.exactness and "pieces" not in found:
-                found["remaining"], found["pieces"] = read_pieces(payload, offset, header, masks)
-            elif kind == METADATA:
-                found["metadata"] = unpack_map(payload, offset)
-                break
+                optional.append((kind, section.payload))
+            elif kind == LAYER and len(layers) < header.layers:
+                layers.append(read_layer(section, header, remaining))
+            elif kind == EXACTNESS and len(layers) == header.layers and header.has_exactness and exactness is None:
+                exactness = read_pieces(section, header, masks)
+            elif kind == METADATA and len(layers) == header.layers and header.has_exactness == (exactness is not None):
+                if len(section.payload) > METADATA_LIMIT:
+                    raise CorruptStreamError("the metadata are too long", section.offset)
+                metadata = unpack_map(section.payload, section.offset)
             else:
-                raise CorruptStreamError("a section that does not belong here", offset)
-        except (CorruptStreamError, TruncatedStreamError):
-            break
-    return Container(header, masks, layers, **found)
+                raise CorruptStreamError(f"a section of kind {kind} does not belong here", section.offset)
+    except (CorruptStreamError, TruncatedStreamError):
+        pass  # what came before stays
+    return Container(header, masks, layers, exactness, metadata, optional)
 
 
-def windows_of(header: Header, masks: Masks | None) -> list[tuple[int, slice, slice, bool]]:
+def windows_of(header: Header, masks: Masks) -> list[tuple[int, slice, slice, bool]]:
     """List the windows of exactness in order: block, rows, columns, and whether it is for the kept holes."""
     down, across = 1 << header.piece[0], 1 << header.piece[1]
-    found = []
-    for number, block in enumerate(header.blocks):
-        for kept in (False, True) if masks is not None and masks.kept[number] is not None else (False,):
-            found += [
-                (number, slice(i, min(i + down, block.rows)), slice(j, min(j + across, block.columns)), kept)
-                for i in range(0, block.rows, down)
-                for j in range(0, block.columns, across)
-            ]
-    return found
+    return [
+        (number, slice(i, min(i + down, block.rows)), slice(j, min(j + across, block.columns)), kept)
+        for number, block in enumerate(header.blocks)
+        for kept in ((False, True) if masks.kept[number].any() else (False,))
+        for i in range(0, block.rows, down)
+        for j in range(0, block.columns, across)
+    ]
 
 
-def read_pieces(payload: bytes, offset: int, header: Header, masks: Masks | None) -> tuple[Errors, list[bytes]]:
-    """Read the payload of the exactness section: remaining errors, and the pieces in order."""
-    fields = Fields(payload, offset)
+def read_pieces(section: Section, header: Header, masks: Masks) -> Exactness:
+    """Read the exactness section."""
+    fields = Fields(section.payload, section.offset)
     channels = len(header.types)
     errors = fields.errors(channels)
     count = channels * len(windows_of(header, masks))
     if count > fields.left:
-        raise fields.damaged("the exactness section ends within its table")
+        raise fields.damaged("the exactness section ends within its lengths")
     lengths = [fields.varint() for _ in range(count)]
     pieces = [fields.take(length) for length in lengths]
     fields.end()
-    return errors, pieces
+    return Exactness(errors, pieces)

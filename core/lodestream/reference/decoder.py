@@ -1,5 +1,6 @@
-"""A surface from segments: sections 8 to 10 of docs/format.md put together."""
+"""A surface from segments: sections 3.3 and 8 to 10 of docs/format.md put together."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,180 +9,235 @@ from numpy.typing import NDArray
 
 from .bands import Band
 from .coefficients import quantiser_step, reconstructed
-from .container import Container, Segment, read_container, windows_of
+from .container import Container, Exactness, Segment, windows_of
 from .exactness import restore
 from .header import Header
 from .large_units import LargeUnit
-from .masks import Masks
+from .masks import Mask, Masks, no_holes
 from .reconstruction import places, plane_values, reconstruct, values_of
 from .small_units import SmallUnit
-from .tiles import Parents
+from .tiles import Parents, Tile
+
+UNKNOWN = -1
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The values of a state.
+    """What a state shows of a block.
 
     Attributes
     ----------
-    points : list of array
-        For each block (h, w) or (h, w, C), in the type of the points.
-    attributes : list of dict of str to array
-        For each block its arrays by name: (h, w) or (h, w, components).
+    arrays : list of array
+        The points (h, w) or (h, w, C), and each attribute (h, w) or (h, w, components), in their types.
+    valid : bool (h, w)
+        The points that have values.
     """
 
-    points: list[NDArray[Any]]
-    attributes: list[dict[str, NDArray[Any]]]
+    arrays: list[NDArray[Any]]
+    valid: Mask
 
 
 class Decoder:
-    """Decodes units as their segments come, and shows the surface as it is after any number of their passes.
+    """Decodes units as their segments come, and shows the surface as it was after any layer.
 
     Parameters
     ----------
     header : Header
         Of the container.
-    masks : Masks or None
-        Holes.
+    masks : Masks, optional
+        Holes; without it there are none.
+
+    Attributes
+    ----------
+    remaining : list of int
+        For each unit how many of its passes remain; 0 too if all its coefficients are known to be 0, -1 as long as
+        that is not known.
+    states : list of list of int
+        What `remaining` was after each layer.
+    units : dict
+        Of each unit that has segments what decodes it.
     """
 
     def __init__(self, header: Header, masks: Masks | None = None) -> None:
         self.header = header
-        self.masks = masks
+        self.masks = no_holes([(block.rows, block.columns) for block in header.blocks]) if masks is None else masks
+        self.remaining = [UNKNOWN] * (len(header.tiles) * len(header.types))
+        self.states: list[list[int]] = []
         self.units: dict[int, SmallUnit | LargeUnit] = {}
         self._bands: dict[int, list[Band]] = {}
 
+    def tile(self, unit: int) -> Tile:
+        """Give the tile of a unit."""
+        return self.header.tiles[unit // len(self.header.types)]
+
     def add(self, segment: Segment) -> None:
-        """Decode the next passes of a unit; those of its parent's same planes must have been added."""
-        number = segment.unit
-        if segment.top:
-            channels = len(self.header.types)
-            indices = self.header.base > 0 and number % channels < self.header.coordinates
-            large = 0 < self.header.large <= self.header.tiles[number // channels].level and not indices
+        """Decode the next passes of a unit; its parent's passes of the same planes must have been added."""
+        number, top = segment.unit, segment.top
+        if number not in self.units:
+            if top is None:
+                raise ValueError(f"unit {number} begins without its bit-planes")
+            indices = self.header.base > 0 and number % len(self.header.types) < self.header.coordinates
+            large = 0 < self.header.large <= self.tile(number).level and not indices
             bands = self.bands(number)
-            self.units[number] = LargeUnit(bands, segment.top) if large else SmallUnit(bands, segment.top, indices)
+            self.units[number] = LargeUnit(bands, top) if large else SmallUnit(bands, top, indices)
         self.units[number].decode(segment.data, segment.passes)
+        self.remaining[number] = self.units[number].remaining
+
+    def take(self, segments: Iterable[Segment], level: int) -> None:
+        """Decode segments, after which all there is of the levels up to this one has come."""
+        for segment in segments:
+            self.add(segment)
+        for number, left in enumerate(self.remaining):
+            if left == UNKNOWN and self.tile(number).level <= level:
+                self.remaining[number] = 0
 
     def bands(self, unit: int) -> list[Band]:
         """Give the bands of a unit, before its first segment all 0."""
         if unit not in self._bands:
-            header = self.header
-            tile_number, channel = divmod(unit, len(header.types))
-            tile, attribute = header.tiles[tile_number], channel >= header.coordinates
+            header, tile = self.header, self.tile(unit)
+            channel = unit % len(header.types)
+            attribute = channel >= header.coordinates
             above = {}
             if tile.parent >= 0:
                 shares = header.tiles[tile.parent].shares[attribute]
                 bands = self.bands(tile.parent * len(header.types) + channel)
                 above = {(share.grid, share.kind): (share, band) for share, band in zip(shares, bands, strict=True)}
-            self._bands[unit] = []
+            found = []
             for share in tile.shares[attribute]:
                 parents = None
                 if (share.grid, share.kind) in above:
                     other, band = above[share.grid, share.kind]
                     parents = Parents(header.grids[share.grid], tile.level, share, other), band
-                self._bands[unit].append(Band(share.shape, share.kind, parents))
+                found.append(Band(share.shape, share.kind, parents))
+            self._bands[unit] = found
         return self._bands[unit]
 
-    def show(
-        self, remaining: dict[int, int], complete: bool, level: int | None = None, pieces: list[bytes] | None = None
-    ) -> Shown:
-        """Reconstruct the surface.
+    def changing(self, unit: int) -> list[Any]:
+        """List the objects that change while a segment of a unit is decoded."""
+        coder = [self.units[unit], *self.units[unit].bands] if unit in self.units else []
+        return [*coder, *self.bands(unit)]
+
+    def channel(self, channel: int, level: int, remaining: list[int] | None = None) -> list[NDArray[Any]]:
+        """Compute the values of a channel.
 
         Parameters
         ----------
-        remaining : dict of int to int
-            For each unit that has passes in this state, how many remain.
-        complete : bool
-            All layers are there, so units without passes have only coefficients 0.
-        level : int, optional
-            The level that is made; the finest one if it is not given.
+        channel : int
+            Number of the channel.
+        level : int
+            The level that is made.
+        remaining : list of int, optional
+            The state that is shown, as in the attribute, which stands in otherwise. A unit may have been decoded
+            further.
+
+        Returns
+        -------
+        list of (h, w)
+            The values of each block at the level, in the channel's type; exactness and holes are not looked at.
         """
         header = self.header
-        level = header.finest if level is None else level
-        channels = len(header.types)
-        arrays: list[list[NDArray[Any]]] = []
+        state = self.remaining if remaining is None else remaining
+        whole = self._whole(channel, state, level)
 
         def coefficients(tile: int, channel: int) -> list[NDArray[np.int64]]:
-            unit = tile * channels + channel
+            unit = tile * len(header.types) + channel
             shares = header.tiles[tile].shares[channel >= header.coordinates]
-            if unit not in remaining:
+            if state[unit] < 0 or unit not in self.units:
                 return [np.zeros(share.shape, np.int64) for share in shares]
             found = []
             for share, band in zip(shares, self.bands(unit), strict=True):
                 step = 0
                 if header.base and channel < header.coordinates:
                     step = quantiser_step(header.base, header.grids[share.grid], header.tiles[tile].level, share)
-                found.append(reconstructed(band, remaining[unit], step))
+                found.append(reconstructed(band, state[unit], step))
             return found
 
-        for channel in range(channels):
-            whole = self._whole(channel, remaining, complete, level)
-            grids = reconstruct(header, channel, level, whole, coefficients)
-            arrays.append([values_of(q, whole < level, header.lattices[channel], header.types[channel]) for q in grids])
-        return self._assembled(arrays, level, pieces)
+        grids = reconstruct(header, channel, level, whole, coefficients)
+        dtype = header.types[channel]
+        values = [values_of(q, whole < level, header.lattices[channel], dtype) for q in grids]
+        blocks = []
+        for number in range(len(header.blocks)):
+            lines, parts = places(header, number, level)
+            blocks.append(np.zeros([len(line) for line in lines], dtype))
+            for grid, index in parts:
+                blocks[-1][index] = values[grid]
+        return blocks
 
-    def _whole(self, channel: int, remaining: dict[int, int], complete: bool, level: int) -> int:
+    def _whole(self, channel: int, state: list[int], level: int) -> int:
         """Find the largest level up to which all coefficients are known."""
         header = self.header
-        channels = len(header.types)
         for number, tile in enumerate(header.tiles):
             if tile.level > level:
                 break
             if tile.level and not header.empty[channel] >> tile.level & 1:
-                unit = number * channels + channel
-                if unit in remaining:
-                    known = remaining[unit] == 0
-                else:
-                    known = complete or not tile.shares[channel >= header.coordinates]
-                if not known:
+                unit = number * len(header.types) + channel
+                if state[unit] and tile.shares[channel >= header.coordinates]:
                     return tile.level - 1
         return level
 
-    def _assembled(self, arrays: list[list[NDArray[Any]]], level: int, pieces: list[bytes] | None) -> Shown:
-        """Put the values of the grids together to blocks, restore them, and mark holes."""
-        header, masks = self.header, self.masks
-        blocks, lines = [], []
-        for number in range(len(header.blocks)):
-            found, parts = places(header, number, level)
-            lines.append(found)
-            blocks.append([np.zeros([len(line) for line in found], dtype) for dtype in header.types])
-            for channel, grids in enumerate(arrays):
-                for grid, index in parts:
-                    blocks[-1][channel][index] = grids[grid]
-        if pieces is not None:
-            self._restore(blocks, pieces)
-        shown = Shown([], [])
-        for number, channels in enumerate(blocks):
-            first = channels[: header.channels]
-            if header.plane is not None:
-                first = plane_values(header, level) + first
-            points = first[0] if header.flat and header.plane is None else np.stack(first, axis=-1)
-            attributes = {}
-            at = header.channels
-            for name, _, components in header.attributes:
-                count = max(components, 1)
-                attributes[name] = np.stack(channels[at : at + count], axis=-1) if components else channels[at]
-                at += count
-            valid = masks.valid[number] if masks is not None else None
-            if masks is not None and valid is not None:
-                kept = masks.kept[number] if pieces is not None else None
-                holes = ~(valid if kept is None else valid | kept)[np.ix_(*lines[number])]
-                points[holes] = np.nan if points.dtype.kind == "f" else masks.hole
-                for values in attributes.values():
-                    values[holes] = np.nan if values.dtype.kind == "f" else 0
-            shown.points.append(points)
-            shown.attributes.append(attributes)
-        return shown
+    def shown(
+        self, layers: int | None = None, *, level: int | None = None, exactness: Exactness | None = None
+    ) -> list[Shown]:
+        """Show the surface.
 
-    def _restore(self, blocks: list[list[NDArray[Any]]], pieces: list[bytes]) -> None:
-        """Put what the pieces of exactness give into the channels of the blocks."""
-        number = 0
-        for block, rows, columns, kept in windows_of(self.header, self.masks):
-            chosen = None
-            if self.masks is not None:
-                chosen = self.masks.kept[block] if kept else self.masks.valid[block]
-            for channel in blocks[block]:
-                window = channel[rows, columns]
-                here = np.ones(window.shape, np.bool_) if chosen is None else chosen[rows, columns]
-                window[here] = restore(window[here], pieces[number])
-                number += 1
+        Parameters
+        ----------
+        layers : int, optional
+            After how many layers, at least 1; else as it is now.
+        level : int, optional
+            The level that is made; the finest one if it is not given.
+        exactness : Exactness, optional
+            Whose pieces are put in; for the finest level after all layers.
+
+        Returns
+        -------
+        list of Shown
+            One for each block. At coarser levels the points of a height field with a plane are heights alone.
+        """
+        header = self.header
+        level = header.finest if level is None else level
+        state = self.remaining if layers is None else self.states[layers - 1]
+        channels = [self.channel(channel, level, state) for channel in range(len(header.types))]
+        if exactness is not None:
+            self._restore(channels, exactness.pieces)
+        found = []
+        for number in range(len(header.blocks)):
+            valid = self.masks.valid[number]
+            if exactness is not None:
+                valid = valid | self.masks.kept[number]
+            valid = valid[np.ix_(*places(header, number, level)[0])]
+            values = [blocks[number] for blocks in channels]
+            first = values[: header.channels]
+            if header.plane is not None and level == header.finest:
+                first = plane_values(header) + first
+            arrays = [first[0] if header.flat and header.plane is None else np.stack(first, axis=-1)]
+            for attribute in header.attributes:
+                at = header.channels + sum(max(other.components, 1) for other in header.attributes[: len(arrays) - 1])
+                some = values[at : at + max(attribute.components, 1)]
+                arrays.append(np.stack(some, axis=-1) if attribute.components else some[0])
+            for array, hole in zip(arrays, [self.masks.hole, *[0] * len(header.attributes)], strict=True):
+                array[~valid] = np.nan if array.dtype.kind == "f" else hole
+            found.append(Shown(arrays, valid))
+        return found
+
+    def _restore(self, channels: list[list[NDArray[Any]]], pieces: list[bytes]) -> None:
+        """Put what the pieces of exactness give into the blocks of each channel."""
+        windows = windows_of(self.header, self.masks)
+        for number, (block, rows, columns, kept) in enumerate(windows):
+            chosen = (self.masks.kept if kept else self.masks.valid)[block][rows, columns]
+            for channel, blocks in enumerate(channels):
+                window = blocks[block][rows, columns]
+                window[chosen] = restore(pieces[number * len(channels) + channel], window[chosen])
+
+
+def decode(container: Container) -> Decoder:
+    """Decode all layers of a container, or those that are there."""
+    decoder = Decoder(container.header, container.masks)
+    for layer in container.layers:
+        for segment in layer.segments:
+            decoder.add(segment)
+        decoder.states.append(decoder.remaining.copy())
+    if len(container.layers) == container.header.layers:
+        decoder.take([], container.header.finest)
+        decoder.states[-1] = decoder.remaining
+    return decoder

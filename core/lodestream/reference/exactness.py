@@ -7,22 +7,22 @@ from numpy.typing import NDArray
 
 from .fields import Fields
 from .offsets import read_offsets
-from .range_coder import RangeCoder
+from .range_coder import RangeCoder, new_contexts
 
 SPECIAL, WHICH, SAME, CLOSE, BESIDE, SHORTER = 0, 4, 20, 21, 22, 38
 CONTEXTS = SHORTER + 256
 MASK = (1 << 64) - 1
 
 
-def restore(values: NDArray[Any], data: bytes, offset: int = 0) -> NDArray[Any]:
+def restore(piece: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]:
     """Restore the values of a piece.
 
     Parameters
     ----------
+    piece : bytes
+        The piece.
     values : (n,)
         What the complete layers give, in the channel's type.
-    data : bytes
-        The piece.
     offset : int
         Where it begins in the container.
 
@@ -36,10 +36,10 @@ def restore(values: NDArray[Any], data: bytes, offset: int = 0) -> NDArray[Any]:
     CorruptStreamError
         The piece is damaged.
     """
-    if not data:
+    if not piece:
         return values.copy()
-    fields = Fields(data, offset)
-    if not len(values) or len(data) > 1 + values.nbytes:
+    fields = Fields(piece, offset)
+    if not len(values) or len(piece) > 1 + values.nbytes:
         raise fields.damaged("a piece is longer than its values")
     first = fields.u8()
     rule, argument = first & 3, first >> 2
@@ -65,7 +65,7 @@ def restore(values: NDArray[Any], data: bytes, offset: int = 0) -> NDArray[Any]:
     places, exponents = _places(values, rule, argument)
     limits = np.clip((most & 4095) - exponents, 0, 63)
     try:
-        differences, special = _differences(places, limits, count, RangeCoder(coded, CONTEXTS), stored)
+        differences, special = _differences(places, limits, count, RangeCoder(coded, new_contexts(CONTEXTS)), stored)
     except IndexError:
         raise fields.damaged("the stored bits of a piece end too early") from None
     except ValueError:

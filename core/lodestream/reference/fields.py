@@ -2,11 +2,27 @@
 
 import struct
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 
 from ..errors import CorruptStreamError
+
+
+class Errors(NamedTuple):
+    """Errors of a reconstruction, in the surface's unit.
+
+    Attributes
+    ----------
+    rms, maximum : float
+        Of the distances over the coordinates.
+    channels : tuple of (float, float)
+        Both of each channel; empty where there is only one channel.
+    """
+
+    rms: float
+    maximum: float
+    channels: tuple[tuple[float, float], ...]
 
 
 class Fields:
@@ -92,31 +108,15 @@ class Fields:
             raise self.damaged("a number is not finite, or an error is negative")
         return value
 
-    def errors(self, channels: int) -> "Errors":
+    def errors(self, channels: int) -> Errors:
         """Read errors of a surface of so many channels: section 3."""
         rms, maximum = self.error(), self.error()
-        each = [(self.rough(), self.rough()) for _ in range(channels)] if channels > 1 else []
-        return Errors(rms, maximum, each)
+        return Errors(rms, maximum, tuple((self.rough(), self.rough()) for _ in range(channels if channels > 1 else 0)))
 
     def end(self) -> None:
         """Refuse bytes that are left over."""
         if self.left:
             raise self.damaged(f"{self.left} bytes more than there are fields")
-
-
-class Errors:
-    """Errors of a reconstruction, in the surface's unit.
-
-    Attributes
-    ----------
-    rms, maximum : float
-        Of the distances over the coordinates.
-    channels : list of (float, float)
-        Both of each channel; empty where there is only one channel.
-    """
-
-    def __init__(self, rms: float, maximum: float, channels: list[tuple[float, float]]) -> None:
-        self.rms, self.maximum, self.channels = rms, maximum, channels
 
 
 def crc(data: bytes) -> int:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,11 +22,11 @@ TYPES = [
 
 @dataclass(frozen=True)
 class Block:
-    """A block: rows, columns, and whether both wrap."""
+    """A block: rows, columns, and whether its rows and its columns wrap."""
 
     rows: int
     columns: int
-    wraps: tuple[bool, bool]
+    closed: tuple[bool, bool]
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,21 @@ class Part:
     curves: list[tuple[int, bool] | None]
 
 
+class Attribute(NamedTuple):
+    """Arrays beside the points: name, type, and components, 0 for an array (H, W)."""
+
+    name: str
+    dtype: np.dtype[Any]
+    components: int
+
+
 @dataclass(frozen=True)
 class Header:
     """What the header says.
 
     Attributes
     ----------
-    flat, exact, exactness, masks : bool
+    flat, exact, has_exactness, has_masks : bool
         The points are arrays (H, W); the complete stream is exact; an exactness section follows; masks follow.
     types : list of dtype
         Of each of the N channels, attributes last.
@@ -87,8 +95,8 @@ class Header:
         The d of a tolerance.
     blocks, curves, parts : list
         The arrangement.
-    attributes : list of (str, dtype, int)
-        Name, type and components (0: an array (H, W)) of each array beside the points.
+    attributes : list of Attribute
+        Of the extras.
     plane : list or None
         The rules of x and y.
     joints : list or None
@@ -103,8 +111,8 @@ class Header:
 
     flat: bool
     exact: bool
-    exactness: bool
-    masks: bool
+    has_exactness: bool
+    has_masks: bool
     types: list[np.dtype[Any]]
     channels: int
     layers: int
@@ -116,7 +124,7 @@ class Header:
     blocks: list[Block]
     curves: list[Curve]
     parts: list[Part]
-    attributes: list[tuple[str, np.dtype[Any], int]]
+    attributes: list[Attribute]
     plane: list[list[Any]] | None
     joints: list[Any] | None
     lattices: list[tuple[int, float, float]]
@@ -182,6 +190,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
     attributes, plane, joints = _extras(fields, fields.take(fields.varint())) if flags & 128 else ([], None, None)
     if (flags & 4 or plane) and channels != 1 or plane and (len(blocks) > 1 or not flags & 4):
         raise fields.damaged("an array (H, W) of several channels, or a plane of several blocks")
+    _check_plane(fields, plane, blocks[0])
     points = sum(block.rows * block.columns for block in blocks)
     total = channels + sum(max(components, 1) for _, _, components in attributes)
     if points < 2 or points * total >= 1 << 63:
@@ -214,6 +223,16 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         *(bits[2], bits[3], bits[4], bits[5], types, channels, layers, tile, piece, large, base, extent),
         *(blocks, curves, parts, attributes, plane, joints, lattices, empty, predictors, grids),
     )
+
+
+def _check_plane(fields: Fields, plane: list[list[Any]] | None, block: Block) -> None:
+    """Refuse rules that are none of those of section 8."""
+    for rule, count in zip(plane or [], (block.columns, block.rows), strict=False):
+        values = rule[-1] == "values"
+        numbers = rule[:-1] if values or isinstance(rule[-1], bool) else rule
+        right = len(rule) == count + 1 if values else len(rule) == 3 if len(numbers) < len(rule) else 2 <= len(rule) <= 4
+        if not right or not all(type(number) in (int, float) and abs(number) < 1 << 1023 for number in numbers):
+            raise fields.damaged("a plane's rule of no known kind")
 
 
 def _sizes(fields: Fields) -> tuple[int, int]:
@@ -258,9 +277,9 @@ def _part(fields: Fields, blocks: list[Block], curves: list[Curve]) -> Part:
         sides.append(None if value is None else (value >> 1, bool(value & 1)))
     for axis, size in enumerate((block.rows, block.columns)):
         first, count = window[2 * axis : 2 * axis + 2]
-        if not 0 < count <= size or first >= size or (first + count > size and not block.wraps[axis]):
+        if not 0 < count <= size or first >= size or (first + count > size and not block.closed[axis]):
             raise fields.damaged("a window beyond its block")
-        if wraps[axis] and not (count == size and block.wraps[axis] and not ends >> 2 * axis & 3):
+        if wraps[axis] and not (count == size and block.closed[axis] and not ends >> 2 * axis & 3):
             raise fields.damaged("an axis that wraps has a side, or is a piece of its block's")
         for side in (2 * axis, 2 * axis + 1):
             _check_side(fields, sides[side], ends, side, curves, window[3 - 2 * axis], wraps[1 - axis], flags >> (5 - axis))
@@ -337,15 +356,15 @@ def common_ends(curves: list[Curve], parts: list[Part]) -> dict[tuple[int, int],
 
 def _extras(
     fields: Fields, data: bytes
-) -> tuple[list[tuple[str, np.dtype[Any], int]], list[list[Any]] | None, list[Any] | None]:
+) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
     extras = unpack_map(data, fields.offset + fields.position - len(data))
-    attributes = []
+    attributes: list[Attribute] = []
     plane = None
     try:
         for name, kind, components in extras.get("attributes", []):
             if not isinstance(name, str) or not 0 <= int(kind) < len(TYPES) or not 0 <= int(components) < 1 << 31:
                 raise ValueError("an attribute of no known type")
-            attributes.append((name, TYPES[int(kind)], int(components)))
+            attributes.append(Attribute(name, TYPES[int(kind)], int(components)))
         if "plane" in extras:
             plane = [list(rule) for rule in extras["plane"]["grid"]]
             if len(plane) != 2 or not all(plane):

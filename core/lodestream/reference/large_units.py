@@ -116,6 +116,8 @@ class LargeUnit:
             )
             self.begun = True
             position = 8
+        for striped in self.bands:
+            striped.plane = -1  # the parents may have changed
         for _ in range(passes):
             self.remaining -= 1
             plane, second = self.remaining >> 1, not self.remaining & 1

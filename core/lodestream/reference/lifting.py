@@ -112,17 +112,6 @@ def details(samples: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
     return d - _predicted(nodes, axis, pair)
 
 
-def unrounded_nodes(positions: NDArray[np.float64], axis: Axis) -> NDArray[np.float64]:
-    """Compute the nodes of a step of float64 (samples,) without any rounding; float64 (nodes,)."""
-    run, count = axis.run, axis.midpoints
-    even = positions[0 : 2 * run : 2]
-    d = positions[1 : 2 * count : 2] - (even[:count] + (np.roll(even, -1)[:count] if _periodic(axis) else even[1 : count + 1])) / 2
-    index, sign = _beyond(axis)
-    wide = d[index] * sign
-    s = sum(h * (wide[REACH + j :][:run] + wide[REACH - 1 - j :][:run]) for j, h in enumerate(H))
-    return np.concatenate([even + s / (1 << 24), positions[-1:] if axis.extra else positions[:0]])
-
-
 def _forward(samples: Lines, axis: Axis) -> tuple[Lines, Lines]:
     run, count = axis.run, axis.midpoints
     even = samples[0 : 2 * run : 2]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..errors import CorruptStreamError
 from .fields import Fields
-from .range_coder import RangeCoder
+from .range_coder import RangeCoder, new_contexts
 
 Mask = NDArray[np.bool_]
 POINTS = 4
@@ -22,13 +22,23 @@ class Masks:
     ----------
     hole : int
         The value of integer points at holes.
-    valid, kept : list of bool (H, W) or None
-        For each block the points that are valid, None if all are; and the holes that are kept, None if none is.
+    valid, kept : list of bool (H, W)
+        For each block the points that are valid, and the holes that are kept.
     """
 
     hole: int
-    valid: list[Mask | None]
-    kept: list[Mask | None]
+    valid: list[Mask]
+    kept: list[Mask]
+
+    @property
+    def keep_any(self) -> bool:
+        """Whether there is a kept hole."""
+        return any(mask.any() for mask in self.kept)
+
+
+def no_holes(sizes: list[tuple[int, int]]) -> Masks:
+    """Make the masks of blocks of such sizes without holes."""
+    return Masks(0, [np.ones(size, np.bool_) for size in sizes], [np.zeros(size, np.bool_) for size in sizes])
 
 
 def decode_mask(data: bytes, rows: int, columns: int, offset: int = 0) -> Mask:
@@ -53,7 +63,7 @@ def decode_mask(data: bytes, rows: int, columns: int, offset: int = 0) -> Mask:
     CorruptStreamError
         The string has more bytes than decoding reads.
     """
-    coder = RangeCoder(data, POINTS + 1024)
+    coder = RangeCoder(data, new_contexts(POINTS + 1024))
     bit = coder.bit
     last = 0
     # Three rows with two zeros before them and, so that every window of a group is whole, eighteen behind.
@@ -101,29 +111,25 @@ def read_masks(payload: bytes, offset: int, kept: bool, sizes: list[tuple[int, i
         The payload is damaged, or its counts are not those of its masks.
     """
     fields = Fields(payload, offset)
+    masks = no_holes(sizes)
     hole: int = fields.number("q")
-    valid: list[Mask | None] = []
     holes = []
-    for rows, columns in sizes:
+    for number, (rows, columns) in enumerate(sizes):
         holes.append(fields.varint())
-        valid.append(_counted(fields, rows, columns, rows * columns - holes[-1]) if holes[-1] else None)
-    saved: list[Mask | None] = []
-    for (rows, columns), count, mask in zip(sizes, holes, valid, strict=True):
-        keeps = fields.varint() if kept else 0
-        if keeps > count:
-            raise fields.damaged("more holes are kept than there are")
-        if keeps == 0 or mask is None:
-            saved.append(None)
-        elif keeps == count:
-            saved.append(~mask)
-        else:
-            saved.append(_counted(fields, rows, columns, keeps))
-            if (saved[-1] & mask).any():
-                raise fields.damaged("a valid point is a kept hole")
-    if kept and all(mask is None for mask in saved):
+        if holes[-1]:
+            masks.valid[number] = _counted(fields, rows, columns, rows * columns - holes[-1])
+    for number, (rows, columns) in enumerate(sizes if kept else ()):
+        count = fields.varint()
+        if count == holes[number]:
+            masks.kept[number] = ~masks.valid[number]
+        elif count:
+            masks.kept[number] = _counted(fields, rows, columns, count)
+        if count > holes[number] or (masks.kept[number] & masks.valid[number]).any():
+            raise fields.damaged("more is kept than holes")
+    if kept and not masks.keep_any:
         raise fields.damaged("no hole is kept")
     fields.end()
-    return Masks(hole, valid, saved)
+    return Masks(hole, masks.valid, masks.kept)
 
 
 def _counted(fields: Fields, rows: int, columns: int, ones: int) -> Mask:

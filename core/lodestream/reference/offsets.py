@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fields import Fields
-from .range_coder import RangeCoder
+from .range_coder import RangeCoder, new_contexts
 
 FIRST, LISTED, WHICH, OFF, NEW = 0, 16, 17, 81, 97
 CONTEXTS = NEW + 46
@@ -41,7 +41,7 @@ def read_offsets(values: NDArray[Any], fields: Fields, bits: int) -> NDArray[Any
     step = fields.number("d")
     if not 0 < step < float("inf"):
         raise fields.damaged("a step of offsets is not above 0")
-    coder = RangeCoder(fields.take(fields.left), CONTEXTS)
+    coder = RangeCoder(fields.take(fields.left), new_contexts(CONTEXTS))
     wide = values.astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         bases = (np.rint(wide / step) * step).tolist()

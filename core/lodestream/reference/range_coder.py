@@ -4,6 +4,11 @@ RATES = [(1 << 17) // (2 * n + 3) for n in range(128)]
 """The share of the way that a context of count n goes, over 2^16."""
 
 
+def new_contexts(count: int) -> tuple[list[int], list[int]]:
+    """Make so many contexts as they are at the start: P and n of each."""
+    return [1 << 19] * count, [1] * count
+
+
 class RangeCoder:
     """Decodes bits from a string of bytes.
 
@@ -11,17 +16,14 @@ class RangeCoder:
     ----------
     data : bytes
         The string; bytes past its end are 0.
-    contexts : int
-        How many contexts there are.
-    like : RangeCoder, optional
-        Whose contexts go on, in place of new ones.
+    contexts : (list of int, list of int)
+        P and n of each, see `new_contexts`; both lists change.
     """
 
     __slots__ = ("counts", "data", "end", "low", "position", "probabilities", "width")
 
-    def __init__(self, data: bytes, contexts: int = 0, like: "RangeCoder | None" = None) -> None:
-        self.probabilities = like.probabilities if like else [1 << 19] * contexts
-        self.counts = like.counts if like else [1] * contexts
+    def __init__(self, data: bytes, contexts: tuple[list[int], list[int]]) -> None:
+        self.probabilities, self.counts = contexts
         self.data = data
         self.end = len(data)
         self.position = 4

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .header import Header
-from .levels import Axis, positions
-from .lifting import details, inverse, unrounded_nodes
+from .levels import positions
+from .lifting import details, inverse
 
 Array = NDArray[np.int64]
 
@@ -174,26 +174,12 @@ def places(header: Header, block: int, level: int) -> tuple[list[NDArray[np.int6
     ]
 
 
-def plane_positions(header: Header, axis: int, level: int) -> NDArray[np.float64]:
-    """Give the positions along an axis of a height field's nodes at a level; float64 (nodes,)."""
-    grid = header.grids[0]
-    line = np.arange(float(grid.axes[-1][axis].samples))
-    for upper in range(header.finest, level, -1):
-        if grid.stepped(upper, axis):
-            above = grid.axes[upper][axis]
-            line = unrounded_nodes(line, Axis(above.samples, False, above.clamped))
-    return line
-
-
-def plane_values(header: Header, level: int) -> list[NDArray[Any]]:
-    """Compute x and y of a surface with a plane at a level; (rows, columns) each, in the type of the points."""
-    assert header.plane is not None
-    down, across = (plane_positions(header, axis, level) for axis in (0, 1))
-    shape = len(down), len(across)
-    r, c = np.broadcast_to(down[:, None], shape), np.broadcast_to(across[None], shape)
+def plane_values(header: Header) -> list[NDArray[Any]]:
+    """Compute x and y of a surface with a plane; (rows, columns) each, in the type of the points."""
     block = header.blocks[0]
+    r, c = np.indices((block.rows, block.columns)).astype(np.float64)
     found = []
-    for rule, p, n in zip(header.plane, (c, r), (block.columns, block.rows), strict=True):
+    for rule, p, n in zip(header.plane or [], (c, r), (block.columns, block.rows), strict=True):
         with np.errstate(all="ignore"):
             found.append(to_type(_evaluate(rule, p, n, r, c), header.types[0]))
     return found
@@ -203,7 +189,7 @@ def _evaluate(
     rule: list[Any], p: NDArray[np.float64], n: int, r: NDArray[np.float64], c: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     if rule[-1] == "values":
-        return np.interp(p, np.arange(n), np.array(rule[:-1], np.float64))
+        return np.array(rule[:-1], np.float64)[p.astype(np.int64)]
     last = rule[-1]
     origin, step = float(rule[0]), float(rule[1])
     if last is False:

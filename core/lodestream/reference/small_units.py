@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bands import Band
-from .range_coder import RATES, RangeCoder
+from .range_coder import RATES, RangeCoder, new_contexts
 
 STATES = [0, 2, 5, 7, 1, 3, 6, 4, 2, 0, 4, 6, 3, 1, 7, 5]
 """Next state of the two quantisers, by 2 state + parity."""
@@ -67,7 +67,7 @@ class _Lists:
         self.grey: list[list[int]] = []
 
     def begin(self, plane: int) -> None:
-        """Take the sums and the parents of a plane of which nothing is decoded."""
+        """Take the sums and the parents of a plane."""
         part, self.grey = self.band.look_up(plane)
         u = np.minimum(np.array(self.magnitudes, np.int32) >> plane, 3)
         sums = np.pad(part, 2).ravel()
@@ -75,7 +75,6 @@ class _Lists:
         for offset, weight in self.neighbours:
             sums[low:high] += weight * u[low + offset : high + offset]
         self.sums = sums.tolist()
-        self.visited = [0] * self.size
 
     def _array(self, values: list[int]) -> NDArray[np.int32]:
         rows, columns = self.band.shape
@@ -108,17 +107,20 @@ class SmallUnit:
         self.remaining = 2 * top - 1
         self.top = top
         self.indices = indices
-        self.coder = RangeCoder(b"", INDICES + (76 if indices else 0))
+        self.contexts = new_contexts(INDICES + (76 if indices else 0))
+        self.coder = RangeCoder(b"", self.contexts)
 
     def decode(self, data: bytes, passes: int) -> None:
         """Decode the next passes from a segment."""
-        self.coder = RangeCoder(data, like=self.coder)
-        for _ in range(passes):
+        self.coder = RangeCoder(data, self.contexts)
+        for number in range(passes):
             self.remaining -= 1
             plane, second = self.remaining >> 1, not self.remaining & 1
             for lists in self.bands:
-                if not second or plane == self.top - 1:
+                if not second or number == 0:
                     lists.begin(plane)
+                if not second:
+                    lists.visited = [0] * len(lists.visited)
                 if second:
                     self._second(lists, plane)
                 elif plane or not self.indices:
