@@ -135,11 +135,11 @@ def read_layer(section: Section, header: Header, remaining: dict[int, int]) -> L
         count = coefficients_of(header, unit)
         if not count or header.empty[unit % channels] >> header.tiles[unit // channels].level & 1:
             raise fields.damaged("a layer names a unit without coefficients")
-        if (top is None) != (unit in remaining) or top is not None and not 1 <= top <= 28:
+        if (top is None) != (unit in remaining) or not 1 <= (top or 1) <= 28 or top == 0:
             raise fields.damaged("bit-planes of a unit are missing, repeated or out of range")
         left = (remaining[unit] if top is None else 2 * top - 1) - passes
-        if left < 0 or not 1 <= length <= 64 + 4 * passes * count:
-            raise fields.damaged("a segment has too many passes or bytes, or none")
+        if left < 0 or not length:
+            raise fields.damaged("a segment has too many passes, or no bytes")
         remaining[unit] = left
         entries.append((unit, passes, top, length))
     segments = [Segment(unit, passes, top, fields.take(length)) for unit, passes, top, length in entries]

@@ -73,7 +73,7 @@ class Decoder:
     def add(self, segment: Segment) -> None:
         """Decode the next passes of a unit; its parent's passes of the same planes must have been added."""
         number, top = segment.unit, segment.top
-        if number not in self.units:
+        if self.remaining[number] == UNKNOWN:
             if top is None:
                 raise ValueError(f"unit {number} begins without its bit-planes")
             indices = self.header.base > 0 and number % len(self.header.types) < self.header.coordinates

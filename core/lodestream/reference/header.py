@@ -230,7 +230,9 @@ def _check_plane(fields: Fields, plane: list[list[Any]] | None, block: Block) ->
     for rule, count in zip(plane or [], (block.columns, block.rows), strict=False):
         values = rule[-1] == "values"
         numbers = rule[:-1] if values or isinstance(rule[-1], bool) else rule
-        right = len(rule) == count + 1 if values else len(rule) == 3 if len(numbers) < len(rule) else 2 <= len(rule) <= 4
+        right = (
+            len(rule) == count + 1 if values else len(rule) == 3 if len(numbers) < len(rule) else 2 <= len(rule) <= 4
+        )
         if not right or not all(type(number) in (int, float) and abs(number) < 1 << 1023 for number in numbers):
             raise fields.damaged("a plane's rule of no known kind")
 
@@ -282,7 +284,9 @@ def _part(fields: Fields, blocks: list[Block], curves: list[Curve]) -> Part:
         if wraps[axis] and not (count == size and block.closed[axis] and not ends >> 2 * axis & 3):
             raise fields.damaged("an axis that wraps has a side, or is a piece of its block's")
         for side in (2 * axis, 2 * axis + 1):
-            _check_side(fields, sides[side], ends, side, curves, window[3 - 2 * axis], wraps[1 - axis], flags >> (5 - axis))
+            _check_side(
+                fields, sides[side], ends, side, curves, window[3 - 2 * axis], wraps[1 - axis], flags >> (5 - axis)
+            )
     return Part(
         *(number, wraps, (bool(flags & 4), bool(flags & 8)), (bool(flags & 16), bool(flags & 32))),
         *((bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)), window, sides),
@@ -319,9 +323,7 @@ def _grids(curves: list[Curve], parts: list[Part]) -> list[Grid]:
     held = common_ends(curves, parts)
     left = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
     left += [tuple(side is not None for side in part.curves) for part in parts]  # type: ignore[misc]
-    return [
-        Grid(number < len(curves), chain, left[number]) for number, chain in enumerate(levels_of(axes, stops))
-    ]
+    return [Grid(number < len(curves), chain, left[number]) for number, chain in enumerate(levels_of(axes, stops))]
 
 
 def common_ends(curves: list[Curve], parts: list[Part]) -> dict[tuple[int, int], tuple[int, int]]:
@@ -354,9 +356,7 @@ def common_ends(curves: list[Curve], parts: list[Part]) -> dict[tuple[int, int],
     return {end: first(end) for end in same}
 
 
-def _extras(
-    fields: Fields, data: bytes
-) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
+def _extras(fields: Fields, data: bytes) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
     extras = unpack_map(data, fields.offset + fields.position - len(data))
     attributes: list[Attribute] = []
     plane = None

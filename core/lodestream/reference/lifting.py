@@ -37,7 +37,9 @@ def _beyond(axis: Axis) -> tuple[Lines, Lines]:
             sign[index == -1] = 0
         if not last:
             sign[index == count] = 0
-        index = np.where(before, (-1 if first else -2) - index, np.where(after, 2 * count - (1 if last else 0) - index, index))
+        index = np.where(
+            before, (-1 if first else -2) - index, np.where(after, 2 * count - (1 if last else 0) - index, index)
+        )
         sign = np.where(before | after, -sign, sign)
         index[sign == 0] = 0
 

@@ -63,12 +63,12 @@ def read_offsets(values: NDArray[Any], fields: Fields, bits: int) -> NDArray[Any
                     rank = min(tree(WHICH, 6), len(intervals) - 1)
         if rank >= 0:
             low, high = intervals.pop(rank)
-            place = place_of(base + 0.5 * (low + high)) + tree(OFF + 8 * (rank > 0), 3) - 4  # noqa: PLW2901
+            place = place_of(base + 0.5 * (low + high)) + tree(OFF + 8 * (rank > 0), 3) - 4
         else:
             w = tree(NEW, min(bits, 4))
             for j in range(4, bits):
                 w = 2 * w + bit(NEW + 12 + j)
-            place += w  # noqa: PLW2901
+            place += w
         value = value_at(place)
         bottom = 0.5 * (value + value_at(place - 1)) - base
         top = 0.5 * (value + value_at(place + 1)) - base

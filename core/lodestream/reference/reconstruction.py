@@ -44,7 +44,7 @@ def reconstruct(
         shares = tile.shares[not coordinate]
         for share, values in zip(shares, coefficients(number, channel) if shares else [], strict=True):
             if tile.level > whole:
-                values = np.clip(8 * values, -(1 << 28), 1 << 28)  # noqa: PLW2901
+                values = np.clip(8 * values, -(1 << 28), 1 << 28)
             arrays[share.grid][share.rows, share.columns] = values
     if coordinate:
         _copy_ends(header, arrays)
@@ -140,7 +140,9 @@ def to_type(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
     limits = np.iinfo(dtype)
     whole = np.rint(values)
     # The highest value of 64 bits is no float64; what reaches it is put in by hand.
-    inside = np.clip(whole, float(limits.min), np.nextafter(float(limits.max) + 1, 0) if limits.bits == 64 else limits.max)
+    inside = np.clip(
+        whole, float(limits.min), np.nextafter(float(limits.max) + 1, 0) if limits.bits == 64 else limits.max
+    )
     found = inside.astype(dtype)
     found[whole >= float(limits.max)] = limits.max
     return found

@@ -154,7 +154,13 @@ class SmallUnit:
         coder = self.coder
         probabilities, counts, data, end = coder.probabilities, coder.counts, coder.data, coder.end
         low, width, position = coder.low, coder.width, coder.position
-        magnitudes, signs, sums, visited, stride = lists.magnitudes, lists.signs, lists.sums, lists.visited, lists.stride
+        magnitudes, signs, sums, visited, stride = (
+            lists.magnitudes,
+            lists.signs,
+            lists.sums,
+            lists.visited,
+            lists.stride,
+        )
         swap, sign_base = lists.band.kind == 2, SIGN + max(lists.band.kind, 1) - 1
         quantisers = self.indices and plane == 0
         one, turned = 1 << plane, False
@@ -228,4 +234,3 @@ class SmallUnit:
                 state = STATES[2 * state + (magnitudes[i] & 1)]
         coder.low, coder.width, coder.position = low, width, position
         return state
-
