@@ -12,23 +12,11 @@ Bits = NDArray[np.bool_]
 class Band:
     """A unit's share of one subband.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of coefficients.
-    kind : (int, int)
-        Whether the band has details along axis 0 and along axis 1.
-    parents : (Parents, Band) or None
-        Where the coefficients' parents are; None if all of them are 0.
-
-    Attributes
-    ----------
-    magnitude : int32 (rows, columns)
-        Of the coefficients, as far as they are decoded.
-    negative, early, odd : bool (rows, columns)
-        The coefficient is negative; became significant in the first pass of a plane; is an index of quantiser Q1.
-    flags : list of list of int
-        For each row of blocks and each block 1 if it is significant.
+    `shape` ((int, int)): rows and columns of coefficients; `kind` ((int, int)): whether the band has details along axis
+    0 and along axis 1; `parents` ((Parents, Band) or None): where the coefficients' parents are; None if all of them
+    are 0. `magnitude` (int32 (rows, columns)): of the coefficients, as far as they are decoded; `negative`, `early`,
+    `odd` (bool (rows, columns)): the coefficient is negative; became significant in the first pass of a plane; is an
+    index of quantiser Q1; `flags` (list of list of int): for each row of blocks and each block 1 if it is significant.
     """
 
     def __init__(self, shape: tuple[int, int], kind: tuple[int, int], parents: "tuple[Parents, Band] | None") -> None:
@@ -45,12 +33,8 @@ class Band:
     def look_up(self, plane: int) -> tuple[Magnitudes, list[list[int]]]:
         """Read the parents at a plane.
 
-        Returns
-        -------
-        part : int32 (rows, columns)
-            The parents' part of a context.
-        grey : list of list of int
-            For each row of blocks and each block the g of its flag's context.
+        Returns `part` (int32 (rows, columns)): the parents' part of a context; `grey` (list of list of int): for each
+        row of blocks and each block the g of its flag's context.
         """
         if self.parents is None:
             return np.zeros(self.shape, np.int32), [[0] * len(row) for row in self.flags]

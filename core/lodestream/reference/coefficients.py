@@ -33,19 +33,8 @@ def quantiser_step(base: int, grid: Grid, level: int, share: Share) -> int:
 def reconstructed(band: Band, remaining: int, step: int) -> NDArray[np.int64]:
     """Reconstruct coefficients as they are while passes remain.
 
-    Parameters
-    ----------
-    band : Band
-        With these passes decoded, or more.
-    remaining : int
-        Passes that remain.
-    step : int
-        S of a band of indices, otherwise 0.
-
-    Returns
-    -------
-    int64 (rows, columns)
-        The coefficients.
+    `band` (Band): with these passes decoded, or more; `remaining` (int): passes that remain; `step` (int): S of a band
+    of indices, otherwise 0. Returns int64 (rows, columns): the coefficients.
     """
     magnitude = band.magnitude.astype(np.int64)
     plane = (remaining + 1) >> 1

@@ -27,14 +27,8 @@ class Section(NamedTuple):
 class Segment:
     """The next passes of a unit.
 
-    Attributes
-    ----------
-    unit, passes : int
-        Number of the unit; how many passes.
-    top : int or None
-        Bit-planes of the unit; None in a layer's segment that is not the unit's first.
-    data : bytes
-        The coded string.
+    `unit`, `passes` (int): number of the unit; how many passes; `top` (int or None): bit-planes of the unit; None in a
+    layer's segment that is not the unit's first; `data` (bytes): the coded string.
     """
 
     unit: int
@@ -64,20 +58,10 @@ class Exactness:
 class Container:
     """What has been read of a container.
 
-    Attributes
-    ----------
-    header : Header
-        The header.
-    masks : Masks
-        Holes.
-    layers : list of Layer
-        Those that are there, from the first.
-    exactness : Exactness or None
-        The exactness section, if there is one and it is there.
-    metadata : dict or None
-        The metadata, if they are there.
-    optional : list of (int, bytes)
-        Kind and payload of the optional sections before the metadata.
+    `header` (Header): the header; `masks` (Masks): holes; `layers` (list of Layer): those that are there, from the
+    first; `exactness` (Exactness or None): the exactness section, if there is one and it is there; `metadata` (dict or
+    None): the metadata, if they are there; `optional` (list of (int, bytes)): kind and payload of the optional sections
+    before the metadata.
     """
 
     header: Header
@@ -91,12 +75,8 @@ class Container:
 def read_section(data: bytes, position: int) -> Section:
     """Read the section that begins at a position of the container.
 
-    Raises
-    ------
-    TruncatedStreamError
-        The container ends before the section does.
-    CorruptStreamError
-        The CRC is another one, or the length is written in more bytes than it takes.
+    Raises TruncatedStreamError if the container ends before the section does; CorruptStreamError if the CRC is another
+    one, or the length is written in more bytes than it takes.
     """
     fields = Fields(data[position : position + 10], position)
     try:
@@ -157,19 +137,9 @@ def coefficients_of(header: Header, unit: int) -> int:
 def read_container(data: bytes) -> Container:
     """Read a container, or its beginning as far as it is whole.
 
-    Parameters
-    ----------
-    data : bytes
-        The file, or a prefix that holds at least the header and the masks.
-
-    Raises
-    ------
-    TruncatedStreamError
-        The header or the masks are not all there.
-    CorruptStreamError
-        They are damaged.
-    UnsupportedVersionError
-        Another version, or a codec that is not known.
+    `data` (bytes): the file, or a prefix that holds at least the header and the masks. Raises TruncatedStreamError if
+    the header or the masks are not all there; CorruptStreamError if they are damaged; UnsupportedVersionError if
+    another version, or a codec that is not known.
     """
     if data[:7] != MAGIC[: len(data)]:
         raise CorruptStreamError("no container", 0)

@@ -25,12 +25,8 @@ UNKNOWN = -1
 class Shown:
     """What a state shows of a block.
 
-    Attributes
-    ----------
-    arrays : list of array
-        The points (h, w) or (h, w, C), and each attribute (h, w) or (h, w, components), in their types.
-    valid : bool (h, w)
-        The points that have values.
+    `arrays` (list of array): the points (h, w) or (h, w, C), and each attribute (h, w) or (h, w, components), in their
+    types; `valid` (bool (h, w)): the points that have values.
     """
 
     arrays: list[NDArray[Any]]
@@ -40,22 +36,10 @@ class Shown:
 class Decoder:
     """Decodes units as their segments come, and shows the surface as it was after any layer.
 
-    Parameters
-    ----------
-    header : Header
-        Of the container.
-    masks : Masks, optional
-        Holes; without it there are none.
-
-    Attributes
-    ----------
-    remaining : list of int
-        For each unit how many of its passes remain; 0 too if all its coefficients are known to be 0, -1 as long as
-        that is not known.
-    states : list of list of int
-        What `remaining` was after each layer.
-    units : dict
-        Of each unit that has segments what decodes it.
+    `header` (Header): of the container; `masks` (Masks, optional): holes; without it there are none. `remaining` (list
+    of int): for each unit how many of its passes remain; 0 too if all its coefficients are known to be 0, -1 as long as
+    that is not known; `states` (list of list of int): what `remaining` was after each layer; `units` (dict): of each
+    unit that has segments what decodes it.
     """
 
     def __init__(self, header: Header, masks: Masks | None = None) -> None:
@@ -120,20 +104,10 @@ class Decoder:
     def channel(self, channel: int, level: int, remaining: list[int] | None = None) -> list[NDArray[Any]]:
         """Compute the values of a channel.
 
-        Parameters
-        ----------
-        channel : int
-            Number of the channel.
-        level : int
-            The level that is made.
-        remaining : list of int, optional
-            The state that is shown, as in the attribute, which stands in otherwise. A unit may have been decoded
-            further.
-
-        Returns
-        -------
-        list of (h, w)
-            The values of each block at the level, in the channel's type; exactness and holes are not looked at.
+        `channel` (int): number of the channel; `level` (int): the level that is made; `remaining` (list of int,
+        optional): the state that is shown, as in the attribute, which stands in otherwise. A unit may have been decoded
+        further. Returns list of (h, w): the values of each block at the level, in the channel's type; exactness and
+        holes are not looked at.
         """
         header = self.header
         state = self.remaining if remaining is None else remaining
@@ -180,19 +154,10 @@ class Decoder:
     ) -> list[Shown]:
         """Show the surface.
 
-        Parameters
-        ----------
-        layers : int, optional
-            After how many layers, at least 1; else as it is now.
-        level : int, optional
-            The level that is made; the finest one if it is not given.
-        exactness : Exactness, optional
-            Whose pieces are put in; for the finest level after all layers.
-
-        Returns
-        -------
-        list of Shown
-            One for each block. At coarser levels the points of a height field with a plane are heights alone.
+        `layers` (int, optional): after how many layers, at least 1; else as it is now; `level` (int, optional): the
+        level that is made; the finest one if it is not given; `exactness` (Exactness, optional): whose pieces are put
+        in; for the finest level after all layers. Returns list of Shown: one for each block. At coarser levels the
+        points of a height field with a plane are heights alone.
         """
         header = self.header
         level = header.finest if level is None else level
@@ -202,10 +167,9 @@ class Decoder:
             self._restore(channels, exactness.pieces)
         found = []
         for number in range(len(header.blocks)):
-            valid = self.masks.valid[number]
-            if exactness is not None:
-                valid = valid | self.masks.kept[number]
-            valid = valid[np.ix_(*places(header, number, level)[0])]
+            stands = np.ix_(*places(header, number, level)[0])
+            valid = self.masks.valid[number][stands]
+            filled = valid if exactness is None else valid | self.masks.kept[number]
             values = [blocks[number] for blocks in channels]
             first = values[: header.channels]
             if header.plane is not None and level == header.finest:
@@ -216,7 +180,7 @@ class Decoder:
                 some = values[at : at + max(attribute.components, 1)]
                 arrays.append(np.stack(some, axis=-1) if attribute.components else some[0])
             for array, hole in zip(arrays, [self.masks.hole, *[0] * len(header.attributes)], strict=True):
-                array[~valid] = np.nan if array.dtype.kind == "f" else hole
+                array[~filled] = np.nan if array.dtype.kind == "f" else hole
             found.append(Shown(arrays, valid))
         return found
 

@@ -17,24 +17,9 @@ MASK = (1 << 64) - 1
 def restore(piece: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]:
     """Restore the values of a piece.
 
-    Parameters
-    ----------
-    piece : bytes
-        The piece.
-    values : (n,)
-        What the complete layers give, in the channel's type.
-    offset : int
-        Where it begins in the container.
-
-    Returns
-    -------
-    (n,)
-        The values, of the same type.
-
-    Raises
-    ------
-    CorruptStreamError
-        The piece is damaged.
+    `piece` (bytes): the piece; `values` ((n,)): what the complete layers give, in the channel's type; `offset` (int):
+    where it begins in the container. Returns (n,): the values, of the same type. Raises CorruptStreamError if the piece
+    is damaged.
     """
     if not piece:
         return values.copy()

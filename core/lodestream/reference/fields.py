@@ -12,12 +12,8 @@ from ..errors import CorruptStreamError
 class Errors(NamedTuple):
     """Errors of a reconstruction, in the surface's unit.
 
-    Attributes
-    ----------
-    rms, maximum : float
-        Of the distances over the coordinates.
-    channels : tuple of (float, float)
-        Both of each channel; empty where there is only one channel.
+    `rms`, `maximum` (float): of the distances over the coordinates; `channels` (tuple of (float, float)): both of each
+    channel; empty where there is only one channel.
     """
 
     rms: float
@@ -28,17 +24,8 @@ class Errors(NamedTuple):
 class Fields:
     """Reads the fields of some bytes; nothing is read beyond their end.
 
-    Parameters
-    ----------
-    data : bytes
-        What is read.
-    offset : int
-        Where it begins in the container, in bytes, for messages of errors.
-
-    Raises
-    ------
-    CorruptStreamError
-        From every method, if the bytes end too early or hold no such field.
+    `data` (bytes): what is read; `offset` (int): where it begins in the container, in bytes, for messages of errors.
+    Raises CorruptStreamError if from every method, if the bytes end too early or hold no such field.
     """
 
     def __init__(self, data: bytes, offset: int = 0) -> None:
@@ -49,6 +36,11 @@ class Fields:
     def damaged(self, message: str) -> CorruptStreamError:
         """Make the error that says what is wrong, at this place in the container."""
         return CorruptStreamError(message, self.offset + self.position)
+
+    def require(self, right: bool, message: str) -> None:
+        """Raise that error unless something is right."""
+        if not right:
+            raise self.damaged(message)
 
     @property
     def left(self) -> int:
@@ -87,7 +79,7 @@ class Fields:
             raise self.damaged(f"{value} entries are announced in {self.left} bytes")
         return value
 
-    def float(self) -> float:
+    def real(self) -> float:
         """Read a binary64 without its last bytes; it must be finite."""
         size = self.u8()
         if size > 8:

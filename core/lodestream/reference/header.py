@@ -1,7 +1,9 @@
 """The header: sections 3 to 3.2 of docs/format.md."""
 
+import operator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,62 +13,43 @@ from .fields import Fields, unpack_map
 from .levels import Axis, Grid, fitted_steps, levels_of
 from .tiles import Tile, tiles_of
 
-CODECS = 6
-"""Codecs 1 to 6 are decoded here."""
+CODECS = 6  # numbers 1 to 6 are decoded here
+TYPES = list(map(np.dtype, ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")))
 
-TYPES = [
-    np.dtype(name)
-    for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64")
-]
+Pair = tuple[bool, bool]  # of axis 0 and axis 1
+End = tuple[int, int]  # a curve, and 0 for its first point or 1 for its last; a curve of one point has one end, 0
 
 
-@dataclass(frozen=True)
-class Block:
-    """A block: rows, columns, and whether its rows and its columns wrap."""
+class Block(NamedTuple):
+    """A block."""
 
     rows: int
     columns: int
-    closed: tuple[bool, bool]
+    closed: Pair
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A curve: its points, whether it stops, whether it is closed."""
+class Curve(NamedTuple):
+    """A curve of so many points."""
 
     length: int
     stops: bool
     closed: bool
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part.
-
-    Attributes
-    ----------
-    block : int
-        Number of its block.
-    wraps, reverse, stops : (bool, bool)
-        Of axis 0 and axis 1: it wraps, is stored in reverse order, stops.
-    clamped : (bool, bool, bool, bool)
-        First row, last row, first column, last column.
-    window : (int, int, int, int)
-        First row, rows, first column, columns of its block.
-    curves : list of (int, bool) or None
-        For each side in the order of `clamped` the curve it comes from and whether that is reversed.
-    """
+class Part(NamedTuple):
+    """A part; its sides are the first row, last row, first column and last column, as it is stored."""
 
     block: int
-    wraps: tuple[bool, bool]
-    reverse: tuple[bool, bool]
-    stops: tuple[bool, bool]
+    closed: Pair
+    reverse: Pair
+    stops: Pair
     clamped: tuple[bool, bool, bool, bool]
-    window: tuple[int, int, int, int]
-    curves: list[tuple[int, bool] | None]
+    curves: tuple[tuple[int, bool] | None, ...]  # for each side the curve it comes from, and whether that is reversed
+    window: tuple[tuple[int, int], tuple[int, int]]  # first row, rows; first column, columns
 
 
 class Attribute(NamedTuple):
-    """Arrays beside the points: name, type, and components, 0 for an array (H, W)."""
+    """Arrays (H, W, components) beside the points, or (H, W) if components is 0."""
 
     name: str
     dtype: np.dtype[Any]
@@ -75,61 +58,29 @@ class Attribute(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """What the header says.
+    """What the header says; N channels, those of attributes last."""
 
-    Attributes
-    ----------
-    flat, exact, has_exactness, has_masks : bool
-        The points are arrays (H, W); the complete stream is exact; an exactness section follows; masks follow.
-    types : list of dtype
-        Of each of the N channels, attributes last.
-    channels, layers : int
-        Channels of the points, C; number of layers.
-    tile, piece : (int, int)
-        Binary logarithms of rows and columns of a tile, and of a piece of exactness.
-    large : int
-        The coarsest level whose units are large; 0: none are.
-    base : int
-        0, or that of the quantisers.
-    extent : float
-        The d of a tolerance.
-    blocks, curves, parts : list
-        The arrangement.
-    attributes : list of Attribute
-        Of the extras.
-    plane : list or None
-        The rules of x and y.
-    joints : list or None
-        As in the extras.
-    lattices : list of (int, float, float)
-        Rule, origin and step of each channel.
-    empty : list of int
-        Of each channel, a bit for each level.
-    predictors : list of dict
-        Of each channel: (lower level, 0 or 1 for the axes of parts, 2 for curves) to (a, b).
-    """
-
-    flat: bool
+    flat: bool  # the points are arrays (H, W)
     exact: bool
     has_exactness: bool
     has_masks: bool
-    types: list[np.dtype[Any]]
-    channels: int
+    types: list[np.dtype[Any]]  # of each channel
+    channels: int  # of the points, C
     layers: int
-    tile: tuple[int, int]
-    piece: tuple[int, int]
-    large: int
+    tile: tuple[int, int]  # binary logarithms of the rows and columns of a tile
+    piece: tuple[int, int]  # and of a piece of exactness
+    large: int  # the coarsest level whose units are large, 0 if none are
     base: int
     extent: float
     blocks: list[Block]
     curves: list[Curve]
     parts: list[Part]
     attributes: list[Attribute]
-    plane: list[list[Any]] | None
+    plane: list[list[Any]] | None  # the rules of x and y
     joints: list[Any] | None
-    lattices: list[tuple[int, float, float]]
-    empty: list[int]
-    predictors: list[dict[tuple[int, int], tuple[int, int]]]
+    lattices: list[tuple[int, float, float]]  # rule, origin, step of each channel
+    empty: list[int]  # of each channel, bit l for level l
+    predictors: list[dict[tuple[int, int], tuple[int, int]]]  # of each channel: fitted step to (a, b)
     grids: list[Grid]
 
     @property
@@ -148,228 +99,169 @@ class Header:
         return tiles_of(self.grids, self.tile)
 
     @cached_property
-    def holders(self) -> dict[tuple[int, int], tuple[int, int]]:
-        """For each end of a curve that another holds, (curve, 0 or 1), the end that holds it."""
+    def holders(self) -> dict[End, End]:
+        """For each end of a curve that another end holds, that one."""
         return common_ends(self.curves, self.parts)
 
 
 def read_header(payload: bytes, offset: int = 0) -> Header:
-    """Read the payload of the header's section.
+    """Read the payload of the header's section, which begins at `offset` in the container.
 
-    Parameters
-    ----------
-    payload : bytes
-        What the frame encloses.
-    offset : int
-        Where it begins in the container.
-
-    Raises
-    ------
-    CorruptStreamError
-        The header is damaged.
-    UnsupportedVersionError
-        The container needs a codec that is not known here.
+    Raises CorruptStreamError if the header is damaged; UnsupportedVersionError if the container needs a codec that is
+    not known here.
     """
     fields = Fields(payload, offset)
     for codec in [fields.varint() for _ in range(fields.count())]:
-        if not 1 <= codec <= CODECS:
+        fields.require(codec > 0, "a codec has the number 0")
+        if codec > CODECS:
             raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
     flags, kind, channels, layers = fields.u8(), fields.u8(), fields.varint(), fields.varint()
     tile, piece, large = _sizes(fields), _sizes(fields), fields.u8()
-    base, extent = fields.varint(), fields.float()
-    if kind >= len(TYPES) or not channels or not layers or base >= 1 << 24:
-        raise fields.damaged("type, channels, layers, base or flags are out of range")
+    base, extent = fields.varint(), fields.real()
+    fields.require(kind < len(TYPES) and channels > 0 and layers > 0 and base < 1 << 24, "a field is out of range")
+    curves: list[Curve] = []
     if flags & 64:
         blocks, curves, parts = _arrangement(fields)
     else:
-        wraps = (bool(flags & 1), bool(flags & 2))
-        blocks, curves = [Block(fields.varint(), fields.varint(), wraps)], []
-        no = (False, False)
-        window = (0, blocks[0].rows, 0, blocks[0].columns)
-        parts = [Part(0, wraps, no, no, (False,) * 4, window, [None] * 4)]
-    attributes, plane, joints = _extras(fields, fields.take(fields.varint())) if flags & 128 else ([], None, None)
-    if (flags & 4 or plane) and channels != 1 or plane and (len(blocks) > 1 or not flags & 4):
-        raise fields.damaged("an array (H, W) of several channels, or a plane of several blocks")
-    _check_plane(fields, plane, blocks[0])
+        closed, no = _pair(flags, 0), (False, False)
+        rows, columns = fields.varint(), fields.varint()
+        blocks = [Block(rows, columns, closed)]
+        parts = [Part(0, closed, no, no, no + no, (None,) * 4, ((0, rows), (0, columns)))]
+    attributes, plane, joints = _extras(fields, blocks[0]) if flags & 128 else ([], None, None)
+    single = channels == 1 and bool(flags & 4) and len(blocks) == 1
+    fields.require(single if plane else channels == 1 or not flags & 4, "a plane, or an array (H, W), of other points")
+    total = channels + sum(max(attribute.components, 1) for attribute in attributes)
+    fields.require(total <= fields.left, "the header ends before its lattices")
+    types = [TYPES[kind]] * channels
+    for attribute in attributes:
+        types += [attribute.dtype] * max(attribute.components, 1)
     points = sum(block.rows * block.columns for block in blocks)
-    total = channels + sum(max(components, 1) for _, _, components in attributes)
-    if points < 2 or points * total >= 1 << 63:
-        raise fields.damaged(f"{points} points of {total} channels")
+    fields.require(points >= 2 and points * total < 1 << 63, f"{points} points of {total} channels")
     for long in (tile, piece):
         pieces = sum(max(1, b.rows >> long[0]) * max(1, b.columns >> long[1]) for b in blocks)
-        if pieces > 64 + len(blocks) + (points >> max(long)):
-            raise fields.damaged("tiles or pieces are too long for the blocks")
-    if total > fields.left:
-        raise fields.damaged("the header ends before its lattices")
-    lattices = [(fields.u8(), fields.float(), fields.float()) for _ in range(total)]
-    if any(rule > 1 or step <= 0 for rule, _, step in lattices):
-        raise fields.damaged("a lattice of no known rule, or without a step")
-    empty = [fields.varint() for _ in range(total)]
+        fields.require(pieces <= 64 + len(blocks) + (points >> max(long)), "tiles or pieces are too long")
+    lattices = [(fields.u8(), fields.real(), fields.real()) for _ in types]
+    fields.require(all(rule < 2 and step > 0 for rule, _, step in lattices), "a lattice of no known rule, or no step")
+    empty = [fields.varint() for _ in types]
     grids = _grids(curves, parts)
     predictors = []
-    for channel in range(total):
+    for channel in range(len(types)):
         steps = fitted_steps(grids, channel < min(channels, 3))
-        if fields.varint() != len(steps):
-            raise fields.damaged("not as many predictors as fitted steps")
+        fields.require(fields.varint() == len(steps), "not as many predictors as fitted steps")
         predictors.append({step: (fields.number("b"), fields.number("b")) for step in steps})
-    if any(-128 in pair for fitted in predictors for pair in fitted.values()):
-        raise fields.damaged("a predictor is out of range")
+        fields.require(all(-128 not in pair for pair in predictors[-1].values()), "a predictor is out of range")
     fields.end()
-    types = [TYPES[kind]] * channels
-    for _, dtype, components in attributes:
-        types += [dtype] * max(components, 1)
-    bits = [bool(flags & 1 << bit) for bit in range(8)]
-    return Header(
-        *(bits[2], bits[3], bits[4], bits[5], types, channels, layers, tile, piece, large, base, extent),
-        *(blocks, curves, parts, attributes, plane, joints, lattices, empty, predictors, grids),
-    )
+    values: list[Any] = [*_pair(flags, 2), *_pair(flags, 4), types, channels, layers]
+    values += [tile, piece, large, base, extent, blocks, curves, parts, attributes, plane, joints]
+    values += [lattices, empty, predictors, grids]
+    return Header(*values)
 
 
-def _check_plane(fields: Fields, plane: list[list[Any]] | None, block: Block) -> None:
-    """Refuse rules that are none of those of section 8."""
-    for rule, count in zip(plane or [], (block.columns, block.rows), strict=False):
-        values = rule[-1] == "values"
-        numbers = rule[:-1] if values or isinstance(rule[-1], bool) else rule
-        right = (
-            len(rule) == count + 1 if values else len(rule) == 3 if len(numbers) < len(rule) else 2 <= len(rule) <= 4
-        )
-        if not right or not all(type(number) in (int, float) and abs(number) < 1 << 1023 for number in numbers):
-            raise fields.damaged("a plane's rule of no known kind")
+def _pair(bits: int, first: int) -> Pair:
+    return bool(bits >> first & 1), bool(bits >> first + 1 & 1)
 
 
 def _sizes(fields: Fields) -> tuple[int, int]:
     byte = fields.u8()
     first, second = byte & 15, byte >> 4
-    if not first or not second or not 8 <= first + second <= 16:
-        raise fields.damaged("a size of tiles or pieces is out of range")
+    fields.require(first > 0 and second > 0 and 8 <= first + second <= 16, "a size of tiles or pieces is out of range")
     return first, second
 
 
 def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
-    blocks = []
+    blocks, curves, parts = [], [], []
     for _ in range(fields.count(3)):
         rows, columns, bits = fields.varint(), fields.varint(), fields.u8()
-        blocks.append(Block(rows, columns, (bool(bits & 1), bool(bits & 2))))
-        if bits > 3 or not rows or not columns:
-            raise fields.damaged("a block without points, or with unknown flags")
-    curves = []
+        fields.require(rows > 0 and columns > 0 and bits < 4, "a block without points, or of unknown flags")
+        blocks.append(Block(rows, columns, _pair(bits, 0)))
     for _ in range(fields.count()):
         value = fields.varint()
+        fields.require(value > 3, "a curve without points")
         curves.append(Curve(value >> 2, bool(value & 2), bool(value & 1)))
-        if not value >> 2:
-            raise fields.damaged("a curve without points")
-    parts = [_part(fields, blocks, curves) for _ in range(fields.count(3))]
-    if {part.block for part in parts} != set(range(len(blocks))):
-        raise fields.damaged("a block without a part")
+    for _ in range(fields.count(3)):
+        number, flags, ends = fields.varint(), fields.u8(), fields.u8()
+        fields.require(number < len(blocks) and flags < 128, "a part of no block, or of unknown flags")
+        block = blocks[number]
+        window = ((0, block.rows), (0, block.columns))
+        if flags & 64:
+            window = ((fields.varint(), fields.varint()), (fields.varint(), fields.varint()))
+        told = [fields.varint() if ends & 16 << side else None for side in range(4)]
+        sides = tuple(None if value is None else (value >> 1, bool(value & 1)) for value in told)
+        clamped = (*_pair(ends, 0), *_pair(ends, 2))
+        parts.append(Part(number, _pair(flags, 0), _pair(flags, 2), _pair(flags, 4), clamped, sides, window))
+        _check_part(fields, parts[-1], block, curves)
+    fields.require({part.block for part in parts} == set(range(len(blocks))), "a block without a part")
     return blocks, curves, parts
 
 
-def _part(fields: Fields, blocks: list[Block], curves: list[Curve]) -> Part:
-    number, flags, ends = fields.varint(), fields.u8(), fields.u8()
-    if number >= len(blocks) or flags > 127:
-        raise fields.damaged("a part of no block, or with unknown flags")
-    block = blocks[number]
-    window = (0, block.rows, 0, block.columns)
-    if flags & 64:
-        window = (fields.varint(), fields.varint(), fields.varint(), fields.varint())
-    wraps = (bool(flags & 1), bool(flags & 2))
-    sides: list[tuple[int, bool] | None] = []
-    for side in range(4):
-        value = fields.varint() if ends & 16 << side else None
-        sides.append(None if value is None else (value >> 1, bool(value & 1)))
+def _check_part(fields: Fields, part: Part, block: Block, curves: list[Curve]) -> None:
     for axis, size in enumerate((block.rows, block.columns)):
-        first, count = window[2 * axis : 2 * axis + 2]
-        if not 0 < count <= size or first >= size or (first + count > size and not block.closed[axis]):
-            raise fields.damaged("a window beyond its block")
-        if wraps[axis] and not (count == size and block.closed[axis] and not ends >> 2 * axis & 3):
-            raise fields.damaged("an axis that wraps has a side, or is a piece of its block's")
+        first, count = part.window[axis]
+        fits = first < size and 0 < count <= size and (first + count <= size or block.closed[axis])
+        fields.require(fits, "a window beyond its block")
+        if part.closed[axis]:
+            free = not any(part.clamped[2 * axis : 2 * axis + 2])
+            fields.require(count == size and block.closed[axis] and free, "an axis wraps that cannot")
+        along = 1 - axis
+        whole = part.window[along][1], part.stops[along], part.closed[along]
         for side in (2 * axis, 2 * axis + 1):
-            _check_side(
-                fields, sides[side], ends, side, curves, window[3 - 2 * axis], wraps[1 - axis], flags >> (5 - axis)
-            )
-    return Part(
-        *(number, wraps, (bool(flags & 4), bool(flags & 8)), (bool(flags & 16), bool(flags & 32))),
-        *((bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)), window, sides),
-    )
-
-
-def _check_side(
-    fields: Fields,
-    side: tuple[int, bool] | None,
-    ends: int,
-    number: int,
-    curves: list[Curve],
-    points: int,
-    wraps: bool,
-    stops: int,
-) -> None:
-    if side is None:
-        return
-    if not ends >> number & 1 or side[0] >= len(curves):
-        raise fields.damaged("a side of no curve, or not clamped")
-    curve = curves[side[0]]
-    if curve.length != 1 and (curve.length, curve.closed, curve.stops) != (points, wraps, bool(stops & 1)):
-        raise fields.damaged("a curve unlike its side")
+            if (source := part.curves[side]) is not None:
+                known = part.clamped[side] and source[0] < len(curves)
+                fields.require(known, "a side of no curve, or one that is not clamped")
+                curve = curves[source[0]]
+                fields.require(curve.length == 1 or curve == whole, "a curve unlike its side")
 
 
 def _grids(curves: list[Curve], parts: list[Part]) -> list[Grid]:
     axes = [(Axis(c.length, c.closed, (not c.closed, not c.closed)), Axis(1, False)) for c in curves]
-    stops = [(curve.stops, False) for curve in curves]
-    for part in parts:
-        c = part.clamped
-        first, second = Axis(part.window[1], part.wraps[0], c[:2]), Axis(part.window[3], part.wraps[1], c[2:])
-        axes.append((first, second))
-        stops.append(part.stops)
+    axes += [
+        (Axis(p.window[0][1], p.closed[0], p.clamped[:2]), Axis(p.window[1][1], p.closed[1], p.clamped[2:]))
+        for p in parts
+    ]
+    chains = levels_of(axes, [(curve.stops, False) for curve in curves] + [part.stops for part in parts])
     held = common_ends(curves, parts)
-    left = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
-    left += [tuple(side is not None for side in part.curves) for part in parts]  # type: ignore[misc]
-    return [Grid(number < len(curves), chain, left[number]) for number, chain in enumerate(levels_of(axes, stops))]
+    left_out: list[Any] = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
+    left_out += [tuple(side is not None for side in part.curves) for part in parts]
+    return [Grid(n < len(curves), chain, out) for n, (chain, out) in enumerate(zip(chains, left_out, strict=True))]
 
 
-def common_ends(curves: list[Curve], parts: list[Part]) -> dict[tuple[int, int], tuple[int, int]]:
-    """Find the ends of curves that another end holds.
+def common_ends(curves: list[Curve], parts: list[Part]) -> dict[End, End]:
+    """Find the ends of curves that another end holds, and which does."""
+    same: dict[End, End] = {}
 
-    Returns
-    -------
-    dict of (int, int) to (int, int)
-        From (curve, 0 for its first point and 1 for its last) to the end that holds it. A curve of one point has one end, 0.
-    """
-    same: dict[tuple[int, int], tuple[int, int]] = {}
-
-    def first(end: tuple[int, int]) -> tuple[int, int]:
+    def first(end: End) -> End:
         while end in same:
             end = same[end]
         return end
 
-    for part in parts:
-        if any(part.wraps):
-            continue
-        for corner in range(4):
-            down, across = corner >> 1, corner & 1
-            met = []
-            for side, along in ((part.curves[down], across), (part.curves[2 + across], down)):
-                if side is not None:
-                    curve, turned = side
-                    met.append(first((curve, (along ^ turned) if curves[curve].length > 1 else 0)))
-            if len(met) == 2 and met[0] != met[1]:
-                same[max(met)] = min(met)
+    for part, down, across in product(parts, (0, 1), (0, 1)):
+        met = []
+        for side, along in ((part.curves[down], across), (part.curves[2 + across], down)):
+            if side is not None and not any(part.closed):
+                curve, turned = side
+                met.append(first((curve, (along ^ turned) if curves[curve].length > 1 else 0)))
+        if len(met) == 2 and met[0] != met[1]:
+            same[max(met)] = min(met)
     return {end: first(end) for end in same}
 
 
-def _extras(fields: Fields, data: bytes) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
+def _extras(fields: Fields, block: Block) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
+    data = fields.take(fields.varint())
     extras = unpack_map(data, fields.offset + fields.position - len(data))
-    attributes: list[Attribute] = []
-    plane = None
+    attributes, plane = [], None
     try:
         for name, kind, components in extras.get("attributes", []):
-            if not isinstance(name, str) or not 0 <= int(kind) < len(TYPES) or not 0 <= int(components) < 1 << 31:
-                raise ValueError("an attribute of no known type")
-            attributes.append(Attribute(name, TYPES[int(kind)], int(components)))
+            fields.require(isinstance(name, str) and 0 <= components < 1 << 31, "an attribute without a name")
+            attributes.append(Attribute(name, TYPES[operator.index(kind)], operator.index(components)))
         if "plane" in extras:
             plane = [list(rule) for rule in extras["plane"]["grid"]]
-            if len(plane) != 2 or not all(plane):
-                raise ValueError("a plane of other than two rules")
-        joints = extras.get("joints")
-    except (TypeError, ValueError, KeyError) as error:
-        raise fields.damaged(f"extras: {error}") from None
-    return attributes, plane, joints
+            fields.require(len(plane) == 2, "a plane has two rules")
+            for rule, count in zip(plane, (block.columns, block.rows), strict=True):
+                last = rule[-1]
+                size = [count + 1] if last == "values" else [3] if isinstance(last, bool) else [2, 3, 4]
+                numbers = rule[:-1] if last == "values" or isinstance(last, bool) else rule
+                known = len(rule) in size and all(type(n) in (int, float) and abs(n) < 1 << 1023 for n in numbers)
+                fields.require(known, "a plane's rule of no known kind")
+    except (TypeError, ValueError, KeyError, IndexError) as error:
+        raise fields.damaged(f"extras: {error!r}") from None
+    return attributes, plane, extras.get("joints")

@@ -16,14 +16,8 @@ PAGE = 256
 class Entry:
     """A segment or a piece.
 
-    Attributes
-    ----------
-    start, length : int
-        Where it stands in the container.
-    check : int
-        The lower half of its CRC.
-    unit, passes, top : int
-        Of a segment; 0 of a piece.
+    `start`, `length` (int): where it stands in the container; `check` (int): the lower half of its CRC; `unit`,
+    `passes`, `top` (int): of a segment; 0 of a piece.
     """
 
     start: int
@@ -45,14 +39,9 @@ class Entry:
 class Index:
     """The index.
 
-    Attributes
-    ----------
-    layer_errors, level_errors : list of Errors
-        After each layer, and of each level.
-    segments : list of list of Entry
-        For each layer its segments by rising number of the unit.
-    pieces : list of Entry
-        In the order of the exactness section.
+    `layer_errors`, `level_errors` (list of Errors): after each layer, and of each level; `segments` (list of list of
+    Entry): for each layer its segments by rising number of the unit; `pieces` (list of Entry): in the order of the
+    exactness section.
     """
 
     layer_errors: list[Errors]
@@ -64,19 +53,8 @@ class Index:
 def read_index(data: bytes, container: Container) -> Index:
     """Read the index of a whole container.
 
-    Parameters
-    ----------
-    data : bytes
-        The file.
-    container : Container
-        What `read_container` found in it.
-
-    Raises
-    ------
-    CorruptStreamError
-        Footer, root or pages are damaged or contradict each other.
-    TruncatedStreamError
-        A section is not all there.
+    `data` (bytes): the file; `container` (Container): what `read_container` found in it. Raises CorruptStreamError if
+    footer, root or pages are damaged or contradict each other; TruncatedStreamError if A section is not all there.
     """
     header = container.header
     channels = len(header.types)

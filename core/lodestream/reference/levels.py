@@ -10,14 +10,8 @@ from numpy.typing import NDArray
 class Axis:
     """One axis of a grid at one level.
 
-    Attributes
-    ----------
-    samples : int
-        Its samples at this level.
-    closed : bool
-        It is periodic.
-    clamped : (bool, bool)
-        Its first and its last sample keep their value in every step.
+    `samples` (int): its samples at this level; `closed` (bool): it is periodic; `clamped` ((bool, bool)): its first and
+    its last sample keep their value in every step.
     """
 
     samples: int
@@ -53,15 +47,9 @@ class Axis:
 class Grid:
     """One curve or part.
 
-    Attributes
-    ----------
-    curve : bool
-        It is a curve: its second axis has one sample.
-    axes : list of (Axis, Axis)
-        Both axes at every level, from 0 to L.
-    left_out : (bool, bool, bool, bool)
-        Nodes of a coordinate that come from elsewhere: of a part in its first row, last row, first column, last column;
-        of a curve at level 0 its first and its last.
+    `curve` (bool): it is a curve: its second axis has one sample; `axes` (list of (Axis, Axis)): both axes at every
+    level, from 0 to L; `left_out` ((bool, bool, bool, bool)): nodes of a coordinate that come from elsewhere: of a part
+    in its first row, last row, first column, last column; of a curve at level 0 its first and its last.
     """
 
     curve: bool
@@ -89,15 +77,8 @@ class Grid:
 def levels_of(axes: list[tuple[Axis, Axis]], stops: list[tuple[bool, bool]]) -> list[list[tuple[Axis, Axis]]]:
     """Give the axes of all grids at all levels.
 
-    Parameters
-    ----------
-    axes, stops : list
-        Of each grid, at the finest level.
-
-    Returns
-    -------
-    list of list of (Axis, Axis)
-        For each grid its axes at the levels 0 to L; L is the same for all.
+    `axes`, `stops` (list): of each grid, at the finest level. Returns list of list of (Axis, Axis): for each grid its
+    axes at the levels 0 to L; L is the same for all.
     """
     found = [[pair] for pair in axes]
     while True:
@@ -119,17 +100,9 @@ def levels_of(axes: list[tuple[Axis, Axis]], stops: list[tuple[bool, bool]]) -> 
 def fitted_steps(grids: list[Grid], curves: bool) -> list[tuple[int, int]]:
     """List the steps for which a channel has predictors.
 
-    Parameters
-    ----------
-    grids : list of Grid
-        All grids.
-    curves : bool
-        Whether those of curves count: for coordinates, not for attributes.
-
-    Returns
-    -------
-    list of (int, int)
-        Lower level of the step, and 0, 1 for the axes of parts, 2 for curves; in the order of the header.
+    `grids` (list of Grid): all grids; `curves` (bool): whether those of curves count: for coordinates, not for
+    attributes. Returns list of (int, int): lower level of the step, and 0, 1 for the axes of parts, 2 for curves; in
+    the order of the header.
     """
     kinds = [(0, False, 0), (1, False, 1)] + ([(2, True, 0)] if curves else [])
     return [

@@ -82,19 +82,8 @@ def _right(x: Lines, axis: Axis) -> Lines:
 def inverse(values: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
     """Compute samples from nodes and details.
 
-    Parameters
-    ----------
-    values : int64 (samples, lines)
-        Nodes and then details along the first axis.
-    axis : Axis
-        The axis at the finer level.
-    pair : (int, int)
-        The step's (a, b).
-
-    Returns
-    -------
-    int64 (samples, lines)
-        The samples, clamped.
+    `values` (int64 (samples, lines)): nodes and then details along the first axis; `axis` (Axis): the axis at the finer
+    level; `pair` ((int, int)): the step's (a, b). Returns int64 (samples, lines): the samples, clamped.
     """
     run, count = axis.run, axis.midpoints
     c = values[:run]

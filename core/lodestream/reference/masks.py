@@ -18,12 +18,8 @@ POINTS = 4
 class Masks:
     """What the section of masks says.
 
-    Attributes
-    ----------
-    hole : int
-        The value of integer points at holes.
-    valid, kept : list of bool (H, W)
-        For each block the points that are valid, and the holes that are kept.
+    `hole` (int): the value of integer points at holes; `valid`, `kept` (list of bool (H, W)): for each block the points
+    that are valid, and the holes that are kept.
     """
 
     hole: int
@@ -44,24 +40,9 @@ def no_holes(sizes: list[tuple[int, int]]) -> Masks:
 def decode_mask(data: bytes, rows: int, columns: int, offset: int = 0) -> Mask:
     """Decode the mask of a block.
 
-    Parameters
-    ----------
-    data : bytes
-        The range-coded string.
-    rows, columns : int
-        Of the block.
-    offset : int
-        Where the string begins in the container.
-
-    Returns
-    -------
-    bool (H, W)
-        The points that are 1.
-
-    Raises
-    ------
-    CorruptStreamError
-        The string has more bytes than decoding reads.
+    `data` (bytes): the range-coded string; `rows`, `columns` (int): of the block; `offset` (int): where the string
+    begins in the container. Returns bool (H, W): the points that are 1. Raises CorruptStreamError if the string has
+    more bytes than decoding reads.
     """
     coder = RangeCoder(data, new_contexts(POINTS + 1024))
     bit = coder.bit
@@ -94,21 +75,9 @@ def decode_mask(data: bytes, rows: int, columns: int, offset: int = 0) -> Mask:
 def read_masks(payload: bytes, offset: int, kept: bool, sizes: list[tuple[int, int]]) -> Masks:
     """Read the payload of the section of masks.
 
-    Parameters
-    ----------
-    payload : bytes
-        What the frame encloses.
-    offset : int
-        Where it begins in the container.
-    kept : bool
-        The section is one of kept masks.
-    sizes : list of (int, int)
-        Rows and columns of each block.
-
-    Raises
-    ------
-    CorruptStreamError
-        The payload is damaged, or its counts are not those of its masks.
+    `payload` (bytes): what the frame encloses; `offset` (int): where it begins in the container; `kept` (bool): the
+    section is one of kept masks; `sizes` (list of (int, int)): rows and columns of each block. Raises
+    CorruptStreamError if the payload is damaged, or its counts are not those of its masks.
     """
     fields = Fields(payload, offset)
     masks = no_holes(sizes)

@@ -12,12 +12,8 @@ def new_contexts(count: int) -> tuple[list[int], list[int]]:
 class RangeCoder:
     """Decodes bits from a string of bytes.
 
-    Parameters
-    ----------
-    data : bytes
-        The string; bytes past its end are 0.
-    contexts : (list of int, list of int)
-        P and n of each, see `new_contexts`; both lists change.
+    `data` (bytes): the string; bytes past its end are 0; `contexts` ((list of int, list of int)): P and n of each, see
+    `new_contexts`; both lists change.
     """
 
     __slots__ = ("counts", "data", "end", "low", "position", "probabilities", "width")
@@ -55,7 +51,7 @@ class RangeCoder:
         return bit
 
     def tree(self, context: int, bits: int) -> int:
-        """Decode a number of so many bits, the highest first, each in context + v; v begins at 1 and becomes 2 v + bit."""
+        """Decode a number, its highest bit first, each in context + v, where v begins at 1 and becomes 2 v + bit."""
         v = 1
         for _ in range(bits):
             v = 2 * v + self.bit(context + v)

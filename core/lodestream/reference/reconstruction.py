@@ -18,23 +18,10 @@ def reconstruct(
 ) -> list[Array]:
     """Reconstruct all grids of a channel.
 
-    Parameters
-    ----------
-    header : Header
-        Of the container.
-    channel : int
-        Number of the channel.
-    level : int
-        The level that is made, K.
-    whole : int
-        The largest level up to which all coefficients are known, F, at most K.
-    coefficients : callable
-        Gives those of a tile and channel, one int64 array for each share.
-
-    Returns
-    -------
-    list of int64 (rows, columns)
-        q of each grid, in eighths if F < K; of an attribute's curves nothing of meaning.
+    `header` (Header): of the container; `channel` (int): number of the channel; `level` (int): the level that is made,
+    K; `whole` (int): the largest level up to which all coefficients are known, F, at most K; `coefficients` (callable):
+    gives those of a tile and channel, one int64 array for each share. Returns list of int64 (rows, columns): q of each
+    grid, in eighths if F < K; of an attribute's curves nothing of meaning.
     """
     grids, coordinate = header.grids, channel < header.coordinates
     arrays = [np.zeros(grid.shape(level), np.int64) for grid in grids]
@@ -126,24 +113,25 @@ def _details_of_sides(header: Header, channel: int, upper: int, number: int, arr
 def values_of(q: Array, eighths: bool, lattice: tuple[int, float, float], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Compute the values of a channel from its lattice coordinates, in its type."""
     rule, origin, step = lattice
-    wide = q * 0.125 if eighths else q.astype(np.float64)
+    wide: NDArray[np.float64] = q.astype(np.float64) * (0.125 if eighths else 1.0)
     with np.errstate(over="ignore", divide="ignore"):
         wide = origin + step * wide if rule == 0 else (origin + wide) / step
     return to_type(wide, dtype)
 
 
-def to_type(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
+def to_type(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Round float64 values to a type, ties to even, and clamp them to its finite range."""
     if dtype.kind == "f":
         most = float(np.finfo(dtype).max)
-        return np.clip(values, -most, most).astype(dtype)
+        clamped: NDArray[Any] = np.clip(values, -most, most).astype(dtype)
+        return clamped
     limits = np.iinfo(dtype)
     whole = np.rint(values)
     # The highest value of 64 bits is no float64; what reaches it is put in by hand.
     inside = np.clip(
         whole, float(limits.min), np.nextafter(float(limits.max) + 1, 0) if limits.bits == 64 else limits.max
     )
-    found = inside.astype(dtype)
+    found: NDArray[Any] = inside.astype(dtype)
     found[whole >= float(limits.max)] = limits.max
     return found
 
@@ -151,12 +139,8 @@ def to_type(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
 def places(header: Header, block: int, level: int) -> tuple[list[NDArray[np.int64]], list[tuple[int, Any]]]:
     """Find where the nodes of a level stand in a block.
 
-    Returns
-    -------
-    lines : list of int64
-        The block's rows, and columns, at which nodes stand.
-    parts : list of (int, index)
-        Number of each part's grid, and where its nodes lie in the block's grid of the level.
+    Returns `lines` (list of int64): the block's rows, and columns, at which nodes stand; `parts` (list of (int,
+    index)): number of each part's grid, and where its nodes lie in the block's grid of the level.
     """
     sizes = header.blocks[block].rows, header.blocks[block].columns
     found = []
@@ -164,7 +148,7 @@ def places(header: Header, block: int, level: int) -> tuple[list[NDArray[np.int6
         if part.block == block:
             stands = []
             for axis, size in enumerate(sizes):
-                first, count = part.window[2 * axis : 2 * axis + 2]
+                first, count = part.window[axis]
                 place = positions(header.grids[number], axis, level)
                 place = count - 1 - place if part.reverse[axis] else place
                 stands.append((first + place) % size)

@@ -92,14 +92,8 @@ class _Lists:
 class SmallUnit:
     """A unit that the range coder codes.
 
-    Parameters
-    ----------
-    bands : list of Band
-        Its bands, which get what is decoded.
-    top : int
-        Bit-planes.
-    indices : bool
-        It codes indices of two quantisers.
+    `bands` (list of Band): its bands, which get what is decoded; `top` (int): bit-planes; `indices` (bool): it codes
+    indices of two quantisers.
     """
 
     def __init__(self, bands: list[Band], top: int, indices: bool) -> None:

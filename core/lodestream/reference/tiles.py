@@ -13,16 +13,9 @@ from .levels import Grid
 class Share:
     """What a tile has of one subband.
 
-    Attributes
-    ----------
-    grid : int
-        Number of the grid.
-    kind : (int, int)
-        Whether the band has details along axis 0 and along axis 1.
-    rows, columns : slice
-        Where it lies in the grid's array of coefficients.
-    origin : (int, int)
-        Its first row and column in the whole band, nodes that are left out counted.
+    `grid` (int): number of the grid; `kind` ((int, int)): whether the band has details along axis 0 and along axis 1;
+    `rows`, `columns` (slice): where it lies in the grid's array of coefficients; `origin` ((int, int)): its first row
+    and column in the whole band, nodes that are left out counted.
     """
 
     grid: int
@@ -41,14 +34,8 @@ class Share:
 class Tile:
     """One tile.
 
-    Attributes
-    ----------
-    level : int
-        Its level.
-    parent : int
-        Number of its parent tile; -1 where all parents are 0.
-    shares : (list of Share, list of Share)
-        Those of a coordinate's unit and those of an attribute's.
+    `level` (int): its level; `parent` (int): number of its parent tile; -1 where all parents are 0; `shares` ((list of
+    Share, list of Share)): those of a coordinate's unit and those of an attribute's.
     """
 
     level: int
@@ -135,14 +122,8 @@ def _shares(
 class Parents:
     """The parents of a share's coefficients.
 
-    Parameters
-    ----------
-    grid : Grid
-        The share's grid.
-    level : int
-        The share's level, at least 2.
-    share, above : Share
-        Of the unit, and of its parent: the same band of the same grid, a level below.
+    `grid` (Grid): the share's grid; `level` (int): the share's level, at least 2; `share`, `above` (Share): of the
+    unit, and of its parent: the same band of the same grid, a level below.
     """
 
     def __init__(self, grid: Grid, level: int, share: Share, above: Share) -> None:
@@ -156,19 +137,9 @@ class Parents:
     def look(self, magnitude: NDArray[np.int32], plane: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Read the parents at a plane.
 
-        Parameters
-        ----------
-        magnitude : int32 (rows, columns)
-            Of the parent's share.
-        plane : int
-            The plane of the pass.
-
-        Returns
-        -------
-        part : int32 (rows, columns)
-            The parents' part of section 7.4, for each coefficient of the share.
-        parent : int32 (rows, columns)
-            The parents' magnitudes, shifted right by the plane.
+        `magnitude` (int32 (rows, columns)): of the parent's share; `plane` (int): the plane of the pass. Returns `part`
+        (int32 (rows, columns)): the parents' part of section 7.4, for each coefficient of the share; `parent` (int32
+        (rows, columns)): the parents' magnitudes, shifted right by the plane.
         """
         near = np.pad(magnitude >> plane, 2)
         part = 3 * np.minimum(near, 4)
