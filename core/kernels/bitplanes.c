@@ -82,9 +82,14 @@ struct run {
 };
 
 static struct run run_of(const int64_t *fields) {
-    return (struct run){
-        fields[0], fields[1], fields[2], fields[3], fields[4], fields[LODE_RUN_START], fields[LODE_RUN_LENGTH],
-        fields[LODE_RUN_LARGE]};
+    return (struct run){fields[0],
+                        fields[1],
+                        fields[2],
+                        fields[3],
+                        fields[4],
+                        fields[LODE_RUN_START],
+                        fields[LODE_RUN_LENGTH],
+                        fields[LODE_RUN_LARGE]};
 }
 
 static bool run_fits(const struct run *run, int64_t bands, int64_t models, int64_t data, int64_t costs) {

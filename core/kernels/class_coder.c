@@ -18,6 +18,7 @@ enum {
     CLASS_CONTEXTS = CLASS_FLAGS + 27,
     CLASS_STATES = CLASS_CONTEXTS, /* of a model: where the two states are kept */
     MOST_KEPT = 16,                /* adaptation count from one plane to the next */
+    KEPT_MAPS = 32,
 };
 
 _Static_assert(CLASS_STATES + 2 <= CONTEXTS, "a model holds the contexts of either coder");
@@ -26,6 +27,7 @@ _Static_assert(CLASS_STATES + 2 <= CONTEXTS, "a model holds the contexts of eith
 static const uint8_t WITHIN[2 * BLOCK] = {255, 255, 255, 255, 255, 255, 255, 255};
 static const uint8_t EVEN[2 * BLOCK] = {1, 0, 1, 0, 1, 0, 1, 0, 1, 0};
 
+typedef uint32_t units4_t __attribute__((vector_size(16)));
 typedef uint16_t places_t __attribute__((vector_size(16)));
 
 /* A unit while it is coded. */
@@ -34,6 +36,9 @@ struct unit {
     struct contexts contexts;
     struct rans rans;
     uint16_t *symbols;
+    /* What the first pass of a plane has seen of the first stripes is not looked at again in the second. */
+    uint32_t seen;
+    struct class_map maps[KEPT_MAPS];
 };
 
 static struct stripe stripe_of(const struct band *band, int64_t number) {
@@ -114,6 +119,17 @@ LODE_INLINE bool code_flags(bool reads, struct unit *unit, const struct band *ba
     return any;
 }
 
+/* Add bits of a plane, 0 or 1 a byte, to what is known of eight coefficients. */
+LODE_INLINE void add_bits(uint32_t *known, eight_t ones, int plane) {
+    uint8_t bits[BLOCK];
+    put_eight(bits, ones);
+    units4_t low = {bits[0], bits[1], bits[2], bits[3]}, high = {bits[4], bits[5], bits[6], bits[7]}, now[2];
+    memcpy(now, known, sizeof now);
+    now[0] += low << (uint32_t)plane;
+    now[1] += high << (uint32_t)plane;
+    memcpy(known, now, sizeof now);
+}
+
 /* List the places of the 1s among eight bytes of 0 and 1; how many the list has then. */
 LODE_INLINE int list_places(eight_t ones, int first, uint16_t *places, int count) {
     uint32_t bits = bits_of(ones);
@@ -177,9 +193,9 @@ LODE_INLINE void code_signs(bool reads, struct unit *unit, const struct band *ba
 
 /* Take bits of a plane, 0 or 1 for each coefficient of the stripe, into what is known, and list what they find: at
  * places whose row and column have an even sum, and at the others. */
-LODE_INLINE void take_bits(bool reads, const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane,
-                      const struct class_map *map, const uint8_t *bits, uint8_t mark,
-                      uint16_t found[2][STRIPE_SIZE + BLOCK], int counts[2]) {
+LODE_INLINE void take_bits(bool reads, const struct tiles *tiles, const struct band *band, const struct stripe *stripe,
+                           int plane, const struct class_map *map, const uint8_t *bits, uint8_t mark,
+                           uint16_t found[2][STRIPE_SIZE + BLOCK], int counts[2]) {
     counts[0] = counts[1] = 0;
     for (int i = 0; i < stripe->rows; i++)
         for (int j = 0; j < stripe->columns; j += BLOCK) {
@@ -188,8 +204,8 @@ LODE_INLINE void take_bits(bool reads, const struct tiles *tiles, const struct b
             if (!ones)
                 continue;
             int64_t at = stripe->first + i * band->stride + j;
-            for (int k = 0; k < BLOCK && reads; k++)
-                tiles->known[at + k] += (uint32_t)bits[place + k] << plane;
+            if (reads)
+                add_bits(tiles->known + at, ones, plane);
             eight_t new = ones & ~reaching(eight_at(map->weights[i + MARGIN] + MARGIN + j), 1);
             if (!new)
                 continue;
@@ -205,42 +221,52 @@ static void stripe_bits(const struct tiles *tiles, const struct band *band, cons
                         const uint16_t *places, int count, uint8_t *bits) {
     for (int i = 0; i < count; i++) {
         int64_t at = stripe->first + places[i] / STRIPE_COLUMNS * band->stride + places[i] % STRIPE_COLUMNS;
-        bits[places[i]] = (uint8_t)(magnitude(tiles->truth[at]) >> plane & 1);
+        bits[places[i]] = (uint8_t)(tiles->known[at] >> plane & 1);
     }
 }
 
 LODE_INLINE void code_stripe(bool reads, bool first_pass, struct unit *unit, const struct band *band,
-                             const struct stripe *stripe, int plane) {
+                             const struct stripe *stripe, int64_t number, int plane) {
     const struct tiles *tiles = unit->tiles;
     uint8_t flagged[STRIPE_BLOCKS] = {0}, fresh[STRIPE_BLOCKS] = {0};
     if (code_flags(reads, unit, band, stripe, plane, flagged, fresh, !first_pass)) {
-        struct class_map map;
+        uint32_t kept = number < KEPT_MAPS - 1 ? UINT32_C(1) << number : 0;
+        struct class_map *map = &unit->maps[kept ? number : KEPT_MAPS - 1];
         uint8_t possible[STRIPE_COLUMNS], new[STRIPE_COLUMNS];
-        for (int j = 0; j < STRIPE_COLUMNS; j++) {
-            possible[j] = j < stripe->columns ? flagged[j / BLOCK] : 0;
-            new[j] = fresh[j / BLOCK];
+        bool any_fresh = false;
+        for (int block = 0; block < STRIPE_BLOCKS; block++) {
+            int columns = stripe->columns - block * BLOCK;
+            eight_t within = columns >= BLOCK ? ~UINT64_C(0) : columns > 0 ? eight_at(WITHIN + BLOCK - columns) : 0;
+            put_eight(possible + block * BLOCK, flagged[block] * EACH & within);
+            put_eight(new + block * BLOCK, fresh[block] * EACH);
+            any_fresh |= fresh[block] != 0;
         }
-        const uint32_t *parents = tiles->known + band->parent +
-                                  (stripe->top >> band->row_shift) * band->parent_stride +
-                                  (stripe->left >> band->column_shift);
-        see_stripe(tiles->early + stripe->first, band->stride, stripe, parents, band->parent_stride, band->row_shift,
-                   band->column_shift, plane, possible, &map);
+        bool looks = first_pass || any_fresh || !(unit->seen & kept);
+        if (looks) {
+            const uint32_t *parents = tiles->known + band->parent +
+                                      (stripe->top >> band->row_shift) * band->parent_stride +
+                                      (stripe->left >> band->column_shift);
+            see_stripe(tiles->early + stripe->first, band->stride, stripe, parents, band->parent_stride,
+                       band->row_shift, band->column_shift, plane, possible, map);
+            unit->seen |= kept;
+        }
         uint16_t visited[STRIPE_SIZE + BLOCK], found[2][STRIPE_SIZE + BLOCK];
         uint8_t bits[STRIPE_SIZE];
-        int counts[2], count = list_visited(first_pass, &map, stripe, possible, new, visited);
+        int counts[2], count = list_visited(first_pass, map, stripe, possible, new, visited);
         if (count) {
-        memset(bits, 0, sizeof bits);
-        if (!reads)
-            stripe_bits(tiles, band, stripe, plane, visited, count, bits);
-        code_run(reads, unit, visited, count, map.context[0], bits);
-        take_bits(reads, tiles, band, stripe, plane, &map, bits, (uint8_t)(plane + 1 + (first_pass ? 0 : FOUND_SECOND)), found,
-                  counts);
-        adapt_all(&unit->contexts, 0, CLASS_SIGNS);
-        if (counts[0] + counts[1]) {
-        code_signs(reads, unit, band, stripe, found[0], counts[0]);
-        code_signs(reads, unit, band, stripe, found[1], counts[1]);
-        adapt_all(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
-        }}
+            memset(bits, 0, sizeof bits);
+            if (!reads)
+                stripe_bits(tiles, band, stripe, plane, visited, count, bits);
+            code_run(reads, unit, visited, count, map->context[0], bits);
+            take_bits(reads, tiles, band, stripe, plane, map, bits,
+                      (uint8_t)(plane + 1 + (first_pass ? 0 : FOUND_SECOND)), found, counts);
+            adapt_all(&unit->contexts, 0, CLASS_SIGNS);
+            if (counts[0] + counts[1]) {
+                code_signs(reads, unit, band, stripe, found[0], counts[0]);
+                code_signs(reads, unit, band, stripe, found[1], counts[1]);
+                adapt_all(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
+            }
+        }
     }
     if (!first_pass)
         adapt_all(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS);
@@ -278,10 +304,7 @@ static int64_t read_raw(const struct tiles *tiles, const struct band *band, cons
             /* Each chosen byte keeps the bit that is its own, and becomes 1 if that is not 0. */
             eight_t own = coming * EACH & eight_at(RANKS[chosen]);
             own = (((own & 127 * EACH) + 127 * EACH) | own) >> 7 & EACH;
-            uint8_t ones[BLOCK];
-            put_eight(ones, own);
-            for (int k = 0; k < BLOCK; k++)
-                tiles->known[place + k] += (uint32_t)ones[k] << plane;
+            add_bits(tiles->known + place, own, plane);
         }
     return bits + at - start;
 }
@@ -291,17 +314,23 @@ static int64_t count_raw(const struct tiles *tiles, const struct band *band, con
     int64_t bits = 0;
     for (int i = 0; i < stripe->rows; i++)
         for (int j = 0; j < stripe->columns; j += BLOCK)
-            bits += (int64_t)(refined_in(tiles->early + stripe->first + i * band->stride + j, plane,
-                                         stripe->columns - j) *
-                                  EACH >> 56);
+            bits +=
+                (int64_t)(refined_in(tiles->early + stripe->first + i * band->stride + j, plane, stripe->columns - j) *
+                              EACH >>
+                          56);
     return bits;
 }
 
 /* Bits of a plane of eight coefficients in a row, 0 or 1 each. */
-LODE_INLINE eight_t true_bits(const int32_t *truth, int plane) {
+LODE_INLINE eight_t true_bits(const uint32_t *magnitudes, int plane) {
+    units4_t all[2];
+    memcpy(all, magnitudes, sizeof all);
+    units4_t low = all[0] >> (uint32_t)plane & 1, high = all[1] >> (uint32_t)plane & 1;
     uint8_t bits[BLOCK];
-    for (int k = 0; k < BLOCK; k++)
-        bits[k] = (uint8_t)(magnitude(truth[k]) >> plane & 1);
+    for (int k = 0; k < BLOCK / 2; k++) {
+        bits[k] = (uint8_t)low[k];
+        bits[k + BLOCK / 2] = (uint8_t)high[k];
+    }
     return eight_at(bits);
 }
 
@@ -314,7 +343,7 @@ static int64_t write_raw(const struct tiles *tiles, const struct band *band, con
             uint32_t chosen = bits_of(refined_in(tiles->early + place, plane, stripe->columns - j));
             if (!chosen)
                 continue;
-            eight_t ones = true_bits(tiles->truth + place, plane);
+            eight_t ones = true_bits(tiles->known + place, plane);
             uint32_t coming = (uint32_t)((255 * ones & eight_at(RANKS[chosen])) * EACH >> 56) << (bits & 7);
             uint8_t *byte = data + (bits >> 3);
             byte[0] |= (uint8_t)coming;
@@ -325,10 +354,13 @@ static int64_t write_raw(const struct tiles *tiles, const struct band *band, con
     return bits;
 }
 
-static void begin_pass(struct contexts *contexts, int64_t number) {
-    if (number & 1)
-        for (int k = 0; k < CLASS_CONTEXTS; k++)
-            contexts->adapted[k] = contexts->adapted[k] < MOST_KEPT ? contexts->adapted[k] : MOST_KEPT;
+static void begin_pass(struct unit *unit, int64_t number) {
+    struct contexts *contexts = &unit->contexts;
+    if (!(number & 1))
+        return;
+    unit->seen = 0;
+    for (int k = 0; k < CLASS_CONTEXTS; k++)
+        contexts->adapted[k] = contexts->adapted[k] < MOST_KEPT ? contexts->adapted[k] : MOST_KEPT;
 }
 
 /* The bytes of raw bits, past the end of which there are zeros. */
@@ -342,6 +374,7 @@ bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t co
     struct unit unit;
     uint32_t *states = (uint32_t *)tiles->model + CLASS_STATES;
     unit.tiles = tiles;
+    unit.seen = 0;
     if (states[0] == 0) { /* the unit's first segment */
         uint8_t bytes[STATE_BYTES] = {0};
         at->bytes = size < STATE_BYTES ? size : STATE_BYTES;
@@ -361,7 +394,12 @@ bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t co
         bool first_pass = number & 1;
         int64_t rounds = first_pass ? count : 2 * count;
         if (at->band == 0 && at->stripe == 0)
-            begin_pass(&unit.contexts, number);
+            begin_pass(&unit, number);
+        int64_t before = 0;
+        for (int64_t b = 0; b < at->band && b < count; b++) {
+            struct band band = band_of(bands + b * BAND_FIELDS);
+            before += stripes_in(&band);
+        }
         for (; at->band < rounds; at->band++, at->stripe = 0) {
             bool raw = at->band >= count;
             struct band band = band_of(bands + (raw ? at->band - count : at->band) * BAND_FIELDS);
@@ -372,13 +410,14 @@ bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t co
                 struct stripe stripe = stripe_of(&band, at->stripe);
                 *budget -= stripe.rows * stripe.columns;
                 if (raw)
-                    at->bits = read_raw(tiles, &band, &stripe, plane, unit.rans.at, unit.rans.end - unit.rans.at,
-                                        at->bits);
+                    at->bits =
+                        read_raw(tiles, &band, &stripe, plane, unit.rans.at, unit.rans.end - unit.rans.at, at->bits);
                 else if (first_pass)
-                    code_stripe(true, true, &unit, &band, &stripe, plane);
+                    code_stripe(true, true, &unit, &band, &stripe, before + at->stripe, plane);
                 else
-                    code_stripe(true, false, &unit, &band, &stripe, plane);
+                    code_stripe(true, false, &unit, &band, &stripe, before + at->stripe, plane);
             }
+            before += stripes;
         }
         unit.rans.at = data + past(unit.rans.at - data, at->bits, size);
         at->bits = 0;
@@ -392,21 +431,20 @@ pause:
 }
 
 /* List the decisions of a pass, forwards; how many raw bits it has, or -1 where there is no room. */
-static int64_t list_pass(struct unit *unit, const int64_t *bands, int64_t count, int64_t number,
-                         const symbol_t *end) {
+static int64_t list_pass(struct unit *unit, const int64_t *bands, int64_t count, int64_t number, const symbol_t *end) {
     int plane = (int)(number >> 1);
-    int64_t bits = 0;
-    begin_pass(&unit->contexts, number);
+    int64_t bits = 0, done = 0;
+    begin_pass(unit, number);
     for (int64_t b = 0; b < count; b++) {
         struct band band = band_of(bands + b * BAND_FIELDS);
-        for (int64_t s = 0, stripes = stripes_in(&band); s < stripes; s++) {
+        for (int64_t s = 0, stripes = stripes_in(&band); s < stripes; s++, done++) {
             struct stripe stripe = stripe_of(&band, s);
             if (end - unit->symbols < 2 * MOST_IN_RUN + STRIPE_BLOCKS)
                 return -1;
             if (number & 1)
-                code_stripe(false, true, unit, &band, &stripe, plane);
+                code_stripe(false, true, unit, &band, &stripe, done, plane);
             else {
-                code_stripe(false, false, unit, &band, &stripe, plane);
+                code_stripe(false, false, unit, &band, &stripe, done, plane);
                 bits += count_raw(unit->tiles, &band, &stripe, plane);
             }
         }
@@ -426,7 +464,7 @@ static void write_raw_bits(const struct tiles *tiles, const int64_t *bands, int6
     }
 }
 
-/* What is known when all passes are done. Contexts of the unit itself follow from marks alone. */
+/* All magnitudes: what is known when all passes are done. Contexts of the unit itself follow from marks alone. */
 static void know_all(const struct tiles *tiles, const int64_t *bands, int64_t count) {
     for (int64_t b = 0; b < count; b++) {
         struct band band = band_of(bands + b * BAND_FIELDS);
@@ -441,9 +479,11 @@ int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_
     struct unit unit;
     int64_t decisions[MOST_PASSES + 1], bits[MOST_PASSES];
     unit.tiles = tiles;
+    unit.seen = 0;
     start_contexts(tiles->model);
     load_contexts(&unit.contexts, tiles->model);
     unit.symbols = output->symbols;
+    know_all(tiles, bands, count);
     decisions[first + 1] = 0;
     for (int64_t number = first; number >= 0; number--) {
         bits[number] = list_pass(&unit, bands, count, number, output->symbols + output->symbols_count);
@@ -451,7 +491,6 @@ int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_
             return -1;
         decisions[number] = unit.symbols - output->symbols;
     }
-    know_all(tiles, bands, count);
     uint32_t states[2] = {LOWEST_STATE, LOWEST_STATE};
     uint8_t *end = output->data + output->data_count, *begin = end;
     for (int64_t number = 0; number <= first; number++) {

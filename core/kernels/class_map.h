@@ -45,8 +45,8 @@ LODE_INLINE void sum_parents(const uint8_t *above, const uint8_t *own, const uin
         of[j] = (uint8_t)(3 * (self < MOST_OF_PARENT ? self : MOST_OF_PARENT) +
                           (around < MOST_BESIDE_PARENT ? around : MOST_BESIDE_PARENT));
     }
-    for (int j = 0; j < columns; j++)
-        sums[j] = of[j >> shift];
+    for (int j = 0; j < STRIPE_COLUMNS; j += BLOCK)
+        put_eight(sums + j, shift == 0 ? eight_at(of + j) : shift == 1 ? doubled(eight_at(of + j / 2)) : 0);
 }
 
 /* Units of parents and of what is around them, at most 12. */
@@ -61,7 +61,7 @@ LODE_INLINE void see_parents(const uint32_t *at, int64_t stride, int rows, int c
 }
 
 LODE_INLINE void see_weights(const uint8_t *marks, int64_t stride, int rows, int columns, int plane,
-                          struct class_map *map) {
+                             struct class_map *map) {
     marks -= MARGIN * stride + MARGIN;
     uint8_t one = (uint8_t)(plane + 2), two = (uint8_t)(plane + 3);
     for (int i = 0; i < rows + 2 * MARGIN; i++, marks += stride)

@@ -20,8 +20,8 @@ enum {
     PROBABILITY_BITS = 12,
     PROBABILITY_RANGE = 1 << PROBABILITY_BITS,
     STATE_BYTES = 8,
-    MOST_IN_RUN = 512,  /* decisions between two changes of probabilities */
-    WORD = 2,           /* bytes */
+    MOST_IN_RUN = 512, /* decisions between two changes of probabilities */
+    WORD = 2,          /* bytes */
 };
 
 #define LOWEST_STATE (UINT32_C(1) << 16)
@@ -129,7 +129,7 @@ static void read_run(struct rans *rans, struct contexts *contexts, const uint16_
 typedef uint16_t symbol_t;
 
 static inline symbol_t *keep_run(symbol_t *to, struct contexts *contexts, const uint16_t *places, int count,
-                            const uint8_t *context, const uint8_t *bits) {
+                                 const uint8_t *context, const uint8_t *bits) {
     for (int i = 0; i < count; i++) {
         int place = places[i], number = context[place], bit = bits[place];
         to[i] = (symbol_t)(contexts->coded[number] | bit << 15);
