@@ -67,7 +67,11 @@ def run(count: int, most: float | None = None) -> Compared:
     done, end = Compared(), time.monotonic() + (float("inf") if most is None else most)
 
     @settings(
-        max_examples=count, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+        max_examples=count,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
     )
     @given(
         st.integers(0, 7).flatmap(lambda turn: _wide() if turn == 0 else surfaces()),

@@ -197,7 +197,8 @@ def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
 def _check_part(fields: Fields, part: Part, block: Block, curves: list[Curve]) -> None:
     for axis, size in enumerate((block.rows, block.columns)):
         first, count = part.window[axis]
-        fits = first < size and 0 < count <= size and (first + count <= size or block.closed[axis])
+        # Cut once, an axis that wraps has its first line at both ends.
+        fits = 0 < count <= size + block.closed[axis] and first + (0 if block.closed[axis] else count) <= size
         fields.require(fits, "a window beyond its block")
         if part.closed[axis]:
             free = not any(part.clamped[2 * axis : 2 * axis + 2])
