@@ -32,16 +32,7 @@ from numpy.typing import NDArray
 from . import kernels
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 
-__all__ = [
-    "BLOCK",
-    "PADDING",
-    "code_passes",
-    "new_models",
-    "pass_count",
-    "pass_gains",
-    "reconstruction_point",
-    "symbols_room",
-]
+__all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point", "symbols_room"]
 
 #: Rows and columns of a block.
 BLOCK = 8
