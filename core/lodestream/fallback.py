@@ -42,7 +42,7 @@ class PlainReconstruction(Reconstruction):
         super().__init__(header)
         section = reference.read_section(serialize_header(header), len(SIGNATURE))
         self._decoder = reference.Decoder(reference.read_header(section.payload))
-        #: The number of a segment, and its unit as it was before: each of its objects, with copies of its attributes.
+        #: The number of a segment, and the objects that decoding it changes, with copies of their attributes.
         self._before: tuple[int, list[tuple[Any, dict[str, Any]]]] = -1, []
 
     def _whole(
@@ -84,22 +84,25 @@ class PlainReconstruction(Reconstruction):
         _say_so()
         while self._taken < length:
             segment = self._queue[self._taken]
-            unit = self._decoder.units[segment.tile * self.header.channels + segment.channel]
+            number = segment.tile * self.header.channels + segment.channel
             if self._before[0] == self._taken:  # an interruption left the unit anywhere within the segment
                 for thing, attributes in self._before[1]:
                     vars(thing).update(attributes)
-            self._before = self._taken, [(thing, _copied(vars(thing))) for thing in (unit, unit.model, *unit.bands)]
-            unit.decode(segment.first // 2 + 1 if unit.remaining < 0 else None, segment.passes, segment.data)
+            self._before = self._taken, [(thing, _copied(vars(thing))) for thing in self._decoder.changing(number)]
+            top = segment.first // 2 + 1 if self._decoder.remaining[number] < 0 else None
+            self._decoder.add(reference.Segment(number, segment.passes, top, segment.data))
             self._taken += 1
             self._forget(self._taken)
 
 
 def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
-    """What decoding changes is in dictionaries, and in lists of rows; all else it replaces."""
-    copies = dict(attributes)
-    for name, value in attributes.items():
-        if isinstance(value, list):
-            copies[name] = [row.copy() if isinstance(row, list) else row for row in value]
-        elif isinstance(value, dict):
-            copies[name] = value.copy()
-    return copies
+    """What decoding changes is in arrays, in lists, and in lists and tuples of lists; all else it replaces."""
+    return {name: _copy(value) for name, value in attributes.items()}
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, list | tuple) and value and isinstance(value[0], list):
+        return type(value)(map(list, value))
+    return list(value) if isinstance(value, list) else value

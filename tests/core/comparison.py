@@ -61,11 +61,11 @@ def agree_on(data: bytes, layer: int, level: int) -> None:
     assert decoder.header is not None
     container = reference.read_container(data)
     other = reference.decode(container)
-    assert (other.levels.last, len(container.layers)) == (decoder.header.levels, decoder.header.layer_count)
-    layer, level = layer % len(container.layers), level % (other.levels.last + 1)
+    assert (container.header.finest, len(container.layers)) == (decoder.header.levels, decoder.header.layer_count)
+    layer, level = layer % len(container.layers), level % (container.header.finest + 1)
     _shows(decoder.layers[layer].surface(), other.shown(layer + 1))
     _shows(decoder.surface(), other.shown(exactness=container.exactness))
-    if level < other.levels.last:
+    if level < container.header.finest:
         # The page does not say what x and y of a coarser level of heights are.
         _shows(decoder.surface(level), other.shown(level=level), heights=container.header.plane is not None)
 

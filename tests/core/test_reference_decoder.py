@@ -50,8 +50,7 @@ def surface_of(name: str) -> list[Shown]:
 
 
 def index_of(name: str) -> Index:
-    container, decoder = decoded(name)
-    return read_index(file_of(name), container, len(decoder.units))
+    return read_index(file_of(name), decoded(name)[0])
 
 
 def digests(blocks: list[Shown]) -> list[str]:
@@ -104,9 +103,9 @@ def test_every_layer_gives_its_reconstruction(name: str) -> None:
 
 @golden
 def test_every_level_gives_its_grids(name: str) -> None:
-    _, decoder = decoded(name)
+    container, decoder = decoded(name)
     *coarser, finest = EXPECTED[name]["levels"]
-    assert len(coarser) == decoder.levels.last
+    assert len(coarser) == container.header.finest
     assert [digests(decoder.shown(level=level)) for level in range(len(coarser))] == coarser
     assert digests(surface_of(name)) == finest
 
@@ -138,7 +137,7 @@ def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     entries = [entry for layer in index.segments for entry in layer]
     decoder = Decoder(decoded(name)[0].header, decoded(name)[0].masks)
     for level, wanted in enumerate(EXPECTED[name]["levels"][:-1]):
-        own = [entry for entry in entries if decoder.units[entry.unit].level == level]
+        own = [entry for entry in entries if decoder.tile(entry.unit).level == level]
         decoder.take([entry.take(file_of(name)) for entry in own], level)
         assert digests(decoder.shown(level=level)) == wanted
 

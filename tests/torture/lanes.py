@@ -21,7 +21,10 @@ __all__ = ["STAGES", "Lanes", "Wish"]
 
 #: What measures runs first and alone. The others wait for links and processes most of the time, or compute all the
 #: time: these lanes run side by side, the parts of each one after another.
-STAGES = ((("throughput", "crowds"),), (("streams",), ("kills", "disk", "history", "faults"), ("fuzz", "kernels")))
+STAGES = (
+    (("throughput", "crowds"),),
+    (("streams",), ("kills", "disk", "history", "faults"), ("fuzz", "kernels", "decoders")),
+)
 
 # Long enough to end servers and remove folders.
 _PATIENCE = 30.0

@@ -255,6 +255,16 @@ def _kernels(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
     return min(item.cases for item in found), tuple(map(str, found))
 
 
+def _decoders(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import decoders
+
+    done = decoders.run(count, seconds)
+    return done.surfaces, (
+        f"{done.surfaces:,} random surfaces, {done.large:,} of them with large units: both decoders show the same, bit "
+        "for bit, after a random layer, at a random level, and at the end",
+    )
+
+
 PARTS = {
     part.name: part
     for part in (
@@ -266,6 +276,7 @@ PARTS = {
         Part("history", "One history through disasters, every acknowledged state in order", "disasters", 200, _history),
         Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults),
         Part("fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz),
+        Part("decoders", "The compiled decoder and the reference", "surfaces", 2000, _decoders),
         Part("kernels", "Any calls of the C kernels, under sanitizers", "cases of each", 1_000_000, _kernels),
     )
 }

@@ -1,65 +1,54 @@
-"""Sections 8 and 8.1 of docs/format.md: partly decoded coefficients, and those that indices stand for."""
+"""Coefficients of a unit of which passes remain: section 8 of docs/format.md, its beginning and 8.1."""
 
-from __future__ import annotations
+import numpy as np
+from numpy.typing import NDArray
 
-from .levels import Levels
-from .passes import MARGIN, Band
+from .bands import Band
+from .levels import Grid
+from .tiles import Share
 
-__all__ = ["MOST", "reconstructed", "step_of"]
-
-MOST = 2**28
-
+DETAILS = [0, 77936, 69201, 52586, 37885, 26915]
 NODES = [65536, 53303, 39201, 27993, 19842, 14039]
-DETAILS = [65536, 77936, 69201, 52586, 37885, 26915]  # of which the first is never used
 
 
-def step_of(levels: Levels, band: Band, level: int, base: int) -> int:
-    """S of a band of a level."""
-    grid = levels.grids[band.grid]
-    steps = grid.axes[max(level, 1) :]
-    down, along = (sum(axes[axis].steps for axes in steps) for axis in (0, 1))
-    along = len(steps) if grid.is_curve else along
-    return max(1, base * _weight(down, bool(band.kind & 2)) * _weight(along, bool(band.kind & 1)) >> 32)
+def _weight(steps: int, detail: int) -> int:
+    half = (steps - 4) // 2 if steps > 5 else 0
+    return (DETAILS if detail else NODES)[steps - 2 * half] >> half
 
 
-def _weight(d: int, of_details: bool) -> int:
-    table = DETAILS if of_details else NODES
-    if d <= 5:
-        return table[d]
-    h = (d - 4) // 2
-    return table[d - 2 * h] >> h
+def quantiser_step(base: int, grid: Grid, level: int, share: Share) -> int:
+    """Compute the quantiser step S of a band in lattice steps."""
+    lower = max(level, 1) - 1
+    finest = len(grid.axes) - 1
+    product = base
+    for axis in (0, 1):
+        if grid.curve and axis == 1:
+            steps = finest - lower
+        else:
+            steps = sum(grid.stepped(upper, axis) for upper in range(lower + 1, finest + 1))
+        product *= _weight(steps, share.kind[axis])
+    return max(1, product >> 32)
 
 
-def reconstructed(band: Band, row: int, column: int, remaining: int, step: int | None) -> int:
-    """A coefficient when so many passes of its unit remain; `step` is S where it is quantised."""
-    m = band.magnitude[row + MARGIN][column + MARGIN]
-    if m == 0:
-        return 0
-    in_pass = band.born[row][column] == remaining
-    if step is None:
-        found = _magnitude(m, remaining, in_pass)
+def reconstructed(band: Band, remaining: int, step: int) -> NDArray[np.int64]:
+    """Reconstruct coefficients as they are while passes remain.
+
+    `band` (Band): with these passes decoded, or more; `remaining` (int): passes that remain; `step` (int): S of a band
+    of indices, otherwise 0. Returns int64 (rows, columns): the coefficients.
+    """
+    magnitude = band.magnitude.astype(np.int64)
+    plane = (remaining + 1) >> 1
+    known = magnitude >> plane
+    if step:
+        value = 16 * magnitude - 8 * (band.odd & (magnitude > 0))
+        if remaining:
+            value = np.where(known > 0, 16 * (known << plane) + 7 * ((1 << plane) - 1) - 4, 0)
     else:
-        odd = band.state[row][column] & 1
-        found = min(_sixteenths(m, remaining, in_pass, odd) * step >> 4, MOST)
-    return band.sign[row + MARGIN][column + MARGIN] * found
-
-
-def _magnitude(m: int, n: int, in_pass: bool) -> int:
-    p = (n + 1) >> 1
-    if m >> p:
-        return ((m >> p) << p) + ((7 << p) >> 4)
-    if n & 1 and in_pass:
-        return (1 << (p - 1)) + ((7 << (p - 1)) >> 4)
-    return 0
-
-
-def _sixteenths(m: int, n: int, in_pass: bool, odd: int) -> int:
-    """The magnitude t of an index, which is not 0; `odd` is 1 where it belongs to Q1."""
-    if n == 0:
-        return 16 * m - 8 * odd
-    p = (n + 1) >> 1
-    if m >> p:
-        return 16 * ((m >> p) << p) + 7 * ((1 << p) - 1) - 4
-    if n & 1 and in_pass:
-        return 16 * (1 << p - 1) + 7 * ((1 << p - 1) - 1) - 4
-    return 0
+        value = np.where(known > 0, (known << plane) + ((7 << plane) >> 4), 0)
+    if remaining & 1:
+        low = plane - 1
+        early = (known == 0) & (magnitude >> low > 0) & band.early
+        value[early] = 16 * (1 << low) + 7 * ((1 << low) - 1) - 4 if step else (1 << low) + ((7 << low) >> 4)
+    if step:
+        value = np.minimum(value * step >> 4, 1 << 28)
+    return np.where(band.negative, -value, value)

@@ -1,164 +1,158 @@
-"""Sections 9, 9.1 and 9.2 of docs/format.md: from the values of the complete layers to those that were written."""
-
-from __future__ import annotations
+"""Pieces of exactness, the last bits of values: sections 9 to 9.2 of docs/format.md."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StreamError
 from .fields import Fields
-from .offsets import with_offsets
-from .range_coder import Model, clamp
+from .offsets import read_offsets
+from .range_coder import RangeCoder, new_contexts
 
-__all__ = ["restore"]
-
-RAW, DECIMALS, OFFSETS = 0, 2, 3
-MEMORY = 16384
-SPREAD = 0x9E3779B97F4A7C15
-SAFE = 2**53
+SPECIAL, WHICH, SAME, CLOSE, BESIDE, SHORTER = 0, 4, 20, 21, 22, 38
+CONTEXTS = SHORTER + 256
+MASK = (1 << 64) - 1
 
 
-def _signed(number: int) -> int:
-    """An integer modulo 2^64, as a signed one."""
-    return (number + 2**63) % 2**64 - 2**63
+def restore(piece: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]:
+    """Restore the values of a piece.
 
-
-class _Line:
-    """Section 9.1: the places of values of a type, by a rule and its argument."""
-
-    def __init__(self, dtype: np.dtype[Any], rule: int, t: int) -> None:
-        self.dtype = dtype
-        self.t = t
-        self.bits = 8 * dtype.itemsize
-        self.in_decimals = rule == DECIMALS
-        self.in_patterns = dtype.kind == "f" and not self.in_decimals
-        self.mantissa = 52 if self.bits == 64 else 23  # bits, of a float
-        if t >= (16 if self.in_decimals else self.bits) or (self.in_decimals and dtype.kind != "f"):
-            raise StreamError(f"expected a rule of exactness for {dtype}, got rule {rule} with {t}")
-
-    def _pattern(self, value: Any) -> int:
-        return int(value.view(f"u{self.dtype.itemsize}"))
-
-    def place(self, value: Any) -> int:
-        """Where a value is."""
-        if self.in_decimals:
-            return round(min(max(float(value) * 10.0**self.t, -SAFE), SAFE))
-        if not self.in_patterns:
-            return _signed(int(value)) >> self.t
-        pattern = self._pattern(value)
-        m = (pattern & (1 << self.bits - 1) - 1) >> self.t
-        return -1 - m if pattern >> self.bits - 1 else m
-
-    def exponent(self, value: Any) -> int:
-        """The exponent field of a float's pattern, otherwise 0."""
-        if not self.in_patterns:
-            return 0
-        return self._pattern(value) >> self.mantissa & (1 << self.bits - 1 - self.mantissa) - 1
-
-    def value(self, place: int) -> bytes:
-        """The value at a place, little-endian."""
-        if self.in_decimals:
-            return np.array(clamp(place, -SAFE, SAFE) / 10.0**self.t).astype(self.dtype).tobytes()
-        sign = 0
-        if self.in_patterns and place < 0:
-            place, sign = -1 - place, 1 << self.bits - 1
-        pattern = (place << self.t) % (1 << self.bits - int(self.in_patterns))
-        return (pattern | sign).to_bytes(self.dtype.itemsize, "little")
-
-
-class _Differences:
-    """Section 9.2: the values of a piece, one after another."""
-
-    def __init__(self, line: _Line, fields: Fields) -> None:
-        packed = fields.number("H")
-        self.line = line
-        self.most = packed & 4095
-        self.specials = [fields.take(line.dtype.itemsize) for _ in range(packed >> 12)]
-        self.model = Model(fields.take(fields.varint()))
-        self.stored = fields.rest()
-        self.taken = 0  # bits of what is stored
-        self.last_two = 0  # bits that said whether a value is special, as one number
-        self.memory: dict[int, tuple[int, int]] = {}  # entry -> place, difference
-
-    def value(self, x: Any) -> bytes:
-        """The value sought where the layers gave x."""
-        if self.specials:
-            bit = self.model.bit("special", self.last_two)
-            self.last_two = 2 * (self.last_two & 1) + bit
-            if bit:
-                k = 1
-                while k < len(self.specials) and self.model.bit("which", k):
-                    k += 1
-                return self.specials[k - 1]
-        place = self.line.place(x)
-        entry = (place * SPREAD % 2**64 >> 40) & (MEMORY - 1)
-        remembered = self.memory.get(entry)
-        z: int | None = None
-        if remembered is not None and remembered[0] == place:
-            if self.model.bit("same"):
-                z = remembered[1]
-            elif self.model.bit("close"):
-                z = remembered[1] - 8 + self.model.number(4, "beside")
-        if z is None:
-            z = self._coded(clamp(self.most - self.line.exponent(x), 0, 63))
-        self.memory[entry] = place, z
-        return self.line.value(_signed(place + z))
-
-    def _take(self, count: int) -> int:
-        """The next stored bits as a number, its lowest bit first; 0 where there are none."""
-        first, end = self.taken, self.taken + count
-        self.taken = end
-        return int.from_bytes(self.stored[first // 8 : (end + 7) // 8], "little") >> first % 8 & (1 << count) - 1
-
-    def _coded(self, limit: int) -> int:
-        c = limit
-        while c > 0 and self.model.bit("shorter", 16 * min(limit, 15) + min(limit - c, 15)):
-            c -= 1
-        if c == 0:
-            return 0
-        magnitude, r = 1, c - 1
-        while r > 32:
-            magnitude = magnitude << 32 | self._take(32)
-            r -= 32
-        last = self._take(r + 1)
-        magnitude = magnitude << r | last >> 1
-        return -magnitude if last & 1 else magnitude
-
-
-def restore(piece: bytes, values: NDArray[Any]) -> NDArray[Any]:
-    """The values sought.
-
-    Parameters
-    ----------
-    piece : bytes
-    values : integers or floats, shape (value,)
-        Those that the complete layers give.
-
-    Returns
-    -------
-    array of the same shape and type, little-endian
-
-    Raises
-    ------
-    StreamError
-        Where the piece is not one of so many values of this type.
+    `piece` (bytes): the piece; `values` ((n,)): what the complete layers give, in the channel's type; `offset` (int):
+    where it begins in the container. Returns (n,): the values, of the same type. Raises CorruptStreamError if the piece
+    is damaged.
     """
-    values = values.astype(values.dtype.newbyteorder("<"))
     if not piece:
-        return values
-    fields = Fields(piece)
-    first = fields.number("B")
-    rule, t = first & 3, first >> 2
-    if rule == RAW:
-        if t or len(piece) != 1 + values.nbytes:
-            raise StreamError(f"expected {values.nbytes} bytes of values, got {len(piece) - 1}, and the argument {t}")
-        return np.frombuffer(fields.rest(), values.dtype)
-    if rule == OFFSETS:
-        return with_offsets(fields, t, values)
-    differences = _Differences(_Line(values.dtype, rule, t), fields)
-    restored = b"".join(differences.value(x) for x in values)
-    if (differences.taken + 7) // 8 != len(differences.stored):
-        raise StreamError(f"expected {differences.taken} stored bits, got {len(differences.stored)} bytes")
-    return np.frombuffer(restored, values.dtype)
+        return values.copy()
+    fields = Fields(piece, offset)
+    if not len(values) or len(piece) > 1 + values.nbytes:
+        raise fields.damaged("a piece is longer than its values")
+    first = fields.u8()
+    rule, argument = first & 3, first >> 2
+    floats = values.dtype.kind == "f"
+    if rule == 0:
+        if argument or fields.left != values.nbytes:
+            raise fields.damaged("raw values of another length")
+        return np.frombuffer(fields.take(fields.left), values.dtype.newbyteorder("<")).astype(values.dtype)
+    if rule == 3:
+        if values.dtype != np.float32 or argument > 34:
+            raise fields.damaged("offsets of no float32, or of too many bits")
+        return read_offsets(values, fields, argument)
+    if (rule == 2 and (not floats or argument > 15)) or argument >= 8 * values.dtype.itemsize:
+        raise fields.damaged("a rule that does not suit the type")
+    most = fields.number("H")
+    count = most >> 12
+    patterns = np.frombuffer(fields.take(count * values.dtype.itemsize), values.dtype.newbyteorder("<"))
+    start = fields.position
+    length = fields.varint()
+    if fields.position - start > 4:
+        raise fields.damaged("a length of more than four bytes")
+    coded, stored = fields.take(length), fields.take(fields.left)
+    places, exponents = _places(values, rule, argument)
+    limits = np.clip((most & 4095) - exponents, 0, 63)
+    try:
+        differences, special = _differences(places, limits, count, RangeCoder(coded, new_contexts(CONTEXTS)), stored)
+    except IndexError:
+        raise fields.damaged("the stored bits of a piece end too early") from None
+    except ValueError:
+        raise fields.damaged("a piece has more stored bits than are taken") from None
+    restored = _values(places + differences, values.dtype, rule, argument)
+    chosen = special >= 0
+    restored[chosen] = patterns[special[chosen]]
+    return restored
+
+
+def _bits(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Give the integers of a type's patterns."""
+    return np.dtype(f"u{dtype.itemsize}")
+
+
+def _places(values: NDArray[Any], rule: int, t: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Compute place and exponent of each value; int64 (n,) each."""
+    none = np.zeros(len(values), np.int64)
+    if rule == 2:
+        return np.rint(np.clip(values.astype(np.float64) * 10.0**t, -(2.0**53), 2.0**53)).astype(np.int64), none
+    if values.dtype.kind != "f":
+        return values.astype(np.int64) >> t, none
+    pattern = values.view(_bits(values.dtype)).astype(np.uint64)
+    high = 8 * values.dtype.itemsize - 1
+    m = (pattern & ((1 << high) - 1)).astype(np.int64)
+    exponent = m >> (23 if high == 31 else 52)
+    m >>= t
+    return np.where(pattern >> high == 1, -1 - m, m), exponent
+
+
+def _values(places: NDArray[np.int64], dtype: np.dtype[Any], rule: int, t: int) -> NDArray[Any]:
+    """Compute the value at each place."""
+    if rule == 2:
+        limited = np.clip(places, -(1 << 53), 1 << 53).astype(np.float64) / 10.0**t
+        return limited.astype(dtype)
+    if dtype.kind != "f":
+        return (places << t).astype(dtype)
+    high = 8 * dtype.itemsize - 1
+    m = np.where(places < 0, -1 - places, places).astype(np.uint64) << np.uint64(t)
+    sign = (places < 0).astype(np.uint64) << np.uint64(high)
+    return ((m & np.uint64((1 << high) - 1)) | sign).astype(_bits(dtype)).view(dtype)
+
+
+def _differences(
+    places: NDArray[np.int64], limits: NDArray[np.int64], specials: int, coder: RangeCoder, stored: bytes
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Decode the difference of each place, and which special it is or -1; int64 (n,) each.
+
+    Raises IndexError if the stored bits end too early, ValueError if some of their bytes are left.
+    """
+    entries = (places.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40) & np.uint64(16383)).tolist()
+    differences, which = [0] * len(entries), [-1] * len(entries)
+    memory_places: list[int | None] = [None] * 16384
+    memory = [0] * 16384
+    bit = coder.bit
+    history = taken = 0
+    whole = 8 * len(stored)
+    for i, (place, entry, limit) in enumerate(zip(places.tolist(), entries, limits.tolist(), strict=True)):
+        if specials:
+            special = bit(SPECIAL + history)
+            history = (2 * history + special) & 3
+            if special:
+                k = 1
+                while k < specials and bit(WHICH + k):
+                    k += 1
+                which[i] = k - 1
+                continue
+        if memory_places[entry] == place:
+            z = memory[entry]
+            if bit(SAME):
+                differences[i] = z
+                continue
+            if bit(CLOSE):
+                z += coder.tree(BESIDE, 4) - 8
+                differences[i] = memory[entry] = z & MASK
+                continue
+        c = limit
+        base = SHORTER + 16 * min(limit, 15)
+        while c and bit(base + min(limit - c, 15)):
+            c -= 1
+        z = 0
+        if c:
+            z, r = 1, c - 1
+            if taken + c > whole:
+                raise IndexError
+            if r > 32:
+                z = z << 32 | _take(stored, taken, 32)
+                taken += 32
+                r -= 32
+            number = _take(stored, taken, r + 1)
+            taken += r + 1
+            z = z << r | number >> 1
+            if number & 1:
+                z = -z
+        memory_places[entry] = place
+        differences[i] = memory[entry] = z & MASK
+    if (taken + 7) // 8 != len(stored):
+        raise ValueError
+    return np.array(differences, np.uint64).astype(np.int64), np.array(which)
+
+
+def _take(stored: bytes, position: int, bits: int) -> int:
+    """Take a number of so many bits, lowest first."""
+    end = position + bits
+    return (int.from_bytes(stored[position >> 3 : (end + 7) >> 3], "little") >> (position & 7)) & ((1 << bits) - 1)

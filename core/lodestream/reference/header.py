@@ -1,198 +1,268 @@
-"""Sections 3, 3.1 and 3.2 of docs/format.md: what the header says of a surface."""
+"""The header: sections 3 to 3.2 of docs/format.md."""
 
-from __future__ import annotations
-
+import operator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
-import msgpack
+import numpy as np
 
-from ..errors import StreamError, UnsupportedVersionError
-from .fields import Fields
+from ..errors import UnsupportedVersionError
+from .fields import Fields, unpack_map
+from .levels import Axis, Grid, fitted_steps, levels_of
+from .tiles import Tile, tiles_of
 
-__all__ = ["Block", "Grid", "Header", "Lattice", "read_header"]
+CODECS = 6  # numbers 1 to 6 are decoded here
+TYPES = list(map(np.dtype, ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")))
 
-TYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-
-CODECS = {1, 3, 4, 5, 6}
-
-Bits = tuple[bool, ...]
+Pair = tuple[bool, bool]  # of axis 0 and axis 1
+End = tuple[int, int]  # a curve, and 0 for its first point or 1 for its last; a curve of one point has one end, 0
 
 
 class Block(NamedTuple):
-    """A grid of points, and which of its axes wrap."""
+    """A block."""
 
     rows: int
     columns: int
-    closed: Bits
+    closed: Pair
 
 
-class Side(NamedTuple):
-    """The curve from which a part takes a side."""
+class Curve(NamedTuple):
+    """A curve of so many points."""
 
-    curve: int
-    reversed: bool
+    length: int
+    stops: bool
+    closed: bool
 
 
-@dataclass(frozen=True)
-class Grid:
-    """What is coded as a grid: a curve, or a part, which is a window of a block.
+class Part(NamedTuple):
+    """A part; its sides are the first row, last row, first column and last column, as it is stored."""
 
-    Sides are the first row, the last row, the first column, the last column.
-    """
-
-    block: int  # -1: it is a curve
-    shape: tuple[int, int]
-    first: tuple[int, int] = (0, 0)
-    closed: Bits = (False, False)
-    backwards: Bits = (False, False)
-    stops: Bits = (False, False)
-    clamped: Bits = (False,) * 4
-    sides: tuple[Side | None, ...] = (None,) * 4
-
-    @property
-    def is_curve(self) -> bool:
-        """Whether it is a curve."""
-        return self.block < 0
+    block: int
+    closed: Pair
+    reverse: Pair
+    stops: Pair
+    clamped: tuple[bool, bool, bool, bool]
+    curves: tuple[tuple[int, bool] | None, ...]  # for each side the curve it comes from, and whether that is reversed
+    window: tuple[tuple[int, int], tuple[int, int]]  # first row, rows; first column, columns
 
 
 class Attribute(NamedTuple):
-    """An array beside the points."""
+    """Arrays (H, W, components) beside the points, or (H, W) if components is 0."""
 
     name: str
-    type: str
+    dtype: np.dtype[Any]
     components: int
-
-    @property
-    def channels(self) -> int:
-        """How many channels it takes."""
-        return max(self.components, 1)
-
-
-class Lattice(NamedTuple):
-    """The rule that turns the integers of a channel into values."""
-
-    decimal: bool
-    origin: float
-    step: float
 
 
 @dataclass(frozen=True)
 class Header:
-    """Section 3, in the words of the page; `predictors` are the pairs of each channel."""
+    """What the header says; N channels, those of attributes last."""
 
-    flat: bool
+    flat: bool  # the points are arrays (H, W)
     exact: bool
     has_exactness: bool
     has_masks: bool
-    type: str
-    points_channels: int
+    types: list[np.dtype[Any]]  # of each channel
+    channels: int  # of the points, C
     layers: int
-    tile: tuple[int, int]
-    piece: tuple[int, int]
-    base: int  # 0 where coordinates are not quantised
+    tile: tuple[int, int]  # binary logarithms of the rows and columns of a tile
+    piece: tuple[int, int]  # and of a piece of exactness
+    large: int  # the coarsest level whose units are large, 0 if none are
+    base: int
+    extent: float
     blocks: list[Block]
-    grids: list[Grid]  # curves first
+    curves: list[Curve]
+    parts: list[Part]
     attributes: list[Attribute]
-    plane: dict[str, Any] | None
-    lattices: list[Lattice]
-    empty: list[int]
-    predictors: list[list[tuple[int, int]]]
-
-    @property
-    def channels(self) -> int:
-        """N of the page."""
-        return len(self.lattices)
+    plane: list[list[Any]] | None  # the rules of x and y
+    joints: list[Any] | None
+    lattices: list[tuple[int, float, float]]  # rule, origin, step of each channel
+    empty: list[int]  # of each channel, bit l for level l
+    predictors: list[dict[tuple[int, int], tuple[int, int]]]  # of each channel: fitted step to (a, b)
+    grids: list[Grid]
 
     @property
     def coordinates(self) -> int:
         """How many of the first channels are coordinates."""
-        return min(self.points_channels, 3)
+        return min(self.channels, 3)
 
     @property
-    def types(self) -> list[str]:
-        """The type of every channel."""
-        return [self.type] * self.points_channels + [a.type for a in self.attributes for _ in range(a.channels)]
+    def finest(self) -> int:
+        """The finest level, L."""
+        return len(self.grids[0].axes) - 1
+
+    @cached_property
+    def tiles(self) -> list[Tile]:
+        """All tiles, by their number."""
+        return tiles_of(self.grids, self.tile)
+
+    @cached_property
+    def holders(self) -> dict[End, End]:
+        """For each end of a curve that another end holds, that one."""
+        return common_ends(self.curves, self.parts)
 
 
-def _bits(number: int, first: int, count: int) -> Bits:
-    return tuple(bool(number >> bit & 1) for bit in range(first, first + count))
+def read_header(payload: bytes, offset: int = 0) -> Header:
+    """Read the payload of the header's section, which begins at `offset` in the container.
 
-
-def _read_curve(fields: Fields) -> Grid:
-    number = fields.varint()
-    closed, stops = bool(number & 1), bool(number & 2)
-    open_ends = not closed, not closed, False, False
-    return Grid(-1, (number >> 2, 1), closed=(closed, False), stops=(stops, False), clamped=open_ends)
-
-
-def _read_part(fields: Fields, blocks: list[Block]) -> Grid:
-    block = fields.varint()
-    flags, ends = fields.number("B"), fields.number("B")
-    row, rows, column, columns = 0, blocks[block].rows, 0, blocks[block].columns
+    Raises CorruptStreamError if the header is damaged; UnsupportedVersionError if the container needs a codec that is
+    not known here.
+    """
+    fields = Fields(payload, offset)
+    for codec in [fields.varint() for _ in range(fields.count())]:
+        fields.require(codec > 0, "a codec has the number 0")
+        if codec > CODECS:
+            raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
+    flags, kind, channels, layers = fields.u8(), fields.u8(), fields.varint(), fields.varint()
+    tile, piece, large = _sizes(fields), _sizes(fields), fields.u8()
+    base, extent = fields.varint(), fields.real()
+    fields.require(kind < len(TYPES) and channels > 0 and layers > 0 and base < 1 << 24, "a field is out of range")
+    curves: list[Curve] = []
     if flags & 64:
-        row, rows, column, columns = (fields.varint() for _ in range(4))
-    numbers = [fields.varint() if has_curve else None for has_curve in _bits(ends, 4, 4)]
-    return Grid(
-        block=block,
-        shape=(rows, columns),
-        first=(row, column),
-        closed=_bits(flags, 0, 2),
-        backwards=_bits(flags, 2, 2),
-        stops=_bits(flags, 4, 2),
-        clamped=_bits(ends, 0, 4),
-        sides=tuple(None if number is None else Side(number >> 1, bool(number & 1)) for number in numbers),
-    )
-
-
-def _read_block(fields: Fields) -> Block:
-    return Block(fields.varint(), fields.varint(), _bits(fields.number("B"), 0, 2))
-
-
-def read_header(payload: bytes) -> Header:
-    """The header, from the payload of its section; StreamError where its bytes end early."""
-    fields = Fields(payload)
-    codecs = [fields.varint() for _ in range(fields.varint())]
-    if not CODECS.issuperset(codecs):
-        raise UnsupportedVersionError(f"expected codecs among {sorted(CODECS)}, got {codecs}")
-    flags = fields.number("B")
-    kind = TYPES[fields.number("B")]
-    points_channels, layers = fields.varint(), fields.varint()
-    tile, piece = fields.number("B"), fields.number("B")
-    base = fields.varint()
-    if base >= 2**24:
-        raise StreamError(f"expected a base below 2^24, got {base}")
-    fields.short_f64()  # the extent, which decoding does not use
-    if flags & 64:
-        blocks = [_read_block(fields) for _ in range(fields.varint())]
-        grids = [_read_curve(fields) for _ in range(fields.varint())]
-        grids += [_read_part(fields, blocks) for _ in range(fields.varint())]
+        blocks, curves, parts = _arrangement(fields)
     else:
-        blocks = [Block(fields.varint(), fields.varint(), _bits(flags, 0, 2))]
-        grids = [Grid(0, blocks[0][:2], closed=blocks[0].closed)]
-    extras = msgpack.unpackb(fields.take(fields.varint())) if flags & 128 else {}
-    attributes = [Attribute(name, TYPES[number], count) for name, number, count in extras.get("attributes", [])]
-    channels = range(points_channels + sum(attribute.channels for attribute in attributes))
-    lattices = [Lattice(fields.number("B") == 1, fields.short_f64(), fields.short_f64()) for _ in channels]
-    empty = [fields.varint() for _ in channels]
-    predictors = [[(fields.number("b"), fields.number("b")) for _ in range(fields.varint())] for _ in channels]
-    fields.finish()
-    return Header(
-        flat=bool(flags & 4),
-        exact=bool(flags & 8),
-        has_exactness=bool(flags & 16),
-        has_masks=bool(flags & 32),
-        type=kind,
-        points_channels=points_channels,
-        layers=layers,
-        tile=(tile & 15, tile >> 4),
-        piece=(piece & 15, piece >> 4),
-        base=base,
-        blocks=blocks,
-        grids=grids,
-        attributes=attributes,
-        plane=extras.get("plane"),
-        lattices=lattices,
-        empty=empty,
-        predictors=predictors,
-    )
+        closed, no = _pair(flags, 0), (False, False)
+        rows, columns = fields.varint(), fields.varint()
+        blocks = [Block(rows, columns, closed)]
+        parts = [Part(0, closed, no, no, no + no, (None,) * 4, ((0, rows), (0, columns)))]
+    attributes, plane, joints = _extras(fields, blocks[0]) if flags & 128 else ([], None, None)
+    single = channels == 1 and bool(flags & 4) and len(blocks) == 1
+    fields.require(single if plane else channels == 1 or not flags & 4, "a plane, or an array (H, W), of other points")
+    total = channels + sum(max(attribute.components, 1) for attribute in attributes)
+    fields.require(total <= fields.left, "the header ends before its lattices")
+    types = [TYPES[kind]] * channels
+    for attribute in attributes:
+        types += [attribute.dtype] * max(attribute.components, 1)
+    points = sum(block.rows * block.columns for block in blocks)
+    fields.require(points >= 2 and points * total < 1 << 63, f"{points} points of {total} channels")
+    for long in (tile, piece):
+        pieces = sum(max(1, b.rows >> long[0]) * max(1, b.columns >> long[1]) for b in blocks)
+        fields.require(pieces <= 64 + len(blocks) + (points >> max(long)), "tiles or pieces are too long")
+    lattices = [(fields.u8(), fields.real(), fields.real()) for _ in types]
+    fields.require(all(rule < 2 and step > 0 for rule, _, step in lattices), "a lattice of no known rule, or no step")
+    empty = [fields.varint() for _ in types]
+    grids = _grids(curves, parts)
+    predictors = []
+    for channel in range(len(types)):
+        steps = fitted_steps(grids, channel < min(channels, 3))
+        fields.require(fields.varint() == len(steps), "not as many predictors as fitted steps")
+        predictors.append({step: (fields.number("b"), fields.number("b")) for step in steps})
+        fields.require(all(-128 not in pair for pair in predictors[-1].values()), "a predictor is out of range")
+    fields.end()
+    values: list[Any] = [*_pair(flags, 2), *_pair(flags, 4), types, channels, layers]
+    values += [tile, piece, large, base, extent, blocks, curves, parts, attributes, plane, joints]
+    values += [lattices, empty, predictors, grids]
+    return Header(*values)
+
+
+def _pair(bits: int, first: int) -> Pair:
+    return bool(bits >> first & 1), bool(bits >> first + 1 & 1)
+
+
+def _sizes(fields: Fields) -> tuple[int, int]:
+    byte = fields.u8()
+    first, second = byte & 15, byte >> 4
+    fields.require(first > 0 and second > 0 and 8 <= first + second <= 16, "a size of tiles or pieces is out of range")
+    return first, second
+
+
+def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
+    blocks, curves, parts = [], [], []
+    for _ in range(fields.count(3)):
+        rows, columns, bits = fields.varint(), fields.varint(), fields.u8()
+        fields.require(rows > 0 and columns > 0 and bits < 4, "a block without points, or of unknown flags")
+        blocks.append(Block(rows, columns, _pair(bits, 0)))
+    for _ in range(fields.count()):
+        value = fields.varint()
+        fields.require(value > 3, "a curve without points")
+        curves.append(Curve(value >> 2, bool(value & 2), bool(value & 1)))
+    for _ in range(fields.count(3)):
+        number, flags, ends = fields.varint(), fields.u8(), fields.u8()
+        fields.require(number < len(blocks) and flags < 128, "a part of no block, or of unknown flags")
+        block = blocks[number]
+        window = ((0, block.rows), (0, block.columns))
+        if flags & 64:
+            window = ((fields.varint(), fields.varint()), (fields.varint(), fields.varint()))
+        told = [fields.varint() if ends & 16 << side else None for side in range(4)]
+        sides = tuple(None if value is None else (value >> 1, bool(value & 1)) for value in told)
+        clamped = (*_pair(ends, 0), *_pair(ends, 2))
+        parts.append(Part(number, _pair(flags, 0), _pair(flags, 2), _pair(flags, 4), clamped, sides, window))
+        _check_part(fields, parts[-1], block, curves)
+    fields.require({part.block for part in parts} == set(range(len(blocks))), "a block without a part")
+    return blocks, curves, parts
+
+
+def _check_part(fields: Fields, part: Part, block: Block, curves: list[Curve]) -> None:
+    for axis, size in enumerate((block.rows, block.columns)):
+        first, count = part.window[axis]
+        # Cut once, an axis that wraps has its first line at both ends.
+        fits = 0 < count <= size + block.closed[axis] and first + (0 if block.closed[axis] else count) <= size
+        fields.require(fits, "a window beyond its block")
+        if part.closed[axis]:
+            free = not any(part.clamped[2 * axis : 2 * axis + 2])
+            fields.require(count == size and block.closed[axis] and free, "an axis wraps that cannot")
+        along = 1 - axis
+        whole = part.window[along][1], part.stops[along], part.closed[along]
+        for side in (2 * axis, 2 * axis + 1):
+            if (source := part.curves[side]) is not None:
+                known = part.clamped[side] and source[0] < len(curves)
+                fields.require(known, "a side of no curve, or one that is not clamped")
+                curve = curves[source[0]]
+                fields.require(curve.length == 1 or curve == whole, "a curve unlike its side")
+
+
+def _grids(curves: list[Curve], parts: list[Part]) -> list[Grid]:
+    axes = [(Axis(c.length, c.closed, (not c.closed, not c.closed)), Axis(1, False)) for c in curves]
+    axes += [
+        (Axis(p.window[0][1], p.closed[0], p.clamped[:2]), Axis(p.window[1][1], p.closed[1], p.clamped[2:]))
+        for p in parts
+    ]
+    chains = levels_of(axes, [(curve.stops, False) for curve in curves] + [part.stops for part in parts])
+    held = common_ends(curves, parts)
+    left_out: list[Any] = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
+    left_out += [tuple(side is not None for side in part.curves) for part in parts]
+    return [Grid(n < len(curves), chain, out) for n, (chain, out) in enumerate(zip(chains, left_out, strict=True))]
+
+
+def common_ends(curves: list[Curve], parts: list[Part]) -> dict[End, End]:
+    """Find the ends of curves that another end holds, and which does."""
+    same: dict[End, End] = {}
+
+    def first(end: End) -> End:
+        while end in same:
+            end = same[end]
+        return end
+
+    for part, down, across in product(parts, (0, 1), (0, 1)):
+        met = []
+        for side, along in ((part.curves[down], across), (part.curves[2 + across], down)):
+            if side is not None and not any(part.closed):
+                curve, turned = side
+                met.append(first((curve, (along ^ turned) if curves[curve].length > 1 else 0)))
+        if len(met) == 2 and met[0] != met[1]:
+            same[max(met)] = min(met)
+    return {end: first(end) for end in same}
+
+
+def _extras(fields: Fields, block: Block) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
+    data = fields.take(fields.varint())
+    extras = unpack_map(data, fields.offset + fields.position - len(data))
+    attributes, plane = [], None
+    try:
+        for name, kind, components in extras.get("attributes", []):
+            fields.require(isinstance(name, str) and 0 <= components < 1 << 31, "an attribute without a name")
+            attributes.append(Attribute(name, TYPES[operator.index(kind)], operator.index(components)))
+        if "plane" in extras:
+            plane = [list(rule) for rule in extras["plane"]["grid"]]
+            fields.require(len(plane) == 2, "a plane has two rules")
+            for rule, count in zip(plane, (block.columns, block.rows), strict=True):
+                last = rule[-1]
+                size = [count + 1] if last == "values" else [3] if isinstance(last, bool) else [2, 3, 4]
+                numbers = rule[:-1] if last == "values" or isinstance(last, bool) else rule
+                known = len(rule) in size and all(type(n) in (int, float) and abs(n) < 1 << 1023 for n in numbers)
+                fields.require(known, "a plane's rule of no known kind")
+    except (TypeError, ValueError, KeyError, IndexError) as error:
+        raise fields.damaged(f"extras: {error!r}") from None
+    return attributes, plane, extras.get("joints")

@@ -1,98 +1,110 @@
-"""Section 8 of docs/format.md: the forward and the inverse step.
+"""Lifting steps along an axis, forward and inverse: section 8 of docs/format.md."""
 
-Many lines go through a step together: row k of an array holds what the page calls number k of each of them, int64 of
-shape (sample, line). All numbers of the page are below 2^63.
-"""
-
-from __future__ import annotations
-
-import functools
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .levels import Axis, Predictor
-
-__all__ = ["Lines", "forward_details", "inverse"]
-
-TAPS = [4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1]
-DETAIL = 2**28
-SAMPLE = 2**27
+from .levels import Axis
 
 Lines = NDArray[np.int64]
 
+H = (4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1)
+REACH = len(H)
+LIMIT = 1 << 28
 
-def _predicted(nodes: Lines, axis: Axis, predictor: Predictor) -> Lines:
-    """What the nodes predict of each detail: floor((v_k + 128) / 256)."""
-    run, (a, b) = axis.run, predictor
-    if run < 3 or predictor == (0, 0):
-        return np.zeros_like(nodes[: axis.midpoints])
-    if axis.periodic:
+
+def _periodic(axis: Axis) -> bool:
+    return axis.closed and axis.samples % 2 == 0
+
+
+@lru_cache(maxsize=256)
+def _beyond(axis: Axis) -> tuple[Lines, Lines]:
+    """Give index and sign of d_{-10} ... d_{M+9}; int64 (M + 20,) each, the sign 0 where d is 0."""
+    count = axis.midpoints
+    index = np.arange(-REACH, count + REACH)
+    if _periodic(axis):
+        return index % count, np.ones_like(index)
+    # An odd sequence about both ends has a period. Free ends have a zero one place outside; clamped ends lie between.
+    first = axis.clamped[0] and not axis.closed
+    last = axis.clamped[1] and not axis.closed and not axis.extra
+    sign = np.ones_like(index)
+    while True:
+        before, after = index < 0, index >= count
+        if not (before | after).any():
+            return index, sign
+        if not first:
+            sign[index == -1] = 0
+        if not last:
+            sign[index == count] = 0
+        index = np.where(
+            before, (-1 if first else -2) - index, np.where(after, 2 * count - (1 if last else 0) - index, index)
+        )
+        sign = np.where(before | after, -sign, sign)
+        index[sign == 0] = 0
+
+
+def _predicted(nodes: Lines, axis: Axis, pair: tuple[int, int]) -> Lines | int:
+    """Give floor((v + 128) / 256) of the nodes c_0 ... c_{R-1}; int64 (M, lines), or 0 where nothing is predicted."""
+    a, b = pair
+    run, count = axis.run, axis.midpoints
+    if run < 3 or (a, b) == (0, 0):
+        return 0
+    if _periodic(axis):
         c = nodes[np.arange(-2, run + 3) % run]
     else:
-        first, last = _extended(nodes[2::-1])[::-1], _extended(nodes[run - 3 : run])
-        c = np.concatenate((first, nodes[:run], last))
-    before2, before, here, after, after2, after3 = (c[2 + j : 2 + j + axis.midpoints] for j in range(-2, 4))
-    v: Lines = a * (-after2 + after + here - before) + b * (-after3 + after + here - before2)
+        c = np.empty((run + 5, *nodes.shape[1:]), np.int64)
+        c[2 : run + 2] = nodes
+        for near, step in ((1, 1), (0, 1), (run + 2, -1), (run + 3, -1), (run + 4, -1)):
+            c[near] = 3 * c[near + step] - 3 * c[near + 2 * step] + c[near + 3 * step]
+    at = [c[shift : shift + count] for shift in range(6)]
+    v = a * (at[3] + at[2] - at[4] - at[1]) + b * (at[3] + at[2] - at[5] - at[0])
     return (v + 128) >> 8
 
 
-def _extended(three: Lines) -> Lines:
-    """The two nodes that follow three by quadratic extrapolation."""
-    x, y, z = three
-    fourth = 3 * z - 3 * y + x
-    return np.stack((fourth, 3 * fourth - 3 * z + y))
-
-
-@functools.cache
-def _beyond(axis: Axis) -> tuple[NDArray[np.intp], Lines]:
-    """Which details, and times what, are d_-10 ... d_(R + 8)."""
-    found = [_inside(axis, index) for index in range(-10, axis.run + 9)]
-    return np.array([index for index, _ in found]), np.array([[sign] for _, sign in found])
-
-
-def _inside(axis: Axis, index: int) -> tuple[int, int]:
-    """The detail of any index: which one it is, and times what."""
-    count, (first, last) = axis.midpoints, axis.clamped_run
-    if axis.periodic:
-        return index % count, 1
-    sign = 1
-    while not 0 <= index < count:
-        is_clamped = first if index < 0 else last
-        if index in (-1, count) and not is_clamped:
-            return 0, 0
-        sign = -sign
-        index = -2 - index + is_clamped if index < 0 else 2 * count - index - is_clamped
-    return index, sign
-
-
 def _update(d: Lines, axis: Axis) -> Lines:
-    """floor((s_k + 3 2^21) / 2^24) for every node of the run."""
+    """Give floor((s_k + 3 2^21) / 2^24) of the details before prediction; int64 (R, lines)."""
+    run = axis.run
     index, sign = _beyond(axis)
-    wide = d[index] * sign  # wide[10 + k] is d_k
-    sums = np.zeros((axis.run, d.shape[1]), np.int64)
-    for j, tap in enumerate(TAPS):
-        sums += tap * (wide[10 + j : 10 + j + axis.run] + wide[9 - j : 9 - j + axis.run])
-    return (sums + 3 * 2**21) >> 24
+    wide = d[index] * sign[:, None]
+    s = np.full((run, *d.shape[1:]), 3 << 21, np.int64)
+    for j, h in enumerate(H):
+        s += h * (wide[REACH + j : REACH + j + run] + wide[REACH - 1 - j : REACH - 1 - j + run])
+    return s >> 24
 
 
-def inverse(lines: Lines, axis: Axis, predictor: Predictor) -> Lines:
-    """The samples of lines that hold nodes and then details; the axis is that of the samples."""
-    d = np.clip(lines[axis.nodes :] + _predicted(lines, axis, predictor), -DETAIL, DETAIL)
-    nodes = lines[: axis.run] - _update(d, axis)
-    samples = np.zeros_like(lines)
-    samples[0 : 2 * axis.run : 2] = nodes
-    samples[1 : 2 * axis.midpoints : 2] = d + ((nodes + np.roll(nodes, -1, axis=0))[: axis.midpoints] >> 1)
-    if axis.nodes > axis.run:
-        samples[-1] = lines[axis.run]
-    return np.clip(samples, -SAMPLE, SAMPLE)
+def _right(x: Lines, axis: Axis) -> Lines:
+    """Give the node to the right of each midpoint; int64 (M, lines)."""
+    count = axis.midpoints
+    return np.concatenate([x[1:], x[:1]]) if _periodic(axis) else x[1 : count + 1]
 
 
-def forward_details(samples: Lines, axis: Axis, predictor: Predictor) -> Lines:
-    """The details of lines of samples."""
-    x = np.concatenate([samples[: 2 * axis.run], samples[:1]])
-    even, odd = x[0::2], x[1::2][: axis.midpoints]
-    d = odd - ((even[: axis.midpoints] + even[1 : axis.midpoints + 1]) >> 1)
-    nodes = even[: axis.run] + _update(d, axis)
-    found: Lines = d - _predicted(nodes, axis, predictor)
-    return found
+def inverse(values: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
+    """Compute samples from nodes and details.
+
+    `values` (int64 (samples, lines)): nodes and then details along the first axis; `axis` (Axis): the axis at the finer
+    level; `pair` ((int, int)): the step's (a, b). Returns int64 (samples, lines): the samples, clamped.
+    """
+    run, count = axis.run, axis.midpoints
+    c = values[:run]
+    d = np.clip(values[axis.nodes :] + _predicted(c, axis, pair), -LIMIT, LIMIT)
+    even = c - _update(d, axis)
+    x = np.empty_like(values)
+    x[0 : 2 * run : 2] = even
+    x[1 : 2 * count : 2] = d + ((even[:count] + _right(even, axis)) >> 1)
+    if axis.extra:
+        x[-1] = values[run]
+    return np.clip(x, -LIMIT // 2, LIMIT // 2)
+
+
+def details(samples: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
+    """Compute the details of the forward step; int64 (samples, lines) to int64 (M, lines)."""
+    nodes, d = _forward(samples, axis)
+    return d - _predicted(nodes, axis, pair)
+
+
+def _forward(samples: Lines, axis: Axis) -> tuple[Lines, Lines]:
+    run, count = axis.run, axis.midpoints
+    even = samples[0 : 2 * run : 2]
+    d = samples[1 : 2 * count : 2] - ((even[:count] + _right(even, axis)) >> 1)
+    return even + _update(d, axis), d

@@ -1,92 +1,112 @@
-"""Sections 3.3 and 7.5 of docs/format.md: which points are valid."""
+"""Masks of holes: sections 3.3 and 7.5 of docs/format.md."""
 
-from __future__ import annotations
-
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StreamError
+from ..errors import CorruptStreamError
 from .fields import Fields
-from .header import Block
-from .range_coder import Model
-
-__all__ = ["Masks", "decode_mask", "no_holes", "read_masks"]
-
-GROUP = 16
-MARGIN = 2  # points beside a mask that contexts see
+from .range_coder import RangeCoder, new_contexts
 
 Mask = NDArray[np.bool_]
+POINTS = 4
+"""The first of the 1024 contexts of points; those of groups stand before them."""
 
 
-class Masks(NamedTuple):
-    """The value of integer points at holes; for each block which points are valid, and which holes are kept."""
+@dataclass(frozen=True)
+class Masks:
+    """What the section of masks says.
+
+    `hole` (int): the value of integer points at holes; `valid`, `kept` (list of bool (H, W)): for each block the points
+    that are valid, and the holes that are kept.
+    """
 
     hole: int
     valid: list[Mask]
     kept: list[Mask]
 
-
-def no_holes(blocks: list[Block]) -> Masks:
-    """What no section says: all points are valid."""
-    shapes = [(block.rows, block.columns) for block in blocks]
-    return Masks(0, [np.ones(shape, bool) for shape in shapes], [np.zeros(shape, bool) for shape in shapes])
-
-
-def read_masks(payload: bytes, blocks: list[Block], with_kept: bool) -> Masks:
-    """The masks, from the payload of the section of masks, or of kept masks."""
-    fields = Fields(payload)
-    hole = fields.number("q")
-    _, every, none = no_holes(blocks)
-    valid = [~_read_marked(fields, points, 0) for points in every]
-    kept = [_read_marked(fields, ~mask, 1) for mask in valid] if with_kept else none
-    fields.finish()
-    return Masks(hole, valid, kept)
+    @property
+    def keep_any(self) -> bool:
+        """Whether there is a kept hole."""
+        return any(mask.any() for mask in self.kept)
 
 
-def _read_marked(fields: Fields, possible: Mask, mark: int) -> Mask:
-    """Their number, and which of the possible points they are: those with the mark in a mask that may follow."""
-    count, marked = fields.varint(), np.zeros_like(possible)
-    if count and (mark == 0 or count < np.count_nonzero(possible)):
-        marked = decode_mask(fields.take(fields.varint()), *possible.shape) == mark
-    elif count:
-        marked = possible
-    if np.count_nonzero(marked) != count or (marked & ~possible).any():
-        raise StreamError(f"expected a mask with {count} points marked, got {np.count_nonzero(marked)}")
-    return marked
+def no_holes(sizes: list[tuple[int, int]]) -> Masks:
+    """Make the masks of blocks of such sizes without holes."""
+    return Masks(0, [np.ones(size, np.bool_) for size in sizes], [np.zeros(size, np.bool_) for size in sizes])
 
 
-def decode_mask(data: bytes, rows: int, columns: int) -> Mask:
-    """Section 7.5.
+def decode_mask(data: bytes, rows: int, columns: int, offset: int = 0) -> Mask:
+    """Decode the mask of a block.
 
-    Parameters
-    ----------
-    data : bytes
-    rows, columns : int
-
-    Returns
-    -------
-    bool, shape (row, column)
-        True where a 1 is coded.
+    `data` (bytes): the range-coded string; `rows`, `columns` (int): of the block; `offset` (int): where the string
+    begins in the container. Returns bool (H, W): the points that are 1. Raises CorruptStreamError if the string has
+    more bytes than decoding reads.
     """
-    model = Model(data)
-    above2, above = ([0] * (columns + 2 * MARGIN) for _ in range(2))
+    coder = RangeCoder(data, new_contexts(POINTS + 1024))
+    bit = coder.bit
     last = 0
-    found = []
-    for _ in range(rows):
-        here = [0] * (columns + 2 * MARGIN)
-        for first in range(MARGIN, columns + MARGIN, GROUP):
-            n = min(GROUP, columns + MARGIN - first)
-            around = above2[first - 2 : first + n + 2] + above[first - 2 : first + n + 2] + here[first - 2 : first]
-            if min(around) == max(around):
-                last = model.bit("group", around[0], last)
+    # Three rows with two zeros before them and, so that every window of a group is whole, eighteen behind.
+    above, near, row = (bytearray(columns + 20) for _ in range(3))
+    mask = np.empty((rows, columns), np.bool_)
+    for i in range(rows):
+        row = bytearray(columns + 20)
+        for left in range(2, columns + 2, 16):
+            right = min(left + 16, columns + 2)
+            v = row[left - 1]
+            same = bytes([v]) * (right - left + 4)
+            if row[left - 2] == v and near[left - 2 : right + 2] == same and above[left - 2 : right + 2] == same:
+                last = bit(2 * v + last)
                 if last:
-                    here[first : first + n] = around[:1] * n
+                    row[left:right] = same[4:]
                     continue
-            for c in range(first, first + n):
-                here[c] = model.bit("point", *above2[c - 1 : c + 2], *above[c - 2 : c + 3], *here[c - 2 : c])
-        found.append(np.array(here[MARGIN : MARGIN + columns], bool))
-        above2, above = above, here
-    model.finish()
-    return np.stack(found)
+            for j in range(left, right):
+                far = above[j - 1] << 2 | above[j] << 1 | above[j + 1]
+                mid = near[j - 2] << 4 | near[j - 1] << 3 | near[j] << 2 | near[j + 1] << 1 | near[j + 2]
+                row[j] = bit(POINTS + (far << 7 | mid << 2 | row[j - 2] << 1 | row[j - 1]))
+        mask[i] = np.frombuffer(row, np.uint8)[2 : columns + 2]
+        above, near = near, row
+    if coder.surplus:
+        raise CorruptStreamError("a mask has more bytes than decoding reads", offset)
+    return mask
+
+
+def read_masks(payload: bytes, offset: int, kept: bool, sizes: list[tuple[int, int]]) -> Masks:
+    """Read the payload of the section of masks.
+
+    `payload` (bytes): what the frame encloses; `offset` (int): where it begins in the container; `kept` (bool): the
+    section is one of kept masks; `sizes` (list of (int, int)): rows and columns of each block. Raises
+    CorruptStreamError if the payload is damaged, or its counts are not those of its masks.
+    """
+    fields = Fields(payload, offset)
+    masks = no_holes(sizes)
+    hole: int = fields.number("q")
+    holes = []
+    for number, (rows, columns) in enumerate(sizes):
+        holes.append(fields.varint())
+        if holes[-1]:
+            masks.valid[number] = _counted(fields, rows, columns, rows * columns - holes[-1])
+    for number, (rows, columns) in enumerate(sizes if kept else ()):
+        count = fields.varint()
+        if count == holes[number]:
+            masks.kept[number] = ~masks.valid[number]
+        elif count:
+            masks.kept[number] = _counted(fields, rows, columns, count)
+        if count > holes[number] or (masks.kept[number] & masks.valid[number]).any():
+            raise fields.damaged("more is kept than holes")
+    if kept and not masks.keep_any:
+        raise fields.damaged("no hole is kept")
+    fields.end()
+    return Masks(hole, masks.valid, masks.kept)
+
+
+def _counted(fields: Fields, rows: int, columns: int, ones: int) -> Mask:
+    """Decode a mask with its length before it, and hold its number of 1s to what was told."""
+    data = fields.take(fields.varint())
+    if not 0 <= ones <= rows * columns:
+        raise fields.damaged("more holes than points")
+    mask = decode_mask(data, rows, columns, fields.offset + fields.position - len(data))
+    if int(mask.sum()) != ones:
+        raise fields.damaged("a mask has another number of holes than is told")
+    return mask

@@ -1,88 +1,86 @@
-"""Section 9.3 of docs/format.md: values on a lattice with offsets that come again."""
+"""Pieces of exactness by offsets from multiples of a step: section 9.3 of docs/format.md."""
 
-from __future__ import annotations
-
+from struct import Struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StreamError
 from .fields import Fields
-from .range_coder import Model, clamp
+from .range_coder import RangeCoder, new_contexts
 
-__all__ = ["with_offsets"]
+FIRST, LISTED, WHICH, OFF, NEW = 0, 16, 17, 81, 97
+CONTEXTS = NEW + 46
+HIGHEST = 0x7F7FFFFF
+"""The place of the largest finite float32."""
 
-MOST_BITS = 34
-LISTED = 64
-LARGEST = 0x7F7FFFFF
-
-
-def _place_of(number: float) -> int:
-    """The place of the nearest float32."""
-    with np.errstate(over="ignore"):
-        nearest = np.float32(number)
-    if not np.isfinite(nearest):
-        return LARGEST
-    m = int(np.abs(nearest).view(np.uint32))
-    return -1 - m if np.signbit(nearest) else m
+_float, _integer = Struct("<f"), Struct("<I")
 
 
-def _value_at(place: int) -> float:
-    """The float32 at a place."""
-    magnitude = float(np.uint32(min(-1 - place if place < 0 else place, LARGEST)).view(np.float32))
-    return -magnitude if place < 0 else magnitude
+def value_at(place: int) -> float:
+    """Give the float32 at a place."""
+    pattern = min(place, HIGHEST) if place >= 0 else 0x80000000 | min(-1 - place, HIGHEST)
+    value: float = _float.unpack(_integer.pack(pattern))[0]
+    return value
 
 
-class _Offsets:
-    """The list of intervals, the last used first, and the contexts."""
+def place_of(value: float) -> int:
+    """Give the place of the nearest float32; of what is not finite the highest."""
+    try:
+        pattern: int = _integer.unpack(_float.pack(value))[0]
+    except OverflowError:
+        return HIGHEST
+    m = pattern & 0x7FFFFFFF
+    if m > HIGHEST:
+        return HIGHEST
+    return -1 - m if pattern >> 31 else m
 
-    def __init__(self, coded: bytes, bits: int) -> None:
-        self.bits = bits
-        self.model = Model(coded)
-        self.listed: list[tuple[float, float]] = []
-        self.in_turn = 0
 
-    def _rank(self) -> int | None:
-        if not self.listed:
-            return None
-        if self.model.bit("first", self.in_turn):
-            self.in_turn = min(self.in_turn + 1, 15)
-            return 0
-        self.in_turn = 0
-        return min(self.model.number(6, "which"), len(self.listed) - 1) if self.model.bit("listed") else None
-
-    def place(self, x: float, base: float) -> int:
-        """The place sought where the layers gave x."""
-        rank = self._rank()
-        low, high = -np.inf, np.inf
-        if rank is None:
-            w = self.model.number(min(self.bits, 4), "new")
-            for j in range(4, self.bits):
-                w = 2 * w + self.model.bit("new", 12 + j)
-            place = _place_of(x) + w - (1 << self.bits >> 1)
-            del self.listed[LISTED - 1 :]
+def read_offsets(values: NDArray[Any], fields: Fields, bits: int) -> NDArray[Any]:
+    """Restore the float32 values (n,) of a piece; `bits` is B, and `fields` stand behind the first byte."""
+    step = fields.number("d")
+    if not 0 < step < float("inf"):
+        raise fields.damaged("a step of offsets is not above 0")
+    coder = RangeCoder(fields.take(fields.left), new_contexts(CONTEXTS))
+    wide = values.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        bases = (np.rint(wide / step) * step).tolist()
+    pattern = values.view(np.uint32).astype(np.int64)
+    start = np.where(pattern >> 31 == 1, -1 - (pattern & 0x7FFFFFFF), pattern) - ((1 << bits) >> 1)
+    intervals: list[tuple[float, float]] = []
+    history = 0
+    restored = []
+    bit, tree = coder.bit, coder.tree
+    for place, base in zip(start.tolist(), bases, strict=True):
+        rank = -1
+        if intervals:
+            if bit(FIRST + history):
+                history = min(history + 1, 15)
+                rank = 0
+            else:
+                history = 0
+                if bit(LISTED):
+                    rank = min(tree(WHICH, 6), len(intervals) - 1)
+        if rank >= 0:
+            low, high = intervals.pop(rank)
+            place = place_of(base + 0.5 * (low + high)) + tree(OFF + 8 * (rank > 0), 3) - 4
         else:
-            low, high = self.listed.pop(rank)
-            place = _place_of(base + 0.5 * (low + high)) + self.model.number(3, "off", 8 if rank else 0) - 4
-        f = _value_at(place)
-        bottom = max(0.5 * (f + _value_at(place - 1)) - base, low)
-        top = min(0.5 * (f + _value_at(place + 1)) - base, high)
-        if bottom > top:
-            bottom = top = f - base
-        self.listed.insert(0, (bottom, top))
-        return place
-
-
-def with_offsets(fields: Fields, bits: int, values: NDArray[Any]) -> NDArray[Any]:
-    """The values sought, from what follows the first byte of a piece, B, and what the layers gave, shape (value,)."""
-    step = fields.f64()
-    if values.dtype.str != "<f4" or bits > MOST_BITS or not 0 < step < np.inf:
-        raise StreamError(f"expected float32, at most {MOST_BITS} bits and a step, got {values.dtype}, {bits}, {step}")
-    offsets = _Offsets(fields.rest(), bits)
-    patterns = []
-    for x in map(float, values):
-        place = clamp(offsets.place(x, float(np.rint(x / step)) * step), -(2**31), 2**31 - 1)
-        patterns.append((-1 - place) | 1 << 31 if place < 0 else place)
-    offsets.model.finish()
-    return np.array(patterns, "<u4").view(values.dtype)
+            w = tree(NEW, min(bits, 4))
+            for j in range(4, bits):
+                w = 2 * w + bit(NEW + 12 + j)
+            place += w
+        value = value_at(place)
+        bottom = 0.5 * (value + value_at(place - 1)) - base
+        top = 0.5 * (value + value_at(place + 1)) - base
+        if rank >= 0:
+            bottom, top = max(bottom, low), min(top, high)
+            if bottom > top:
+                bottom = top = value - base
+        elif len(intervals) == 64:
+            intervals.pop()
+        intervals.insert(0, (bottom, top))
+        restored.append(place)
+    if coder.surplus:
+        raise fields.damaged("a piece of offsets has more bytes than decoding reads")
+    found = np.clip(np.array(restored, np.int64), -(1 << 31), (1 << 31) - 1)
+    return np.where(found < 0, 0x80000000 | (-1 - found), found).astype(np.uint32).view(np.float32)

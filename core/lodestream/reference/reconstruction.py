@@ -1,152 +1,189 @@
-"""Sections 3 and 8 of docs/format.md: from the coefficients of a channel to lattice coordinates, and to values."""
+"""From coefficients to values: section 8 of docs/format.md."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .coefficients import MOST, reconstructed, step_of
-from .header import Header, Lattice
-from .levels import GridLevels, Levels
-from .lifting import Lines, forward_details, inverse
-from .passes import Unit
-from .range_coder import clamp
+from .header import Header
+from .levels import positions
+from .lifting import details, inverse
 
-__all__ = ["EIGHTHS", "Channel", "Values", "block_places", "plane_value", "put_together", "rounded", "value"]
-
-#: Levels above those that are known are in eighths of a lattice step.
-EIGHTHS = 8
-
-Values = NDArray[Any]
+Array = NDArray[np.int64]
 
 
-class Channel:
-    """One channel at a level: of each grid an int64 array, shape (row, column), of coefficients, then of points."""
+def reconstruct(
+    header: Header, channel: int, level: int, whole: int, coefficients: Callable[[int, int], list[Array]]
+) -> list[Array]:
+    """Reconstruct all grids of a channel.
 
-    def __init__(self, header: Header, levels: Levels, channel: int, level: int) -> None:
-        self.levels = levels
-        self.channel = channel
-        self.level = level
-        self.is_coordinate = channel < header.coordinates
-        self.base = header.base if self.is_coordinate else 0
-        self.arrays = [np.zeros(grid.shape(level), np.int64) for grid in levels.grids]
-
-    def put(self, unit: Unit, remaining: int, factor: int) -> None:
-        """Put the reconstructed coefficients of a unit in their places, times a factor."""
-        for band in unit.bands if unit.top else ():
-            step = step_of(self.levels, band, unit.level, self.base) if self.base else None
-            found = [
-                [reconstructed(band, row, column, remaining, step) for column in range(len(band.columns))]
-                for row in range(len(band.rows))
-            ]
-            row, column = band.place
-            window = slice(row, row + len(band.rows)), slice(column, column + len(band.columns))
-            self.arrays[band.grid][window] = np.clip(np.array(found, np.int64) * factor, -MOST, MOST)
-
-    def refine(self, whole: int) -> None:
-        """Undo all steps; the coefficients of the levels up to `whole` are known, those above it are in eighths."""
-        if self.is_coordinate:
-            self._take_common_ends()
-            for grid in self.levels.grids:
-                self._take_sides(grid, 0)
-        for level in range(1, self.level + 1):
-            for grid in self.levels.grids:
-                if self.is_coordinate or not grid.is_curve:
-                    self._refine(grid, level, level == whole + 1)
-
-    def _take_common_ends(self) -> None:
-        for (curve, end), (holder, held) in sorted(self.levels.held.items()):
-            place, source = (k * (self.levels.grids[n].shape(0)[0] - 1) for n, k in ((curve, end), (holder, held)))
-            self.arrays[curve][place] = self.arrays[holder][source]
-
-    def _sides(self, grid: GridLevels, level: int) -> Iterable[tuple[int, int, Lines]]:
-        """Axis and end (0 or 1) of each side that comes from a curve, and its points of a level in the side's order."""
-        for number, side in enumerate(grid.grid.sides):
-            if side is not None:
-                axis, curve = number // 2, self.levels.grids[side.curve]
-                points = self.arrays[side.curve][: curve.shape(level)[0], 0]
-                if curve.axes[-1][0].samples == 1:
-                    points = np.repeat(points, grid.shape(level)[1 - axis])
-                yield axis, number % 2, points[::-1] if side.reversed else points
-
-    def _take_sides(self, grid: GridLevels, level: int) -> None:
-        """Take what curves give to a level: its points if that is level 0, otherwise details."""
-        nodes = grid.shape(max(level - 1, 0))
-        for axis, end, points in self._sides(grid, level):
-            array = self.arrays[grid.number] if axis == 0 else self.arrays[grid.number].T
-            line, along = array[end * (nodes[axis] - 1)], grid.axes[level][1 - axis]
-            if level == 0:
-                line[: along.samples] = points
-            elif along.steps:
-                predictor = self.levels.predictor(self.channel, grid, level, 1 - axis)
-                line[along.nodes : along.samples] = forward_details(points[:, None], along, predictor)[:, 0]
-
-    def _refine(self, grid: GridLevels, level: int, scaled: bool) -> None:
-        array = self.arrays[grid.number]
-        if scaled:
-            rows, columns = grid.shape(level - 1)
-            array[:rows, :columns] = np.clip(array[:rows, :columns], -(2**24), 2**24) * EIGHTHS
-        if self.is_coordinate:
-            self._take_sides(grid, level)
-        rows, columns = grid.shape(level)
-        finer = array[:rows, :columns]
-        for axis, lines in ((1, finer.T), (0, finer)):
-            step = grid.axes[level][axis]
-            if step.steps:
-                lines[:] = inverse(lines, step, self.levels.predictor(self.channel, grid, level, axis))
+    `header` (Header): of the container; `channel` (int): number of the channel; `level` (int): the level that is made,
+    K; `whole` (int): the largest level up to which all coefficients are known, F, at most K; `coefficients` (callable):
+    gives those of a tile and channel, one int64 array for each share. Returns list of int64 (rows, columns): q of each
+    grid, in eighths if F < K; of an attribute's curves nothing of meaning.
+    """
+    grids, coordinate = header.grids, channel < header.coordinates
+    arrays = [np.zeros(grid.shape(level), np.int64) for grid in grids]
+    for number, tile in enumerate(header.tiles):
+        if tile.level > level:
+            break
+        shares = tile.shares[not coordinate]
+        for share, values in zip(shares, coefficients(number, channel) if shares else [], strict=True):
+            if tile.level > whole:
+                values = np.clip(8 * values, -(1 << 28), 1 << 28)
+            arrays[share.grid][share.rows, share.columns] = values
+    if coordinate:
+        _copy_ends(header, arrays)
+    for upper in range(1, level + 1):
+        for number, (grid, array) in enumerate(zip(grids, arrays, strict=True)):
+            if grid.curve and not coordinate:
+                continue
+            nodes = grid.shape(upper - 1)
+            if upper == whole + 1:
+                lower = array[: nodes[0], : nodes[1]]
+                lower[:] = 8 * np.clip(lower, -(1 << 24), 1 << 24)
+            if coordinate and not grid.curve:
+                _details_of_sides(header, channel, upper, number, arrays)
+            rows, columns = grid.shape(upper)
+            for axis in (1, 0):
+                if grid.stepped(upper, axis):
+                    part = array[:rows, :columns]
+                    line = grid.axes[upper][axis]
+                    pair = _pair(header, channel, upper, number, axis)
+                    if axis:
+                        part[:] = inverse(np.ascontiguousarray(part.T), line, pair).T
+                    else:
+                        part[:] = inverse(part, line, pair)
+    return arrays
 
 
-def value(lattice: Lattice, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Section 3: the float64 values of lattice coordinates, before they are rounded to the type."""
-    with np.errstate(over="ignore"):
-        return (lattice.origin + q) / lattice.step if lattice.decimal else lattice.origin + lattice.step * q
+def _pair(header: Header, channel: int, upper: int, number: int, axis: int) -> tuple[int, int]:
+    """Give (a, b) of a grid's step from a level to the one below."""
+    grid = header.grids[number]
+    if grid.axes[upper][axis].run < 24:
+        return 16, 0
+    return header.predictors[channel][upper - 1, 2 if grid.curve else axis]
 
 
-def rounded(numbers: NDArray[np.float64], kind: str) -> Values:
-    """Values of a type, little-endian, of the same shape."""
-    dtype = np.dtype(kind).newbyteorder("<")
+def _copy_ends(header: Header, arrays: list[Array]) -> None:
+    """Copy points of level 0 from ends that hold them, and from curves to the sides of parts."""
+    grids = header.grids
+
+    def place(end: tuple[int, int]) -> int:
+        return grids[end[0]].shape(0)[0] - 1 if end[1] else 0
+
+    for end, holder in sorted(header.holders.items()):
+        arrays[end[0]][place(end), 0] = arrays[holder[0]][place(holder), 0]
+    for number, part in enumerate(header.parts, len(header.curves)):
+        rows, columns = grids[number].shape(0)
+        for side, source in enumerate(part.curves):
+            if source is not None:
+                curve, turned = source
+                points = arrays[curve][: grids[curve].shape(0)[0], 0]
+                target = (0, rows - 1, 0, columns - 1)[side]
+                line = points[::-1] if turned else points
+                if side < 2:
+                    arrays[number][target, :columns] = line
+                else:
+                    arrays[number][:rows, target] = line
+
+
+def _details_of_sides(header: Header, channel: int, upper: int, number: int, arrays: list[Array]) -> None:
+    """Compute the details along the sides of a part that come from curves."""
+    grid, array = header.grids[number], arrays[number]
+    nodes, shape = grid.shape(upper - 1), grid.shape(upper)
+    for side, source in enumerate(header.parts[number - len(header.curves)].curves):
+        along = 1 if side < 2 else 0
+        if source is None or not grid.stepped(upper, along):
+            continue
+        curve, turned = source
+        found: Array | int = 0
+        if header.curves[curve].length > 1:
+            points = arrays[curve][: shape[along]]
+            points = points[::-1] if turned else points
+            found = details(points, grid.axes[upper][along], _pair(header, channel, upper, number, along))[:, 0]
+        target = nodes[1 - along] - 1 if side & 1 else 0
+        if along:
+            array[target, nodes[1] : shape[1]] = found
+        else:
+            array[nodes[0] : shape[0], target] = found
+
+
+def values_of(q: Array, eighths: bool, lattice: tuple[int, float, float], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Compute the values of a channel from its lattice coordinates, in its type."""
+    rule, origin, step = lattice
+    wide: NDArray[np.float64] = q.astype(np.float64) * (0.125 if eighths else 1.0)
+    with np.errstate(over="ignore", divide="ignore"):
+        wide = origin + step * wide if rule == 0 else (origin + wide) / step
+    return to_type(wide, dtype)
+
+
+def to_type(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Round float64 values to a type, ties to even, and clamp them to its finite range."""
     if dtype.kind == "f":
-        greatest = float(np.finfo(dtype).max)
-        return np.clip(numbers, -greatest, greatest).astype(dtype)
-    least, most = int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
-    whole = [clamp(round(number), least, most) for number in np.clip(numbers, least, most).ravel().tolist()]
-    return np.array(whole, dtype).reshape(numbers.shape)
-
-
-def block_places(header: Header, levels: Levels, block: int, level: int) -> tuple[list[int], list[int]]:
-    """The rows and columns of a block at which the nodes of a level stand."""
-    found = [grid.places(level, header.blocks[block]) for grid in levels.grids if grid.grid.block == block]
-    rows, columns = (sorted({place for places in found for place in places[axis]}) for axis in (0, 1))
-    return rows, columns
-
-
-def put_together(header: Header, levels: Levels, block: int, level: int, arrays: list[Lines]) -> Lines:
-    """The grid of a block at a level, from the arrays of all grids."""
-    rows, columns = block_places(header, levels, block, level)
-    found = np.zeros((len(rows), len(columns)), np.int64)
-    for grid in levels.grids:
-        if grid.grid.block == block:
-            down, along = grid.places(level, header.blocks[block])
-            found[np.ix_(np.searchsorted(rows, down), np.searchsorted(columns, along))] = arrays[grid.number]
+        most = float(np.finfo(dtype).max)
+        clamped: NDArray[Any] = np.clip(values, -most, most).astype(dtype)
+        return clamped
+    limits = np.iinfo(dtype)
+    whole = np.rint(values)
+    # The highest value of 64 bits is no float64; what reaches it is put in by hand.
+    inside = np.clip(
+        whole, float(limits.min), np.nextafter(float(limits.max) + 1, 0) if limits.bits == 64 else limits.max
+    )
+    found: NDArray[Any] = inside.astype(dtype)
+    found[whole >= float(limits.max)] = limits.max
     return found
 
 
-def plane_value(rule: list[Any], axis: int, place: tuple[int, int], size: tuple[int, int]) -> float:
-    """x (axis 1) or y (axis 0) of heights that came with them, at a row and a column of a block of such a size."""
-    p, n = place[axis], size[axis]
+def places(header: Header, block: int, level: int) -> tuple[list[NDArray[np.int64]], list[tuple[int, Any]]]:
+    """Find where the nodes of a level stand in a block.
+
+    Returns `lines` (list of int64): the block's rows, and columns, at which nodes stand; `parts` (list of (int,
+    index)): number of each part's grid, and where its nodes lie in the block's grid of the level.
+    """
+    sizes = header.blocks[block].rows, header.blocks[block].columns
+    found = []
+    for number, part in enumerate(header.parts, len(header.curves)):
+        if part.block == block:
+            stands = []
+            for axis, size in enumerate(sizes):
+                first, count = part.window[axis]
+                place = positions(header.grids[number], axis, level)
+                place = count - 1 - place if part.reverse[axis] else place
+                stands.append((first + place) % size)
+            found.append((number, stands))
+    lines = [np.unique(np.concatenate([stands[axis] for _, stands in found])) for axis in (0, 1)]
+    return lines, [
+        (number, np.ix_(*(np.searchsorted(line, stand) for line, stand in zip(lines, stands, strict=True))))
+        for number, stands in found
+    ]
+
+
+def plane_values(header: Header) -> list[NDArray[Any]]:
+    """Compute x and y of a surface with a plane; (rows, columns) each, in the type of the points."""
+    block = header.blocks[0]
+    r, c = np.indices((block.rows, block.columns)).astype(np.float64)
+    found = []
+    for rule, p, n in zip(header.plane or [], (c, r), (block.columns, block.rows), strict=True):
+        with np.errstate(all="ignore"):
+            found.append(to_type(_evaluate(rule, p, n, r, c), header.types[0]))
+    return found
+
+
+def _evaluate(
+    rule: list[Any], p: NDArray[np.float64], n: int, r: NDArray[np.float64], c: NDArray[np.float64]
+) -> NDArray[np.float64]:
     if rule[-1] == "values":
-        return float(rule[p])
-    numbers = [float(number) for number in rule]
-    if len(rule) == 4:
-        origin, across, down, shift = numbers
-        return across * (place[1] + shift) + down * (place[0] + shift) + origin
+        return np.array(rule[:-1], np.float64)[p.astype(np.int64)]
+    last = rule[-1]
+    origin, step = float(rule[0]), float(rule[1])
+    if last is False:
+        return step * (p + 0.5) + origin
+    if last is True:
+        return np.where(p == n - 1, step, origin + p * ((step - origin) / np.float64(n - 1)))
     if len(rule) == 2:
-        return numbers[0] + numbers[1] * p
-    if rule[2] is True:
-        return numbers[1] if p == n - 1 else numbers[0] + p * ((numbers[1] - numbers[0]) / (n - 1))
-    if rule[2] is False:
-        return numbers[1] * (p + 0.5) + numbers[0]
-    return (numbers[0] + numbers[1] * p) / numbers[2]
+        return origin + step * p
+    if len(rule) == 3:
+        return (origin + step * p) / float(last)
+    return step * (c + float(last)) + float(rule[2]) * (r + float(last)) + origin
