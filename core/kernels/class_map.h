@@ -61,7 +61,7 @@ LODE_INLINE void see_parents(const uint32_t *at, int64_t stride, int rows, int c
 }
 
 LODE_INLINE void see_weights(const uint8_t *marks, int64_t stride, int rows, int columns, int plane,
-                          struct class_map *map) {
+                             struct class_map *map) {
     marks -= MARGIN * stride + MARGIN;
     uint8_t one = (uint8_t)(plane + 2), two = (uint8_t)(plane + 3);
     for (int i = 0; i < rows + 2 * MARGIN; i++, marks += stride)

@@ -134,7 +134,15 @@ def test_calls_that_are_cut_short_go_on_where_they_stopped(trellis: bool, budget
             own = arrays.known, arrays.sign, arrays.flags, arrays.early, given_true, arrays.models, data
             while finished < len(runs):
                 finished = kernels.passes(
-                    reading, trellis, table.bands, runs, *own, np.zeros(17 * (not reading)), np.zeros(0, np.uint16), state, at_once
+                    reading,
+                    trellis,
+                    table.bands,
+                    runs,
+                    *own,
+                    np.zeros(17 * (not reading)),
+                    np.zeros(0, np.uint16),
+                    state,
+                    at_once,
                 )
                 calls += 1
             done.append(calls)
