@@ -47,10 +47,23 @@ static void store_contexts(const struct contexts *contexts, int32_t *model) {
         model[k] = contexts->probability[k] | contexts->adapted[k] << 16;
 }
 
-static void begin_pass(struct contexts *contexts, int64_t number) {
-    if (number & 1)
-        for (int k = 0; k < CLASS_CONTEXTS; k++)
-            contexts->adapted[k] = contexts->adapted[k] < MOST_KEPT ? contexts->adapted[k] : MOST_KEPT;
+/* Before a pass: each plane forgets, but the highest, which has one pass. */
+static void begin_pass(struct unit *unit, int64_t number) {
+    struct contexts *contexts = &unit->contexts;
+    if (!(number & 1))
+        return;
+    unit->seen = 0;
+    for (int k = 0; k < CLASS_CONTEXTS; k++)
+        contexts->adapted[k] = contexts->adapted[k] < MOST_KEPT ? contexts->adapted[k] : MOST_KEPT;
+}
+
+static int64_t stripes_before(const int64_t *bands, int64_t count) {
+    int64_t stripes = 0;
+    for (int64_t b = 0; b < count; b++) {
+        struct band band = band_of(bands + b * BAND_FIELDS);
+        stripes += stripes_in(&band);
+    }
+    return stripes;
 }
 
 /* Begin a unit: its states from its first bytes, of which zeros follow those that are there; how many are taken. */
@@ -73,11 +86,14 @@ static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, in
     int plane = (int)(number >> 1);
     bool first_pass = number & 1;
     if (at->band == 0 && at->stripe == 0)
-        begin_pass(&unit->contexts, number);
-    for (int64_t rounds = first_pass ? count : 2 * count; at->band < rounds; at->band++, at->stripe = 0) {
+        begin_pass(unit, number);
+    int64_t rounds = first_pass ? count : 2 * count,
+            before = stripes_before(bands, at->band < count ? at->band : count);
+    for (; at->band < rounds; at->band++, at->stripe = 0) {
         bool raw = at->band >= count;
         struct band band = band_of(bands + (raw ? at->band - count : at->band) * BAND_FIELDS);
-        for (int64_t stripes = stripes_in(&band); at->stripe < stripes; at->stripe++) {
+        int64_t stripes = stripes_in(&band);
+        for (; at->stripe < stripes; at->stripe++) {
             if (*budget <= 0)
                 return false;
             struct stripe stripe = stripe_of(&band, at->stripe);
@@ -86,10 +102,11 @@ static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, in
                 at->bits = read_raw(unit->tiles, &band, &stripe, plane, unit->rans.at, unit->rans.end - unit->rans.at,
                                     at->bits);
             else if (first_pass)
-                code_stripe(true, true, unit, &band, &stripe, plane);
+                code_stripe(true, true, unit, &band, &stripe, before + at->stripe, plane);
             else
-                code_stripe(true, false, unit, &band, &stripe, plane);
+                code_stripe(true, false, unit, &band, &stripe, before + at->stripe, plane);
         }
+        before += stripes;
     }
     int64_t left = unit->rans.end - unit->rans.at, bytes = (at->bits + 7) >> 3;
     unit->rans.at += bytes < left ? bytes : left;
@@ -105,6 +122,7 @@ bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t co
         at->bytes = start_unit(tiles->model, states, data, size);
     load_contexts(&unit.contexts, tiles->model);
     unit.tiles = tiles;
+    unit.seen = 0;
     unit.rans = (struct rans){states[0], states[1], data + at->bytes, data + size};
     while (at->passes <= first - last && read_pass(&unit, bands, count, first - at->passes, at, budget)) {
         at->passes++;
@@ -128,18 +146,18 @@ static int64_t count_coefficients(const int64_t *bands, int64_t count, int64_t m
 /* List the decisions of a pass, forwards; how many raw bits it has, or -1 where there is no room. */
 static int64_t list_pass(struct unit *unit, const int64_t *bands, int64_t count, int64_t number, const symbol_t *end) {
     int plane = (int)(number >> 1);
-    int64_t bits = 0;
-    begin_pass(&unit->contexts, number);
+    int64_t bits = 0, done = 0;
+    begin_pass(unit, number);
     for (int64_t b = 0; b < count; b++) {
         struct band band = band_of(bands + b * BAND_FIELDS);
-        for (int64_t s = 0, stripes = stripes_in(&band); s < stripes; s++) {
+        for (int64_t s = 0, stripes = stripes_in(&band); s < stripes; s++, done++) {
             struct stripe stripe = stripe_of(&band, s);
             if (end - unit->symbols < MOST_IN_STRIPE)
                 return -1;
             if (number & 1)
-                code_stripe(false, true, unit, &band, &stripe, plane);
+                code_stripe(false, true, unit, &band, &stripe, done, plane);
             else {
-                code_stripe(false, false, unit, &band, &stripe, plane);
+                code_stripe(false, false, unit, &band, &stripe, done, plane);
                 bits += count_raw(unit->tiles, &band, &stripe, plane);
             }
         }
@@ -159,7 +177,7 @@ static void write_raw_bits(const struct tiles *tiles, const int64_t *bands, int6
     }
 }
 
-/* What is known when all passes are done. Contexts of the unit itself follow from marks alone. */
+/* All magnitudes: what is known when all passes are done. Contexts of the unit itself follow from marks alone. */
 static void know_all(const struct tiles *tiles, const int64_t *bands, int64_t count) {
     for (int64_t b = 0; b < count; b++) {
         struct band band = band_of(bands + b * BAND_FIELDS);
@@ -178,9 +196,11 @@ int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_
         return -1;
     *budget -= coefficients * (first + 1);
     unit.tiles = tiles;
+    unit.seen = 0;
+    unit.symbols = output->symbols;
     start_contexts(tiles->model);
     load_contexts(&unit.contexts, tiles->model);
-    unit.symbols = output->symbols;
+    know_all(tiles, bands, count);
     decisions[first + 1] = 0;
     for (int64_t number = first; number >= 0; number--) {
         bits[number] = list_pass(&unit, bands, count, number, output->symbols + output->symbols_count);
@@ -188,7 +208,6 @@ int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_
             return -1;
         decisions[number] = unit.symbols - output->symbols;
     }
-    know_all(tiles, bands, count);
     uint32_t states[2] = {LOWEST_STATE, LOWEST_STATE};
     uint8_t *end = output->data + output->data_count, *begin = end;
     for (int64_t number = 0; number <= first; number++) {

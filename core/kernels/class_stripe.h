@@ -20,6 +20,7 @@ enum {
     CLASS_SIGNS = CLASS_REFINEMENT + 1,
     CLASS_FLAGS = CLASS_SIGNS + 15,
     CLASS_CONTEXTS = CLASS_FLAGS + 27,
+    KEPT_MAPS = 32, /* of the first stripes; the last one is that of all others */
 };
 
 _Static_assert((int)CLASS_CONTEXTS <= (int)MOST_CONTEXTS &&
@@ -32,13 +33,19 @@ static const uint8_t WITHIN[2 * BLOCK] = {255, 255, 255, 255, 255, 255, 255, 255
 static const uint8_t EVEN[BLOCK + 1] = {1, 0, 1, 0, 1, 0, 1, 0, 1};
 
 typedef uint16_t places_t __attribute__((vector_size(16)));
+typedef uint32_t units_of_four_t __attribute__((vector_size(16)));
 
-/* A unit while it is read, or written: then its decisions are kept. */
+/* A unit while it is read, or written: then its decisions are kept.
+ *
+ * What the first pass of a plane has seen of the first stripes of all bands is not looked at again in the second.
+ */
 struct unit {
     const struct tiles *tiles;
     struct contexts contexts;
     struct rans rans;
     symbol_t *symbols; /* where the next one will stand */
+    uint32_t seen;     /* a bit for each map that holds what this plane's first pass has seen */
+    struct class_map maps[KEPT_MAPS];
 };
 
 /* Code decisions in turn: of each the context and the bit stand at its place. */
@@ -73,6 +80,7 @@ LODE_INLINE uint8_t code_class_flag(bool reads, struct unit *unit, const struct 
 /* Of each column of a stripe whether its block is significant, and whether it became so in this pass: 255, else 0. */
 struct columns {
     uint8_t possible[STRIPE_COLUMNS], fresh[STRIPE_COLUMNS];
+    bool any_fresh;
 };
 
 /* Look at the blocks of a stripe, whose flags a second pass codes; whether any is significant. */
@@ -88,7 +96,10 @@ LODE_INLINE bool code_flags(bool reads, bool first_pass, struct unit *unit, cons
         if (!*flag && !first_pass) {
             struct block block = {stripe->top, stripe->left + left, stripe->rows, wide, 0};
             *flag = code_class_flag(reads, unit, band, &block, flag, plane);
-            memset(columns->fresh + left, *flag ? 255 : 0, BLOCK);
+            if (*flag) {
+                memset(columns->fresh + left, 255, BLOCK);
+                columns->any_fresh = true;
+            }
         }
         if (*flag) {
             memset(columns->possible + left, 255, (size_t)wide);
@@ -96,6 +107,17 @@ LODE_INLINE bool code_flags(bool reads, bool first_pass, struct unit *unit, cons
         }
     }
     return any;
+}
+
+/* Add bits of a plane, 0 or 1 a byte, to what is known of eight coefficients. */
+LODE_INLINE void add_bits(uint32_t *known, eight_t ones, int plane) {
+    uint8_t bits[BLOCK];
+    put_eight(bits, ones);
+    units_of_four_t low = {bits[0], bits[1], bits[2], bits[3]}, high = {bits[4], bits[5], bits[6], bits[7]}, now[2];
+    memcpy(now, known, sizeof now);
+    now[0] += low << (uint32_t)plane;
+    now[1] += high << (uint32_t)plane;
+    memcpy(known, now, sizeof now);
 }
 
 /* List the places of the 1s among eight bytes of 0 and 1 behind `many` others; how many there are then. Seven more
@@ -174,8 +196,8 @@ LODE_INLINE void take_bits(bool reads, bool first_pass, const struct tiles *tile
             if (!ones)
                 continue;
             int64_t at = stripe->first + i * band->stride + j;
-            for (int k = 0; k < BLOCK && reads; k++)
-                tiles->known[at + k] += (uint32_t)bits[place + k] << plane;
+            if (reads)
+                add_bits(tiles->known + at, ones, plane);
             eight_t new = ones & ~reaching(eight_at(map->weights[i + MARGIN] + MARGIN + j), 1);
             if (!new)
                 continue;
@@ -186,34 +208,47 @@ LODE_INLINE void take_bits(bool reads, bool first_pass, const struct tiles *tile
         }
 }
 
-/* The bits of a stripe that is written. */
+/* The bits of a stripe that is written, all of whose magnitudes are known. */
 static void stripe_bits(const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane,
                         const uint16_t *places, int many, uint8_t *bits) {
     for (int i = 0; i < many; i++) {
         int64_t at = stripe->first + places[i] / STRIPE_COLUMNS * band->stride + places[i] % STRIPE_COLUMNS;
-        bits[places[i]] = (uint8_t)(magnitude(tiles->truth[at]) >> plane & 1);
+        bits[places[i]] = (uint8_t)(tiles->known[at] >> plane & 1);
     }
 }
 
-/* Code the bits of a stripe whose blocks are not all insignificant, and their signs. */
-LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const struct band *band,
-                           const struct stripe *stripe, int plane, const struct columns *columns) {
-    const struct tiles *tiles = unit->tiles;
-    struct class_map map;
-    const uint32_t *parents = tiles->known + band->parent + (stripe->top >> band->row_shift) * band->parent_stride +
+/* What is known of a stripe, by its number in the pass. */
+LODE_INLINE const struct class_map *map_of(bool first_pass, struct unit *unit, const struct band *band,
+                                           const struct stripe *stripe, int64_t number, int plane,
+                                           const struct columns *columns) {
+    uint32_t kept = number < KEPT_MAPS - 1 ? UINT32_C(1) << number : 0;
+    struct class_map *map = &unit->maps[kept ? number : KEPT_MAPS - 1];
+    if (!first_pass && !columns->any_fresh && unit->seen & kept)
+        return map;
+    const uint32_t *parents = unit->tiles->known + band->parent +
+                              (stripe->top >> band->row_shift) * band->parent_stride +
                               (stripe->left >> band->column_shift);
-    see_stripe(tiles->early + stripe->first, band->stride, stripe, parents, band->parent_stride, band->row_shift,
-               band->column_shift, plane, columns->possible, &map);
+    see_stripe(unit->tiles->early + stripe->first, band->stride, stripe, parents, band->parent_stride, band->row_shift,
+               band->column_shift, plane, columns->possible, map);
+    unit->seen |= kept;
+    return map;
+}
+
+/* Code the bits of a stripe some of whose blocks are significant, and their signs. */
+LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const struct band *band,
+                           const struct stripe *stripe, int64_t number, int plane, const struct columns *columns) {
+    const struct tiles *tiles = unit->tiles;
+    const struct class_map *map = map_of(first_pass, unit, band, stripe, number, plane, columns);
     list_t visited, found[2];
-    int counts[2], many = list_visited(first_pass, &map, stripe, columns, visited);
+    int counts[2], many = list_visited(first_pass, map, stripe, columns, visited);
     if (many == 0)
         return;
     uint8_t bits[STRIPE_SIZE] = {0};
     if (!reads)
         stripe_bits(tiles, band, stripe, plane, visited, many, bits);
-    code_decisions(reads, unit, visited, many, map.context[0], bits);
+    code_decisions(reads, unit, visited, many, map->context[0], bits);
     adapt_all(&unit->contexts, 0, CLASS_SIGNS);
-    take_bits(reads, first_pass, tiles, band, stripe, plane, &map, bits, found, counts);
+    take_bits(reads, first_pass, tiles, band, stripe, plane, map, bits, found, counts);
     if (counts[0] + counts[1] == 0)
         return;
     code_signs(reads, unit, band, stripe, found[0], counts[0]);
@@ -221,12 +256,12 @@ LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const
     adapt_all(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
 }
 
-/* Code a stripe in a pass, without the raw bits. */
+/* Code a stripe, of which the number in the pass is given, without the raw bits. */
 LODE_INLINE void code_stripe(bool reads, bool first_pass, struct unit *unit, const struct band *band,
-                             const struct stripe *stripe, int plane) {
+                             const struct stripe *stripe, int64_t number, int plane) {
     struct columns columns;
     if (code_flags(reads, first_pass, unit, band, stripe, plane, &columns))
-        code_bits(reads, first_pass, unit, band, stripe, plane, &columns);
+        code_bits(reads, first_pass, unit, band, stripe, number, plane, &columns);
     if (!first_pass)
         adapt_all(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS);
 }
@@ -263,10 +298,7 @@ static int64_t read_raw(const struct tiles *tiles, const struct band *band, cons
             /* Each chosen byte keeps the bit that is its own, and becomes 1 if that is not 0. */
             eight_t own = coming * EACH & eight_at(RANKS[chosen]);
             own = (((own & 127 * EACH) + 127 * EACH) | own) >> 7 & EACH;
-            uint8_t ones[BLOCK];
-            put_eight(ones, own);
-            for (int k = 0; k < BLOCK; k++)
-                tiles->known[place + k] += (uint32_t)ones[k] << plane;
+            add_bits(tiles->known + place, own, plane);
         }
     return bits + at - start;
 }
@@ -283,11 +315,16 @@ static int64_t count_raw(const struct tiles *tiles, const struct band *band, con
     return bits;
 }
 
-/* Bits of a plane of eight coefficients in a row, 0 or 1 each. */
-LODE_INLINE eight_t true_bits(const int32_t *truth, int plane) {
+/* Bits of a plane of eight magnitudes in a row, 0 or 1 each. */
+LODE_INLINE eight_t bits_in(const uint32_t *magnitudes, int plane) {
+    units_of_four_t all[2];
+    memcpy(all, magnitudes, sizeof all);
+    units_of_four_t low = all[0] >> (uint32_t)plane & 1, high = all[1] >> (uint32_t)plane & 1;
     uint8_t bits[BLOCK];
-    for (int k = 0; k < BLOCK; k++)
-        bits[k] = (uint8_t)(magnitude(truth[k]) >> plane & 1);
+    for (int k = 0; k < BLOCK / 2; k++) {
+        bits[k] = (uint8_t)low[k];
+        bits[k + BLOCK / 2] = (uint8_t)high[k];
+    }
     return eight_at(bits);
 }
 
@@ -300,7 +337,7 @@ static int64_t write_raw(const struct tiles *tiles, const struct band *band, con
             uint32_t chosen = bits_of(refined_in(tiles->early + place, plane, stripe->columns - j));
             if (!chosen)
                 continue;
-            eight_t ones = true_bits(tiles->truth + place, plane);
+            eight_t ones = bits_in(tiles->known + place, plane);
             uint32_t coming = (uint32_t)((255 * ones & eight_at(RANKS[chosen])) * EACH >> 56) << (bits & 7);
             uint8_t *byte = data + (bits >> 3);
             byte[0] |= (uint8_t)coming;
