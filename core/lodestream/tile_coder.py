@@ -39,6 +39,8 @@ class Channel:
 class TileCoder:
     """Codes the tiles of all channels, plane after plane, as a reader will meet them.
 
+    All passes of a large unit are coded when the first ones are asked for: its parents must be coded whole by then.
+
     Parameters
     ----------
     tables : list of TileTable, one a channel
