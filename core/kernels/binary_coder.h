@@ -16,10 +16,10 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "inlining.h"
 #include "lodestream.h"
 #include "tables.h"
 
-#define LODE_INLINE static inline __attribute__((always_inline))
 #define SELDOM(condition) __builtin_expect(condition, 0)
 
 enum { MOST_ADAPTED = 127 };

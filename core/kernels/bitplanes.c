@@ -76,6 +76,9 @@ static bool band_fits(const int64_t *fields, int64_t size, int64_t flags) {
            band.parent + parent_row * band.parent_stride + parent_column + WIDE <= size;
 }
 
+/* Raw bits of a pass, each of a coefficient: no array has as many. */
+#define MOST_BITS (INT64_C(1) << 48)
+
 /* Passes of one tile: a row of the table of runs. */
 struct run {
     int64_t band, bands, model, first, last, start, length, large;
@@ -96,7 +99,7 @@ static bool run_fits(const struct run *run, int64_t bands, int64_t models, int64
     return run->band >= 0 && run->bands >= 0 && run->band <= bands && run->bands <= bands - run->band &&
            run->model >= 0 && run->model < models && run->last >= 0 && run->last < MOST_PASSES && run->first >= -1 &&
            run->first < MOST_PASSES && (costs == 0 || run->first < costs) && run->start >= 0 && run->length >= 0 &&
-           run->start <= data && run->length <= data - run->start;
+           run->start <= data && run->length <= data - run->start && (run->large & ~INT64_C(1)) == 0;
 }
 
 /* Where the walk stands: the run, and in it passes that are done, band, block, state of the trellis. */
@@ -143,14 +146,25 @@ static bool go_on(bool reads, const struct run *run, const struct position *at, 
            coder_can_go_on(reads, coder);
 }
 
-/* Where the walk over a large unit stood, from what was kept; whether that can be. */
-static bool find_place(const struct run *run, const int64_t *state, struct class_place *place) {
-    if (!(place->passes || place->band || place->stripe))
-        return true;
-    place->bytes = state[AT_PLACE];
-    place->bits = state[AT_LOW];
-    return place->passes >= 0 && place->band >= 0 && place->stripe >= 0 && place->bytes >= 0 &&
-           place->bytes <= run->length && place->bits >= 0 && place->bits < INT64_C(1) << 40;
+enum outcome { DONE, PAUSED, REFUSED };
+
+/* Go on with a run of a large unit until it is done or the budget is spent. */
+static enum outcome read_large(const struct run *run, const struct tiles *tiles, const int64_t *bands,
+                               const uint8_t *data, struct position *at, int64_t *state, int64_t *budget) {
+    struct class_place place = {at->passes, at->band, at->block, 0, 0};
+    if (at->passes || at->band || at->block) {
+        place.bytes = state[AT_PLACE];
+        place.bits = state[AT_LOW];
+    }
+    if (place.passes < 0 || place.band < 0 || place.stripe < 0 || place.bytes < 0 || place.bytes > run->length ||
+        place.bits < 0 || place.bits > MOST_BITS)
+        return REFUSED;
+    bool done = lode_class_read(tiles, bands + run->band * BAND_FIELDS, run->bands, run->first, run->last,
+                                data + run->start, run->length, &place, budget);
+    *at = (struct position){at->run, place.passes, place.band, place.stripe, 0};
+    state[AT_PLACE] = place.bytes;
+    state[AT_LOW] = place.bits;
+    return done ? DONE : PAUSED;
 }
 
 int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
@@ -175,27 +189,22 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
             if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
                 return LODE_REFUSED;
         struct tiles tiles = {(uint32_t *)known, sign, flags, early, truth, models + run.model * model};
-        if (run.large) {
-            if (trellis)
+        if (run.large && trellis)
+            return LODE_REFUSED;
+        if (run.large && reads) {
+            enum outcome outcome = read_large(&run, &tiles, bands, data, &at, state, &budget);
+            if (outcome == REFUSED)
                 return LODE_REFUSED;
-            if (reads) {
-                struct class_place place = {at.passes, at.band, at.block, 0, 0};
-                if (!find_place(&run, state, &place))
-                    return LODE_REFUSED;
-                bool done = lode_class_read(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, run.last,
-                                            data + run.start, run.length, &place, &budget);
-                state[AT_PLACE] = place.bytes;
-                state[AT_LOW] = place.bits;
-                if (done)
-                    continue;
-                at = (struct position){at.run, place.passes, place.band, place.stripe, 0};
+            if (outcome == PAUSED)
                 break;
-            }
+            continue;
+        }
+        if (run.large) {
             struct class_output output = {symbols, symbols_count, data + run.start, run.length, costs};
-            if (run.last != 0 || run.first >= costs_count)
-                return LODE_REFUSED;
-            fields[LODE_RUN_LENGTH] =
-                lode_class_write(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, &output);
+            fields[LODE_RUN_LENGTH] = -1;
+            if (run.first >= 0 && run.last == 0 && run.first < costs_count)
+                fields[LODE_RUN_LENGTH] =
+                    lode_class_write(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, &output, &budget);
             if (fields[LODE_RUN_LENGTH] < 0)
                 return LODE_REFUSED;
             continue;

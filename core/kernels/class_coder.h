@@ -30,8 +30,9 @@ struct class_output {
 bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t count, int64_t first, int64_t last,
                      const uint8_t *data, int64_t size, struct class_place *at, int64_t *budget);
 
-/* Write all passes of a unit from `first` on; the bytes of its string, or -1 where there is no room. */
+/* Write all passes of a unit from `first` on, whatever the budget, which becomes less; the bytes of its string, or -1
+ * where there is no room. */
 int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_t count, int64_t first,
-                         const struct class_output *output);
+                         const struct class_output *output, int64_t *budget);
 
 #endif

@@ -35,10 +35,10 @@ struct class_map {
     uint8_t context[STRIPE_ROWS][STRIPE_COLUMNS]; /* of significance; CLASSES for a refinement */
 };
 
-/* What the parents of a row of the stripe add to what is far. */
+/* What the parents of a row of the stripe add to what is far; nothing where there are none. */
 LODE_INLINE void sum_parents(const uint8_t *above, const uint8_t *own, const uint8_t *below, int columns, int shift,
                              uint8_t *sums) {
-    uint8_t of[STRIPE_COLUMNS];
+    uint8_t of[STRIPE_COLUMNS] = {0};
     int count = ((columns - 1) >> shift) + 1;
     for (int j = 0; j < count; j++) {
         uint8_t around = (uint8_t)(above[j + 1] + own[j] + own[j + 2] + below[j + 1]), self = own[j + 1];

@@ -322,8 +322,8 @@ LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const in
  *           large unit.
  * costs:    empty; or the bits that were written when each pass had ended, by its number. Not empty where a large unit
  *           is written.
- * symbols:  where large units are written, room for the decisions of any of them, and for a stripe's more: of n
- *           coefficients in p planes n (p + 2) + n p / 8 + 2048.
+ * symbols:  where large units are written, room for the decisions of any of them: n (p + 2) + 2048 of n coefficients in
+ *           p planes.
  * state:    LODE_PASSES_STATE numbers, zeros at first, handed on from call to call.
  * budget:   about so many coefficients are looked at in a call, at least one block.
  *

@@ -11,17 +11,16 @@
 #include <stdint.h>
 
 #include "copying.h"
-
-#ifndef LODE_INLINE
-#define LODE_INLINE static inline __attribute__((always_inline))
-#endif
+#include "inlining.h"
 
 enum {
     PROBABILITY_BITS = 12,
     PROBABILITY_RANGE = 1 << PROBABILITY_BITS,
-    STATE_BYTES = 8,
-    MOST_IN_RUN = 512, /* decisions between two changes of probabilities */
-    WORD = 2,          /* bytes */
+    WORD = 2,          /* bytes of a word, */
+    STATE_BYTES = 8,   /* and of two states */
+    MOST_IN_RUN = 512, /* decisions that are coded in turn */
+    MOST_COUNT = 127,  /* adaptation count */
+    MOST_CONTEXTS = 128,
 };
 
 #define LOWEST_STATE (UINT32_C(1) << 16)
@@ -34,10 +33,10 @@ struct rans {
 
 /* A context: the probability of a 1 over 2^16, an adaptation count, and what the coder takes. */
 struct contexts {
-    uint16_t probability[128];
-    uint8_t adapted[128];
-    uint16_t coded[128];   /* the probability over 2^12, neither 0 nor 1 */
-    uint32_t counted[128]; /* decisions of this run, and above 16 bits the 1s among them */
+    uint16_t probability[MOST_CONTEXTS];
+    uint8_t adapted[MOST_CONTEXTS];
+    uint16_t coded[MOST_CONTEXTS];   /* the probability over 2^12, neither 0 nor 1 */
+    uint32_t counted[MOST_CONTEXTS]; /* decisions since the last change, and above 16 bits the 1s among them */
 };
 
 static inline void set_coded(struct contexts *contexts, int number) {
@@ -45,19 +44,27 @@ static inline void set_coded(struct contexts *contexts, int number) {
     contexts->coded[number] = (uint16_t)(coded ? coded : 1);
 }
 
-/* Move a probability towards the share of 1s in a run: each decision counts like one of those before. */
+/* Count a decision. */
+static inline void count(struct contexts *contexts, int number, int bit) {
+    contexts->counted[number] += 1 + ((uint32_t)bit << 16);
+}
+
+/* Move a probability towards the share of 1s among the counted decisions, each of which weighs as much as one before.
+ */
 static inline void adapt(struct contexts *contexts, int number) {
     uint32_t counted = contexts->counted[number];
     contexts->counted[number] = 0;
-    int32_t decisions = counted & 0xFFFF, ones = (int32_t)(counted >> 16), adapted = contexts->adapted[number];
+    int32_t decisions = (int32_t)(counted & 0xFFFF), ones = (int32_t)(counted >> 16),
+            adapted = contexts->adapted[number];
     int32_t probability = contexts->probability[number], rate = (1 << 17) / (2 * (adapted + decisions) + 1);
     int64_t change = ((int64_t)((ones << 16) - decisions * probability) * rate) >> 16;
     contexts->probability[number] = (uint16_t)(probability + change);
     adapted += decisions;
-    contexts->adapted[number] = (uint8_t)(adapted < MOST_ADAPTED ? adapted : MOST_ADAPTED);
+    contexts->adapted[number] = (uint8_t)(adapted < MOST_COUNT ? adapted : MOST_COUNT);
     set_coded(contexts, number);
 }
 
+/* Read a bit; `at` moves by a word where the state takes one. */
 LODE_INLINE int read_bit(uint32_t *state, const uint8_t **at, uint32_t probability) {
     uint32_t x = *state, part = x & (PROBABILITY_RANGE - 1), below = (x >> PROBABILITY_BITS) * probability;
     uint32_t one = below + part, zero = x - below - probability;
@@ -81,13 +88,14 @@ struct run {
     uint8_t rest[MOST_IN_RUN * WORD + WORD];
 };
 
-LODE_INLINE void begin_run(struct run *run, int count) {
+/* Begin a run of so many decisions, at most MOST_IN_RUN. */
+LODE_INLINE void begin_run(struct run *run, int many) {
     struct rans *rans = run->rans;
     run->even = rans->next;
     run->odd = rans->other;
     run->at = rans->at;
     run->left = rans->end - rans->at;
-    run->copied = run->left < WORD * (count + 1);
+    run->copied = run->left < WORD * (many + 1);
     if (run->copied) {
         memset(run->rest, 0, sizeof run->rest);
         memcpy(run->rest, rans->at, (size_t)run->left);
@@ -112,15 +120,15 @@ LODE_INLINE void end_run(struct run *run) {
 }
 
 /* Read the bits of a run: of each decision the context and the bit stand at its place. */
-static void read_run(struct rans *rans, struct contexts *contexts, const uint16_t *places, int count,
+static void read_run(struct rans *rans, struct contexts *contexts, const uint16_t *places, int many,
                      const uint8_t *context, uint8_t *bits) {
     struct run run;
     run.rans = rans;
-    begin_run(&run, count);
-    for (int i = 0; i < count; i++) {
+    begin_run(&run, many);
+    for (int i = 0; i < many; i++) {
         int place = places[i], number = context[place], bit = next_bit(&run, contexts->coded[number]);
         bits[place] = (uint8_t)bit;
-        contexts->counted[number] += 1 + ((uint32_t)bit << 16);
+        count(contexts, number, bit);
     }
     end_run(&run);
 }
@@ -128,29 +136,37 @@ static void read_run(struct rans *rans, struct contexts *contexts, const uint16_
 /* A decision that was taken, until it is written: its probability, and above 15 bits whether it is a 1. */
 typedef uint16_t symbol_t;
 
-static inline symbol_t *keep_run(symbol_t *to, struct contexts *contexts, const uint16_t *places, int count,
-                                 const uint8_t *context, const uint8_t *bits) {
-    for (int i = 0; i < count; i++) {
-        int place = places[i], number = context[place], bit = bits[place];
-        to[i] = (symbol_t)(contexts->coded[number] | bit << 15);
-        contexts->counted[number] += 1 + ((uint32_t)bit << 16);
-    }
-    return to + count;
+static inline symbol_t symbol_of(const struct contexts *contexts, int number, int bit) {
+    return (symbol_t)(contexts->coded[number] | bit << 15);
 }
 
+/* Keep the decisions of a run; where the next one will stand. */
+static inline symbol_t *keep_run(symbol_t *to, struct contexts *contexts, const uint16_t *places, int many,
+                                 const uint8_t *context, const uint8_t *bits) {
+    for (int i = 0; i < many; i++) {
+        int place = places[i], number = context[place], bit = bits[place];
+        to[i] = symbol_of(contexts, number, bit);
+        count(contexts, number, bit);
+    }
+    return to + many;
+}
+
+/* The state before a decision from that after it, x. It may give a word to the bytes before `end`; two of these are
+ * overwritten in any case. */
 LODE_INLINE uint32_t write_symbol(symbol_t symbol, uint32_t x, uint8_t **end) {
     uint32_t probability = symbol & (PROBABILITY_RANGE - 1), zero = (symbol >> 15) - 1u;
-    uint32_t width = (probability ^ zero) + (zero & (PROBABILITY_RANGE + 1)), low;
+    uint32_t width = (probability ^ zero) + (zero & (PROBABILITY_RANGE + 1));
     (*end)[-2] = (uint8_t)x;
     (*end)[-1] = (uint8_t)(x >> 8);
-    low = 0 - (uint32_t)(x >= width << (32 - PROBABILITY_BITS));
-    *end -= low & WORD;
-    x >>= low & 16;
+    uint32_t high = 0 - (uint32_t)(x >= width << (32 - PROBABILITY_BITS));
+    *end -= high & WORD;
+    x >>= high & 16;
     uint32_t quotient = x / width;
     return (quotient << PROBABILITY_BITS) + (x - quotient * width) + (zero & probability);
 }
 
-/* Write decisions backwards, from the last to the first, to the bytes before `end`; where they begin. */
+/* Write the decisions from number `first` to the one before `last`, backwards, to the bytes before `end`; where they
+ * begin. Those of even numbers take the first state. */
 static uint8_t *write_symbols(const symbol_t *symbols, int64_t first, int64_t last, uint32_t states[2], uint8_t *end) {
     int64_t i = last;
     if (i > first && i & 1) {

@@ -1,22 +1,44 @@
-"""Writes ``tables.h``: by how much contexts adapt (docs/format.md, "Contexts"), and logarithms, for encoders only.
+"""Writes ``tables.h`` and ``class_tables.h``: constants of the coders (docs/format.md, section 7), and logarithms, for
+encoders only.
 
-``python core/kernels/tables.py`` makes it again.
+``python core/kernels/tables.py`` makes them again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from decimal import Decimal, getcontext
 from pathlib import Path
 
-TABLES = Path(__file__).with_name("tables.h")
+_HERE = Path(__file__).parent
 
 _MOST_ADAPTED = 127
 _LOGARITHMS = 256
+
+#: Of a large unit's contexts before its first pass: the probabilities of a 1 over 2**16, and the adaptation count.
+_CLASS_STARTS = {
+    "significance": """
+        1769 6269 10941 17037 22777 15303 12725 16197 21319 25579 22090 19291 22284 26014 30911 24483 24690 26193
+        28805 33543 37136 21576 21544 29250 40871
+    """,
+    "refinement": "17460",
+    "signs": "29848 28496 30599 33607 30402 31139 33249 37776 33696 34465 34348 32465 35933 32560 31473",
+    "flags": """
+        873 5445 19444 9223 22512 37850 16482 23482 41024 9867 20496 43481 14984 37936 58064 18912 40816 56828 21977
+        44089 58982 19476 54276 63525 15755 53595 63560
+    """,
+}
+_STARTING_COUNT = 6
 
 
 def rates() -> list[int]:
     """By what part a context with the adaptation count n moves, over 2**16: 2**16 / (n + 3/2), rounded down."""
     return [2**17 // (2 * count + 3) for count in range(_MOST_ADAPTED + 1)]
+
+
+def class_starts() -> list[int]:
+    """Probabilities of a large unit's contexts before its first pass, over 2**16, by number."""
+    return [int(number) for numbers in _CLASS_STARTS.values() for number in numbers.split()]
 
 
 def logarithms() -> list[int]:
@@ -27,33 +49,69 @@ def logarithms() -> list[int]:
     return [int(entry.to_integral_value()) for entry in entries]
 
 
-def _array(name: str, ctype: str, comment: str, values: list[int], suffix: str = "") -> str:
+def set_bits() -> list[list[int]]:
+    """For each byte the numbers of the bits that are 1, rising, and zeros behind them."""
+    numbers = ([bit for bit in range(8) if byte >> bit & 1] for byte in range(256))
+    return [found + [0] * (8 - len(found)) for found in numbers]
+
+
+def ranks() -> list[list[int]]:
+    """For each byte and each of its bits that are 1 the power of two by how many of the lower bits are; else 0."""
+    return [
+        [1 << (byte & ((1 << bit) - 1)).bit_count() if byte >> bit & 1 else 0 for bit in range(8)]
+        for byte in range(256)
+    ]
+
+
+def _lines(entries: Sequence[str]) -> str:
     lines, line = [], "   "
-    for value in values:
-        entry = f" {value}{suffix},"
-        if len(line) + len(entry) > 120:
+    for entry in entries:
+        if len(line) + len(entry) + 2 > 120:
             lines.append(line)
             line = "   "
-        line += entry
-    return f"/* {comment} */\nstatic const {ctype} {name}[{len(values)}] = {{\n" + "\n".join([*lines, line]) + "\n};\n"
+        line += f" {entry},"
+    return "\n".join([*lines, line])
 
 
-def text() -> str:
-    """All of the header."""
+def _array(name: str, ctype: str, comment: str, values: list[int] | list[list[int]]) -> str:
+    entries = [f"{{{', '.join(map(str, value))}}}" if isinstance(value, list) else str(value) for value in values]
+    lengths = f"[{len(values)}]" + (f"[{len(values[0])}]" if isinstance(values[0], list) else "")
+    return f"/* {comment} */\nstatic const {ctype} {name}{lengths} = {{\n{_lines(entries)}\n}};\n"
+
+
+def _header(name: str, *parts: str) -> str:
+    guard = f"LODE_{name.upper()}_H"
     return "\n".join(
         [
             "/* Made by tables.py, which says what each table is. */",
             "/* clang-format off */",
-            "#ifndef LODE_TABLES_H",
-            "#define LODE_TABLES_H\n",
+            f"#ifndef {guard}",
+            f"#define {guard}\n",
             "#include <stdint.h>\n",
-            _array("RATES", "uint16_t", "By adaptation count, over 2^16.", rates()),
-            _array("LOGARITHMS", "int64_t", "2^32 log2(1 + i / 256).", logarithms()),
+            *parts,
             "#endif",
             "/* clang-format on */\n",
         ]
     )
 
 
+def headers() -> dict[Path, str]:
+    """The headers and all that is in them."""
+    texts = {
+        "tables": [
+            _array("RATES", "uint16_t", "By adaptation count, over 2^16.", rates()),
+            _array("LOGARITHMS", "int64_t", "2^32 log2(1 + i / 256).", logarithms()),
+        ],
+        "class_tables": [
+            f"enum {{ STARTING_COUNT = {_STARTING_COUNT} }};\n",
+            _array("CLASS_STARTS", "uint16_t", "By context, over 2^16.", class_starts()),
+            _array("SET_BITS", "uint16_t", "By byte: the numbers of its 1s.", set_bits()),
+            _array("RANKS", "uint8_t", "By byte: for each 1 the bit that has its rank among them.", ranks()),
+        ],
+    }
+    return {_HERE / f"{name}.h": _header(name, *parts) for name, parts in texts.items()}
+
+
 if __name__ == "__main__":
-    TABLES.write_text(text())
+    for path, text in headers().items():
+        path.write_text(text)

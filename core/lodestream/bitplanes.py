@@ -32,7 +32,16 @@ from numpy.typing import NDArray
 from . import kernels
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 
-__all__ = ["BLOCK", "PADDING", "code_passes", "new_models", "pass_count", "pass_gains", "reconstruction_point", "symbols_room"]
+__all__ = [
+    "BLOCK",
+    "PADDING",
+    "code_passes",
+    "new_models",
+    "pass_count",
+    "pass_gains",
+    "reconstruction_point",
+    "symbols_room",
+]
 
 #: Rows and columns of a block.
 BLOCK = 8
@@ -60,7 +69,7 @@ def new_models(count: int, trellis: bool = False, large: int | None = None) -> N
 
 def symbols_room(coefficients: int, planes: int) -> int:
     """Room for the decisions of a large unit that is written, in numbers of uint16."""
-    return coefficients * (planes + 2) + coefficients * planes // 8 + 2048
+    return coefficients * (planes + 2) + 2048
 
 
 def code_passes(

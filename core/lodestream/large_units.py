@@ -20,9 +20,7 @@ _LARGE = 1 << 15
 _MOST, _TRIED = 1.05, 2
 
 
-def large_level(
-    tables: list[TileTable], channels: list[Channel], geometric: int, quantiser: Quantiser | None
-) -> int:
+def large_level(tables: list[TileTable], channels: list[Channel], geometric: int, quantiser: Quantiser | None) -> int:
     """The coarsest level whose units should be large; 0: none should. Parameters are those of `TileCoder`."""
     layout = tables[0].layout
     level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)

@@ -208,7 +208,9 @@ class Reconstruction:
             table = TileTable.of(header.layout)
             other = TileTable.of(header.layout, False) if header.layout.shared else table
             self._tiles = [
-                Tiles(table, header.quantiser, header.large) if channel < header.geometric else Tiles(other, None, header.large)
+                Tiles(table, header.quantiser, header.large)
+                if channel < header.geometric
+                else Tiles(other, None, header.large)
                 for channel in range(header.channels)
             ]
         return self._tiles

@@ -39,6 +39,8 @@ class Channel:
 class TileCoder:
     """Codes the tiles of all channels, plane after plane, as a reader will meet them.
 
+    All passes of a large unit are coded when the first ones are asked for: its parents must be coded whole by then.
+
     Parameters
     ----------
     tables : list of TileTable, one a channel
@@ -86,9 +88,7 @@ class TileCoder:
         tiles.code(False, run, self._channels[channel].true, data, np.zeros(0) if costs is None else costs)
         return data[: run[0, 6]].tobytes()
 
-    def _of_string(
-        self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None
-    ) -> bytes:
+    def _of_string(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None) -> bytes:
         """Passes of a large unit, all of which are coded at once. A segment has at least one byte."""
         if (tile, channel) not in self.strings:
             self.strings[tile, channel] = self._string(tile, channel)

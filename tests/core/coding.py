@@ -5,6 +5,7 @@ What stands between the tests and the coder's insides: these two functions are a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
@@ -55,23 +56,23 @@ def passes_of(layout: Layout, coefficients: Ints) -> list[int]:
     return [pass_count(planes) for planes in planes_of(layout, coefficients)]
 
 
-def encode_runs(layout: Layout, channels: list[Ints], runs: Runs) -> list[Coded]:
-    """Code runs of passes, one after another."""
+def encode_runs(layout: Layout, channels: list[Ints], runs: Runs, large: int = 0) -> list[Coded]:
+    """Code runs of passes, one after another; of large units, which are coded whole, parents first."""
     table = TileTable.of(layout)
-    bands = np.ones(len(table.bands))
-    coder = TileCoder(
-        [table] * len(channels),
-        [Channel(gather(table, [c]), bands, np.array(planes_of(layout, c), np.int8)) for c in channels],
-        len(channels),
-        None,
-    )
+    bands, counts = np.ones(len(table.bands)), [passes_of(layout, c) for c in channels]
+    coded = [Channel(gather(table, [c]), bands, np.array(planes_of(layout, c), np.int8)) for c in channels]
+    whole, coder = (TileCoder([table] * len(channels), coded, len(channels), None, large) for _ in range(2))
+    for tile, channel in itertools.product(range(len(layout.tiles)), range(len(channels))):
+        if large and counts[channel][tile]:
+            whole.code(tile, channel, counts[channel][tile], counts[channel][tile])
+    coder.strings = whole.strings
     return [
         Coded(tile, channel, first, passes, coder.code(tile, channel, first + 1, passes), 0)
         for tile, channel, first, passes in runs
     ]
 
 
-def header_for(layout: Layout, channels: int) -> Header:
+def header_for(layout: Layout, channels: int, large: int = 0) -> Header:
     """A header of int32 values that are their own lattice coordinates."""
     return Header(
         dtype=np.dtype(np.int32),
@@ -86,15 +87,18 @@ def header_for(layout: Layout, channels: int) -> Header:
         empty=(0,) * channels,
         tile=layout.tile,
         piece=(6, 6),
+        large=large,
         exact=False,
         corrected=False,
         layer_count=1,
     )
 
 
-def decode_runs(layout: Layout, channels: int, coded: Iterable[Coded], state: list[list[int]]) -> list[Ints]:
+def decode_runs(
+    layout: Layout, channels: int, coded: Iterable[Coded], state: list[list[int]], large: int = 0
+) -> list[Ints]:
     """Coefficients after the runs, as they are known when ``state[tile][channel]`` passes remain."""
-    reader = Reconstruction(header_for(layout, channels))
+    reader = Reconstruction(header_for(layout, channels, large))
     for segment in coded:
         reader.add(segment)
     reader._decode(reader.length)

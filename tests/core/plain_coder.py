@@ -1,4 +1,7 @@
-"""The embedded coder in plain Python, both ends: what the kernel is compared with. See docs/format.md, section 7."""
+"""The embedded coder in plain Python, both ends, and the reading end of large units: what the kernel is compared with.
+
+See docs/format.md, section 7.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from lodestream.band_fields import (
     STRIDE,
 )
 
-__all__ = ["PlainTile", "RangeCoder"]
+__all__ = ["PlainLargeUnit", "PlainTile", "RangeCoder"]
 
 _AROUND = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if i or j]
 _NEAR = [(i, j) for i, j in _AROUND if max(abs(i), abs(j)) == 1]
@@ -182,3 +185,147 @@ class PlainTile:
         flip = total < 0
         bit = self._alone(("sign", abs(total), max(kind - 1, 0)), int(true < 0) ^ flip) ^ flip
         self.sign[at] = -1 if bit else 1
+
+
+_STARTS = """
+    1769 6269 10941 17037 22777 15303 12725 16197 21319 25579 22090 19291 22284 26014 30911 24483 24690 26193 28805
+    33543 37136 21576 21544 29250 40871 17460 29848 28496 30599 33607 30402 31139 33249 37776 33696 34465 34348
+    32465 35933 32560 31473 873 5445 19444 9223 22512 37850 16482 23482 41024 9867 20496 43481 14984 37936 58064
+    18912 40816 56828 21977 44089 58982 19476 54276 63525 15755 53595 63560
+"""
+_REFINEMENT, _SIGN, _FLAG = 25, 26, 41
+
+
+class PlainLargeUnit:
+    """A large unit that is read, in the flat arrays that a table of bands describes."""
+
+    def __init__(self, bands: NDArray[np.int64], size: int, flag_count: int) -> None:
+        self.bands = bands
+        self.known, self.sign = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.early, self.flags = np.zeros(size, np.int64), np.zeros(flag_count, np.int64)
+        self.contexts = [[int(start), 6] for start in _STARTS.split()]
+        self._counted: dict[int, list[int]] = defaultdict(list)
+        self._states: list[int] = []
+
+    def read(self, first: int, last: int, data: bytes) -> None:
+        """Read the passes of a segment."""
+        self._data, self._place = data, 0
+        if not self._states:
+            self._states = [max(self._number(4), 2**16) for _ in range(2)]
+        for number in range(first, last - 1, -1):
+            if number & 1:
+                self.contexts = [[p, min(n, 16)] for p, n in self.contexts]
+            for band in self.bands.tolist():
+                classes = self._classes(band, number >> 1)  # no bit of this pass changes them
+                for stripe in self._stripes(band):
+                    self._stripe(band, number, *stripe, *classes)
+            if not number & 1:
+                self._raw(number >> 1)
+
+    def _number(self, count: int) -> int:
+        self._place += count
+        return int.from_bytes(self._data[self._place - count : self._place].ljust(count, b"\0"), "little")
+
+    @staticmethod
+    def _stripes(band: list[int]) -> list[tuple[range, range]]:
+        """Rows and columns of each."""
+        tops, lefts = range(0, band[ROWS], 8), range(0, band[COLUMNS], 64)
+        return [
+            (range(top, min(top + 8, band[ROWS])), range(left, min(left + 64, band[COLUMNS])))
+            for top in tops
+            for left in lefts
+        ]
+
+    def _decide(self, context: int) -> int:
+        state, other = self._states
+        chance = max(self.contexts[context][0] >> 4, 1)
+        rest, bit = state & 4095, int(state & 4095 < chance)
+        state = chance * (state >> 12) + rest if bit else (4096 - chance) * (state >> 12) + rest - chance
+        self._states = [other, (state << 16) + self._number(2) if state < 2**16 else state]
+        self._counted[context].append(bit)
+        return bit
+
+    def _adapt(self) -> None:
+        for context, bits in self._counted.items():
+            (p, n), k = self.contexts[context], len(bits)
+            p += (65536 * sum(bits) - k * p) * (2**17 // (2 * n + 2 * k + 1)) >> 16
+            self.contexts[context] = [p, min(n + k, 127)]
+        self._counted.clear()
+
+    @staticmethod
+    def _places(band: list[int], margin: int = 0) -> NDArray[np.int64]:
+        rows, columns = (np.arange(-margin, band[axis] + margin) for axis in (ROWS, COLUMNS))
+        return np.asarray(band[OFFSET] + rows[:, None] * band[STRIDE] + columns)
+
+    @staticmethod
+    def _parents(band: list[int]) -> NDArray[np.int64]:
+        rows, columns = np.arange(band[ROWS])[:, None], np.arange(band[COLUMNS])
+        down, across = rows >> band[ROW_SHIFT], columns >> band[COLUMN_SHIFT]
+        return np.asarray(band[PARENT] + down * band[PARENT_STRIDE] + across)
+
+    def _classes(self, band: list[int], plane: int) -> tuple[NDArray[np.int64], ...]:
+        """m of each coefficient of a band, and its two classes."""
+        m = np.minimum(self.known[self._places(band, 2)] >> (plane + 1), 2)
+        weights = np.array([0, 2, 3])[m]
+        near, far = np.zeros((2, band[ROWS], band[COLUMNS]), np.int64)
+        for i in range(-2, 3):
+            for j in range(-2, 3):
+                weight = weights[2 + i : 2 + i + band[ROWS], 2 + j : 2 + j + band[COLUMNS]]
+                if max(abs(i), abs(j)) == 1:
+                    near += weight * (2 if i and j else 3)
+                elif i or j:
+                    far += weight * (1 if i and j else 2)
+        parents, stride = self._parents(band), band[PARENT_STRIDE]
+        beside = sum(self.known[parents + step] >> plane for step in (-1, 1, -stride, stride))
+        far += 3 * np.minimum(self.known[parents] >> plane, 4) + np.minimum(beside, 12)
+        classes = [
+            sum((total >= limit).astype(np.int64) for limit in limits)
+            for total, limits in (
+                (near, (1, 6, 13, 24)),
+                (far, (1, 4, 9, 18)),
+            )
+        ]
+        return m[2:-2, 2:-2], *classes
+
+    def _stripe(self, band: list[int], number: int, rows: range, columns: range, *classes: NDArray[np.int64]) -> None:
+        plane, second, across = number >> 1, not number & 1, (band[COLUMNS] + 7) // 8
+        m, a, b = classes
+        row, fresh = band[FLAGS] + rows[0] // 8 * (across + 1), set()
+        for block in range(columns[0] // 8, columns[-1] // 8 + 1):
+            if second and not self.flags[row + block]:
+                inside = np.s_[rows[0] : rows[-1] + 1, 8 * block : 8 * block + 8]
+                family = int(np.bitwise_or.reduce(self.known[self._parents(band)[inside]], None)) >> plane
+                before, after = (
+                    int(self.flags[row + block + s]) + int(self.flags[row + block + s * (across + 1)]) for s in (-1, 1)
+                )
+                self.flags[row + block] = self._decide(_FLAG + (3 * before + after) * 3 + min(family, 2))
+                fresh |= {block} if self.flags[row + block] else set()
+        found = []
+        for i in rows:
+            for j in columns:
+                visits = (a[i, j] == 0 or j // 8 in fresh) if second else a[i, j] > 0
+                if not self.flags[row + j // 8] or m[i, j] > 1 or (not second if m[i, j] else not visits):
+                    continue
+                at = band[OFFSET] + i * band[STRIDE] + j
+                if self._decide(_REFINEMENT if m[i, j] else int(5 * a[i, j] + b[i, j])):
+                    self.known[at] += 1 << plane
+                    found += [] if m[i, j] else [((i + j) % 2, i, j, at)]
+        for *_, at in sorted(found):
+            self.early[at] = plane + 1 + 128 * second
+            x, y = (int(np.sign(self.sign[at - d] + self.sign[at + d])) for d in (1, band[STRIDE]))
+            total = 3 * y + x if band[KIND] == 2 else 3 * x + y
+            bit = self._decide(_SIGN + 3 * abs(total) + max(band[KIND], 1) - 1) ^ (total < 0)
+            self.sign[at] = -1 if bit else 1
+        self._adapt()
+
+    def _raw(self, plane: int) -> None:
+        bits = 8 * self._place
+        for band in self.bands.tolist():
+            places = self._places(band)
+            for rows, columns in self._stripes(band):
+                for at in places[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].ravel():
+                    if self.known[at] >> (plane + 1) > 1:
+                        byte = self._data[bits >> 3] if bits >> 3 < len(self._data) else 0
+                        self.known[at] += (byte >> (bits & 7) & 1) << plane
+                        bits += 1
+        self._place = (bits + 7) >> 3

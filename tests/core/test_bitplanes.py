@@ -58,6 +58,7 @@ def random_runs(
     count=st.integers(1, 3),
     bits=st.integers(0, COEFFICIENT_BITS),
     density=st.sampled_from([0.01, 0.2, 1.0]),
+    large=st.integers(0, 3),
     seed=st.integers(0, 2**32),
 )
 def test_any_coefficients_come_back_in_runs_split_anyhow(
@@ -67,37 +68,41 @@ def test_any_coefficients_come_back_in_runs_split_anyhow(
     count: int,
     bits: int,
     density: float,
+    large: int,
     seed: int,
 ) -> None:
     layout = Layout.single(shape, closed, tile)
     channels = [coefficients(shape, bits, density, seed + n) for n in range(count)]
     runs, end = random_runs(np.random.default_rng(seed), layout, channels)
-    coded = encode_runs(layout, channels, runs)
+    coded = encode_runs(layout, channels, runs, large)
     assert all(segment.data for segment in coded)
-    for decoded, expected in zip(decode_runs(layout, count, coded, end), channels, strict=True):
+    for decoded, expected in zip(decode_runs(layout, count, coded, end, large), channels, strict=True):
         np.testing.assert_array_equal(decoded, expected)
 
 
+@pytest.mark.parametrize("large", [0, 1])
 @pytest.mark.parametrize("fill", [2**28 - 1, -(2**28 - 1), 1, -1, 0])
-def test_the_largest_and_smallest_coefficients_come_back(fill: int) -> None:
+def test_the_largest_and_smallest_coefficients_come_back(fill: int, large: int) -> None:
     layout = Layout.single((40, 33), (False, False), (4, 4))
     values = np.full((40, 33), fill, np.int32)
     runs, end = random_runs(np.random.default_rng(0), layout, [values])
-    coded = encode_runs(layout, [values], runs)
-    np.testing.assert_array_equal(decode_runs(layout, 1, coded, end)[0], values)
+    coded = encode_runs(layout, [values], runs, large)
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, end, large)[0], values)
     assert bool(coded) == bool(fill)
 
 
-def test_noise_that_cannot_be_compressed_stays_within_its_buffer() -> None:
+@pytest.mark.parametrize("large", [0, 1])
+def test_noise_that_cannot_be_compressed_stays_within_its_buffer(large: int) -> None:
     layout = Layout.single((150, 150), (False, False), (7, 7))
     values = np.random.default_rng(1).integers(-(2**28) + 1, 2**28, (150, 150), np.int32)
     runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values))]
-    coded = encode_runs(layout, [values], runs)
+    coded = encode_runs(layout, [values], runs, large)
     assert sum(len(segment.data) for segment in coded) < 1.02 * 150 * 150 * 29 / 8
-    np.testing.assert_array_equal(decode_runs(layout, 1, coded, [[0]] * len(layout.tiles))[0], values)
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, [[0]] * len(layout.tiles), large)[0], values)
 
 
-def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
+@pytest.mark.parametrize("large", [0, 1])
+def test_unknown_bits_are_replaced_by_the_reconstruction_point(large: int) -> None:
     layout = Layout.single((33, 33), (False, True), (3, 3))
     values = coefficients((33, 33), 12, 1.0, 7)
     tops = planes_of(layout, values)
@@ -105,7 +110,7 @@ def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
         runs = [
             (tile, 0, pass_count(top) - 1, pass_count(top) - 2 * plane) for tile, top in enumerate(tops) if top > plane
         ]
-        known = decode_runs(layout, 1, encode_runs(layout, [values], runs), [[2 * plane]] * len(tops))[0]
+        known = decode_runs(layout, 1, encode_runs(layout, [values], runs, large), [[2 * plane]] * len(tops), large)[0]
         high = np.abs(values) >> plane
         middle = np.where(high > 0, (high << plane) + reconstruction_point(plane), 0)
         np.testing.assert_array_equal(known, np.sign(values) * middle)
@@ -113,39 +118,42 @@ def test_unknown_bits_are_replaced_by_the_reconstruction_point() -> None:
         assert np.abs(known - values).max() < 2**plane
 
 
+@pytest.mark.parametrize("large", [0, 1])
 @pytest.mark.parametrize("cut", [9, 10])
-def test_passes_known_beyond_a_state_do_not_show_in_it(cut: int) -> None:
+def test_passes_known_beyond_a_state_do_not_show_in_it(cut: int, large: int) -> None:
     layout = Layout.single((20, 20), (False, False), (3, 3))
     values = coefficients((20, 20), 10, 1.0, 8)
     counts = passes_of(layout, values)
     coarse = [(tile, 0, count - 1, count - cut) for tile, count in enumerate(counts) if count > cut]
     fine = [(tile, 0, min(count, cut) - 1, min(count, cut)) for tile, count in enumerate(counts) if count]
-    coded = encode_runs(layout, [values], coarse + fine)
+    coded = encode_runs(layout, [values], coarse + fine, large)
     state = [[min(count, cut)] for count in counts]
-    before = decode_runs(layout, 1, coded[: len(coarse)], state)[0]
-    np.testing.assert_array_equal(decode_runs(layout, 1, coded, state)[0], before)
+    before = decode_runs(layout, 1, coded[: len(coarse)], state, large)[0]
+    np.testing.assert_array_equal(decode_runs(layout, 1, coded, state, large)[0], before)
 
 
-def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm() -> None:
+@pytest.mark.parametrize("large", [0, 1])
+def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm(large: int) -> None:
     layout = Layout.single((30, 30), (False, False), (4, 4))
     values = coefficients((30, 30), 9, 0.5, 9)
     runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values)) if count]
-    coded = encode_runs(layout, [values], runs)
+    coded = encode_runs(layout, [values], runs, large)
     end = [[0]] * len(layout.tiles)
     padded = [Coded(s.tile, s.channel, s.first, s.passes, s.data + bytes(9), 0) for s in coded]
-    np.testing.assert_array_equal(decode_runs(layout, 1, padded, end)[0], values)
+    np.testing.assert_array_equal(decode_runs(layout, 1, padded, end, large)[0], values)
     for seed, data in enumerate([b"", b"\xff", b"\xff" * 3000, b"\x00" * 3000, bytes(range(256)) * 9]):
         other = [Coded(s.tile, s.channel, s.first, s.passes, data, seed) for s in coded]
-        decoded = decode_runs(layout, 1, other, end)[0]
+        decoded = decode_runs(layout, 1, other, end, large)[0]
         assert np.abs(decoded.astype(np.int64)).max() < 2**COEFFICIENT_BITS
 
 
-def test_gains_are_the_squared_errors_of_what_is_known() -> None:
+@pytest.mark.parametrize("large", [0, 1])
+def test_gains_are_the_squared_errors_of_what_is_known(large: int) -> None:
     layout = Layout.single((25, 18), (False, False), (3, 3))
     table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
     counts = passes_of(layout, values)
-    reader = Reconstruction(header_for(layout, 1))
-    for segment in encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n]):
+    reader = Reconstruction(header_for(layout, 1, large))
+    for segment in encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n], large):
         reader.add(segment)
     reader._decode(reader.length)
     for tile, count in enumerate(counts):

@@ -134,7 +134,15 @@ def test_calls_that_are_cut_short_go_on_where_they_stopped(trellis: bool, budget
             own = arrays.known, arrays.sign, arrays.flags, arrays.early, given_true, arrays.models, data
             while finished < len(runs):
                 finished = kernels.passes(
-                    reading, trellis, table.bands, runs, *own, np.zeros(17 * (not reading)), np.zeros(0, np.uint16), state, at_once
+                    reading,
+                    trellis,
+                    table.bands,
+                    runs,
+                    *own,
+                    np.zeros(17 * (not reading)),
+                    np.zeros(0, np.uint16),
+                    state,
+                    at_once,
                 )
                 calls += 1
             done.append(calls)
@@ -151,7 +159,8 @@ def test_a_run_is_checked_when_it_is_its_turn() -> None:
     arrays, data = Arrays(table, False), np.zeros(100, np.uint8)
     runs = np.array([arrays.run(0, 3, 0, 0, 50), arrays.run(1, 3, 0, 60, 50)])
     state = np.zeros(kernels.PASSES_STATE, np.int64)
-    own = arrays.known, arrays.sign, arrays.flags, arrays.early, np.zeros(0, np.int32), arrays.models, data, np.zeros(0)
+    own = arrays.known, arrays.sign, arrays.flags, arrays.early, np.zeros(0, np.int32), arrays.models, data
+    own += np.zeros(0), np.zeros(0, np.uint16)
     assert kernels.passes(True, False, table.bands, runs, *own, state, 1) == 0
     with pytest.raises(ValueError, match="do not fit"):
         kernels.passes(True, False, table.bands, runs, *own, state, 1 << 30)
@@ -172,6 +181,7 @@ def a_call(**changes: Any) -> int:
         "models": arrays.models,
         "data": np.full(30, 77, np.uint8),
         "costs": np.zeros(0),
+        "symbols": np.zeros(0, np.uint16),
     }
     reading, budget = changes.pop("reading", True), changes.pop("budget", 1 << 20)
     for name, change in changes.items():
@@ -206,7 +216,7 @@ def test_a_band_without_coefficients_may_lie_anywhere(column: int) -> None:
         {f"band{OFFSET}": 3},
         {f"band{FLAGS}": 1},
         {f"band{PARENT}": 0},
-        *({f"run{column}": value} for column in range(7) for value in (-2, 2**62, -(2**63), 2**63 - 1)),
+        *({f"run{column}": value} for column in range(8) for value in (-2, 2**62, -(2**63), 2**63 - 1)),
         {"run0": 1000},
         {"run1": 1000},
         {"run2": 1000},

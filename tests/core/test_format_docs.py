@@ -30,3 +30,10 @@ def test_the_page_has_the_version_and_the_magic_of_the_code() -> None:
     assert f"\n    version    u8        {sections.VERSION}\n" in TEXT
     assert f"\n    magic      7 bytes   {sections.MAGIC.hex(' ').upper()} " in TEXT
     assert sections._FOOTER_MAGIC.hex(" ").upper() in TEXT
+
+
+def test_the_page_has_the_starts_of_the_contexts_of_large_units() -> None:
+    header = (Path(__file__).parents[2] / "core" / "kernels" / "class_tables.h").read_text()
+    starts = [int(number) for number in re.findall(r"\d+", header.partition("CLASS_STARTS[68] = {")[2])[:68]]
+    assert numbers_after("They begin with n = 6 and these P, over 2^16:", 68) == starts
+    assert "enum { STARTING_COUNT = 6 };" in header

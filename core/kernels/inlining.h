@@ -1,0 +1,7 @@
+/* Functions that are compiled for each constant with which they are called. */
+#ifndef LODE_INLINING_H
+#define LODE_INLINING_H
+
+#define LODE_INLINE static inline __attribute__((always_inline))
+
+#endif
