@@ -93,10 +93,15 @@ def all_large() -> Iterator[None]:
 @cache
 def contained(name: str) -> tuple[bytes, Index]:
     """The container of a sample, and its index."""
+    container = encoded(name)
+    return container, index_of(container)
+
+
+def encoded(name: str) -> bytes:
+    """A sample, encoded anew."""
     points, closed, precision = SAMPLES[name]
     with all_large() if name.startswith("large") else nullcontext():
-        container = ls.encode(ls.Surface(points, closed, metadata={"name": name}), precision)
-    return container, index_of(container)
+        return ls.encode(ls.Surface(points.copy(), closed, metadata={"name": name}), precision)
 
 
 def index_of(container: bytes) -> Index:
