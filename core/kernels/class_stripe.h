@@ -71,7 +71,7 @@ LODE_INLINE uint8_t code_class_flag(bool reads, struct unit *unit, const struct 
     int before = (flag[-1] != 0) + (flag[-band->across - 1] != 0);
     int after = (flag[1] != 0) + (flag[band->across + 1] != 0);
     uint8_t context = (uint8_t)(CLASS_FLAGS + (before * 3 + after) * 3 + (int)(family < 2 ? family : 2));
-    uint8_t bit = reads ? 0 : truth_in(unit->tiles, band, block) >> plane != 0;
+    uint8_t bit = (uint8_t)(!reads && truth_in(unit->tiles, band, block) >> plane != 0);
     uint16_t place = 0;
     code_decisions(reads, unit, &place, 1, &context, &bit);
     return bit;

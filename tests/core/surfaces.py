@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -9,12 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
+from lodestream import large_units
 from lodestream.container import Index, read_index
 from lodestream.container.fields import told
 from lodestream.decoder import Decoder, View
 from lodestream.plans import Plan
 
-__all__ = ["SAMPLES", "contained", "errors", "figures", "follow", "index_of", "is_told", "terrain", "torus"]
+__all__ = [
+    "SAMPLES",
+    "all_large",
+    "contained",
+    "errors",
+    "figures",
+    "follow",
+    "index_of",
+    "is_told",
+    "terrain",
+    "torus",
+]
 
 Points = NDArray[Any]
 
@@ -56,6 +70,8 @@ def _samples() -> dict[str, tuple[Points, tuple[bool, bool], float | None]]:
         "constant": (np.full((9, 12), 7.25), (False, False), None),
         "zeros": (zeros, (False, False), None),
         "pair": (np.array([[1.5, np.pi]], np.float32), (False, False), None),
+        "large heights": (np.rint(terrain((23, 70), 3)).astype(np.int16), (False, True), None),
+        "large torus": (np.dstack([torus(14, 18), rng.random((14, 18, 1), np.float32)]), (True, True), None),
         "terraces": (np.floor(terrain((70, 66), 2) / 15).astype(np.int16), (False, False), None),
     }
 
@@ -63,12 +79,29 @@ def _samples() -> dict[str, tuple[Points, tuple[bool, bool], float | None]]:
 SAMPLES = _samples()
 
 
+@contextmanager
+def all_large() -> Iterator[None]:
+    """Units of all levels but the coarsest are large, whatever that costs."""
+    kept = large_units._LARGE, large_units._MOST
+    large_units._LARGE, large_units._MOST = 1, float("inf")
+    try:
+        yield
+    finally:
+        large_units._LARGE, large_units._MOST = kept
+
+
 @cache
 def contained(name: str) -> tuple[bytes, Index]:
     """The container of a sample, and its index."""
-    points, closed, precision = SAMPLES[name]
-    container = ls.encode(ls.Surface(points, closed, metadata={"name": name}), precision)
+    container = encoded(name)
     return container, index_of(container)
+
+
+def encoded(name: str) -> bytes:
+    """A sample, encoded anew."""
+    points, closed, precision = SAMPLES[name]
+    with all_large() if name.startswith("large") else nullcontext():
+        return ls.encode(ls.Surface(points.copy(), closed, metadata={"name": name}), precision)
 
 
 def index_of(container: bytes) -> Index:

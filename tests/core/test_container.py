@@ -70,6 +70,7 @@ def lying_header(shape: tuple[int, int], channels: int = 1, **changes: Any) -> b
     out.varint(changes.get("layers", 1))
     out.byte(changes.get("tile", 7 | 7 << 4))
     out.byte(changes.get("piece", 6 | 6 << 4))
+    out.byte(changes.get("large", 0))
     out.varint(changes.get("base", 0))
     out.number(changes.get("extent", 1.0))
     for number in shape:

@@ -261,6 +261,7 @@ def test_a_large_surface_of_several_tiles_keeps_its_promises_too() -> None:
     container = ls.encode(points)
     index = index_of(container)
     assert len(index.header.layout.tiles) > 10
+    assert 1 < index.header.large < index.header.levels
     for view, record in zip(states(container)[::6], index.layers[::6], strict=True):
         rms, worst = errors(points, view.points)
         assert view.rms == record.rms
@@ -294,8 +295,12 @@ def test_bytes_after_the_end_and_a_damaged_footer_are_refused_and_the_surface_st
         assert bytewise.complete
 
 
-def test_an_interrupted_view_is_decoded_on_from_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    container = ls.encode(terrain((150, 130)))
+@pytest.mark.parametrize("shape", [(150, 130), (190, 180)])
+def test_an_interrupted_view_is_decoded_on_from_where_it_was(
+    shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    container = ls.encode(terrain(shape))
+    assert bool(index_of(container).header.large) == (shape == (190, 180))
     wanted = Decoder()
     wanted.feed(container)
     surface = wanted.surface()

@@ -15,7 +15,7 @@ from lodestream.container import describe
 from lodestream.container.model import Errors
 from lodestream.encoding import Encoding
 
-from .surfaces import SAMPLES, contained, errors, index_of, is_told, terrain, torus
+from .surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus
 
 DTYPES = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
@@ -127,9 +127,7 @@ def test_several_tiles_and_either_byte_order_come_back() -> None:
 
 def test_the_same_surface_makes_the_same_container() -> None:
     for name in SAMPLES:
-        points, closed, precision = SAMPLES[name]
-        surface = ls.Surface(points.copy(), closed, metadata={"name": name})
-        assert ls.encode(surface, precision) == contained(name)[0]
+        assert encoded(name) == contained(name)[0]
 
 
 @given(

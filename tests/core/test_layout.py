@@ -139,7 +139,7 @@ def test_pieces_of_narrow_surfaces_are_long(shape: tuple[int, int], pieces: list
 
 
 def test_small_surfaces_take_small_tiles_where_points_have_many_bytes() -> None:
-    assert tile_exponents((512, 512), small=True) == (5, 6)
+    assert tile_exponents((512, 512), 11) == (5, 6)
     assert piece_exponents((512, 512), small=True) == [(5, 5), (6, 6), (8, 8)]
     noise = np.random.default_rng(4).normal(size=(70, 150)).astype(np.float32)
     for values, tile in ((noise, (5, 6)), (np.rint(100 * noise), (6, 6)), (noise > 0, (6, 6))):

@@ -111,10 +111,10 @@ def test_so_many_bytes_at_most_and_not_one_layer_fewer(name: str) -> None:
 
 def test_of_several_limits_the_first_one_met_ends_it() -> None:
     _, index = contained("heights")
-    third, eighth = index.layers[2], index.layers[7]
-    soon = plan(index, Target(until_rms=Tolerance(third.rms), max_bytes=eighth.end))
+    third, later = index.layers[2], index.layers[5]
+    soon = plan(index, Target(until_rms=Tolerance(third.rms), max_bytes=later.end))
     assert (soon.ended, soon.bytes) == ("rms", third.end)
-    soon = plan(index, Target(until_rms=Tolerance(eighth.rms), max_bytes=third.end))
+    soon = plan(index, Target(until_rms=Tolerance(later.rms), max_bytes=third.end))
     assert (soon.ended, soon.bytes) == ("bytes", third.end)
     assert plan(index, Target(until_max=Tolerance(1e9))).ended == "max"
 

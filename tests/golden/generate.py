@@ -5,25 +5,93 @@ Until Lodestream 1.0 this goes with each new version of the format and nothing e
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
+from lodestream import encoder, encoding, large_units, preparation
+from lodestream.allocation import TileCurve
+from lodestream.predictors import COEFFICIENT_BITS
+from lodestream.tile_coder import TileCoder, planes_of
+from lodestream.tiles import TileTable, gather
 
 __all__ = ["FOLDER", "Original", "digest", "digests", "expectations", "lines", "originals"]
 
 FOLDER = Path(__file__).parent
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Crafted:
+    """What the encoder does otherwise, for files that are as good as others and that it would not write.
+
+    Attributes
+    ----------
+    large : bool
+        The units of all levels but the coarsest are large.
+    tile : (int, int) or None
+        Exponents of two of a tile's rows and columns.
+    factor : int
+        All coefficients are so many times as large, and meet the limits; the exactness section sets the values right.
+    ones : int
+        The first unit tells so many bit-planes too many; their passes are a segment of four bytes of 255.
+    """
+
+    large: bool = False
+    tile: tuple[int, int] | None = None
+    factor: int = 1
+    ones: int = 0
+
+    @contextlib.contextmanager
+    def applied(self) -> Iterator[None]:
+        """While a surface is encoded."""
+        code, assign, most = TileCoder.code, encoding.assign_layers, (1 << COEFFICIENT_BITS) - 1
+
+        def gathered(*arguments: Any) -> NDArray[np.int32]:
+            return np.clip(self.factor * gather(*arguments).astype(np.int64), -most, most).astype(np.int32)
+
+        def planes(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
+            return planes_of(table, true, tile) + (self.ones if tile == 0 else 0)
+
+        def assigned(curves: list[TileCurve], *arguments: Any) -> list[NDArray[Any]]:
+            states = assign(curves, *arguments)
+            first = np.zeros_like(states[0])
+            for curve in curves:
+                first[curve.tile, curve.channel] = len(curve.bits)
+            first[0] -= 2 * self.ones
+            return [first, *states]
+
+        def coded(coder: TileCoder, tile: int, channel: int, first: int, passes: int, *costs: Any) -> bytes:
+            data = code(coder, tile, channel, first, passes, *costs)
+            begins = first == 2 * int(coder._channels[channel].top[tile]) - 1
+            return b"\xff" * 4 if tile == 0 and begins and passes == 2 * self.ones else data
+
+        with pytest.MonkeyPatch.context() as patch:
+            if self.large:
+                patch.setattr(large_units, "_LARGE", 1)
+                patch.setattr(large_units, "_MOST", float("inf"))
+            if self.tile:
+                patch.setattr(preparation, "tile_exponents", lambda *_: self.tile)
+            if self.factor > 1:
+                patch.setattr(encoder, "_COARSER", ())  # no container of fewer bits is tried
+                patch.setattr(encoding, "gather", gathered)
+            if self.ones:
+                patch.setattr(encoding, "planes_of", planes)
+                patch.setattr(encoding, "assign_layers", assigned)
+                patch.setattr(TileCoder, "code", coded)
+            yield
 
 
 @dataclass(frozen=True)
@@ -34,11 +102,13 @@ class Original:
     precision: str | None = None
     attribute_precision: Mapping[str, str] = field(default_factory=dict)
     rms: str | None = None
+    crafted: Crafted = Crafted()
 
     def encode(self) -> bytes:
         """Its container."""
         precisions = dict(self.attribute_precision)
-        return ls.encode(self.surface, self.precision, rms=self.rms, attribute_precision=precisions)
+        with self.crafted.applied():
+            return ls.encode(self.surface, self.precision, rms=self.rms, attribute_precision=precisions)
 
 
 def _wave(rows: int, columns: int) -> Floats:
@@ -310,6 +380,66 @@ def _made_for_an_error() -> dict[str, Original]:
     }
 
 
+def _large() -> dict[str, Original]:
+    """Large units: of the finest level of a surface that is large enough, and of all levels of small ones."""
+    rng = np.random.default_rng(2008)
+    rough = np.cumsum(np.cumsum(rng.normal(size=(90, 75)), 0), 1)
+    spikes = np.where(rng.random((96, 140)) < 0.003, rng.integers(1, 99, (96, 140)), 0).astype(np.uint8)
+    attributes: dict[str, NDArray[Any]] = {
+        "color": rng.integers(0, 256, (26, 70, 3)).astype(np.uint8),
+        "temperature": (280 + 10 * _wave(26, 70)).astype(np.float32),
+        "label": np.rint(40 * _wave(26, 70)).astype(np.int32) ** 3,
+    }
+    holes = np.rint(900 * _wave(45, 66)).astype(np.int16)
+    lake = np.hypot(*(np.mgrid[:45, :66] - np.array([20, 30])[:, None, None])) < 9
+    sides = [
+        ls.Block(block, attributes={"speed": (7 * block[..., 2]).astype(np.float32)})
+        for block in _cut(_terrain(24, 41), [0, 9, 23], [0, 40])
+    ]
+    natural = 5 * _wave(186, 183) + 0.4 * np.random.default_rng(2009).normal(size=(186, 183))
+    widest = np.random.default_rng(2010).choice([-(2**23), 0, 1, 2**23 - 1], (24, 70), p=[0.45, 0.05, 0.05, 0.45])
+    everywhere = Crafted(large=True)
+    return {
+        "large": Original(ls.Surface(np.rint(natural).astype(np.int16))),
+        "large-attributes": Original(
+            ls.Surface(_torus(26, 70).astype(np.float32), (True, False), attributes=attributes), crafted=everywhere
+        ),
+        "large-blocks": Original(ls.Surface(blocks=sides), crafted=everywhere),
+        "large-closed": Original(ls.Surface(_torus(21, 72)), "1e-5d", crafted=everywhere),
+        "large-error": Original(
+            ls.Surface(_torus(26, 70), (True, False), attributes={"color": attributes["color"]}),
+            rms="2e-3d",
+            crafted=everywhere,
+        ),
+        "large-holes": Original(ls.Surface(holes, mask=~lake), crafted=everywhere),
+        "large-limits": Original(
+            ls.Surface(widest.astype(np.int32)), crafted=Crafted(large=True, tile=(3, 6), factor=40)
+        ),
+        "large-sparse": Original(ls.Surface(spikes), crafted=everywhere),
+        "large-tiles": Original(ls.Surface(np.rint(30 * rough).astype(np.int32)), crafted=Crafted(True, (4, 4))),
+    }
+
+
+def _limits() -> dict[str, Original]:
+    """What no surface reaches by itself, or few do."""
+    rng = np.random.default_rng(2011)
+    widest = rng.choice([-(2**23), 0, 1, 2**23 - 1], (33, 40), p=[0.45, 0.05, 0.05, 0.45])
+    spikes = np.where(rng.random((150, 160)) < 0.002, rng.integers(1, 99, (150, 160)), 0).astype(np.uint8)
+    long = _cut(_terrain(290, 7), [0, 289], [0, 3, 6])
+    masks = [np.ones((290, 4), bool), np.ones((290, 4), bool)]
+    masks[1][250:, 1:] = False
+    patches = [
+        ls.Block(block.astype(np.float32), mask=mask, attributes={"speed": np.where(mask, 7 * block[..., 2], 0)})
+        for block, mask in zip(long, masks, strict=True)
+    ]
+    return {
+        "limits-clamps": Original(ls.Surface(widest.astype(np.int32)), crafted=Crafted(factor=40)),
+        "limits-contexts": Original(ls.Surface(spikes)),
+        "limits-ones": Original(ls.Surface(np.rint(40 * _wave(40, 43)).astype(np.int16)), crafted=Crafted(ones=2)),
+        "limits-patches": Original(ls.Surface(blocks=patches)),
+    }
+
+
 @functools.cache
 def originals() -> dict[str, Original]:
     """All that there is a golden file of."""
@@ -321,6 +451,8 @@ def originals() -> dict[str, Original]:
         **_planes(),
         **_arrangements(),
         **_made_for_an_error(),
+        **_large(),
+        **_limits(),
     }
 
 

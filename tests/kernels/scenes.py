@@ -17,6 +17,7 @@ from lodestream.errors import FormatError
 from lodestream.formats.lzf import decompress
 from lodestream.mesh.recognise import recognise
 from tests.core.meshes import FaceList, collapse, cut_in_two, grid_faces, mesh_of, scrambled, star
+from tests.core.surfaces import all_large
 from tests.core.test_mesh_attributes import sphere, with_texture
 from tests.golden.generate import FOLDER, expectations, originals
 
@@ -59,6 +60,21 @@ def _small_surfaces() -> None:
         ):
             for rms in (None, "5e-2d"):
                 ls.decode(ls.encode(ls.Surface(values), rms=rms))
+
+
+def _large_units() -> None:
+    """Units that are large, of few coefficients, cut short and read on: attributes, and levels closed and open."""
+    rng = np.random.default_rng(3)
+    with all_large():
+        for shape, closed in (((9, 12), (False, False)), ((24, 150), (False, True)), ((70, 5), (True, False))):
+            rough, few = rng.integers(-900, 900, shape).cumsum(1), np.where(rng.random(shape) < 0.02, 9, 0)
+            for values in (rough.astype(np.int32), few.astype(np.int16)):
+                container = ls.encode(ls.Surface(values, closed, attributes={"few": few.astype(np.int8)}))
+                decoder, chunk = ls.Decoder(), 40 + len(container) // 20
+                for start in range(0, len(container), chunk):
+                    decoder.feed(container[start : start + chunk])
+                    if decoder.layers:
+                        decoder.surface()
 
 
 def _windows() -> None:
@@ -107,6 +123,7 @@ SCENES: dict[str, Callable[[], None]] = {
     **{f"decode {name}": partial(_decode, name) for name in sorted(originals())},
     **{f"encode {name}": partial(_encode, name) for name in sorted(originals())},
     "small surfaces": _small_surfaces,
+    "large units": _large_units,
     "windows": _windows,
     "meshes": _meshes,
     "compressed scans": _compressed_scans,
