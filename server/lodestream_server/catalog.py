@@ -161,8 +161,7 @@ class Catalog:
 
     def one_of_container(self, sha256: str) -> Record | None:
         """One of the surfaces that have a container or had it before it was lost; all describe it in the same way."""
-        surface = next(iter(tuple(self._containers.get(sha256, ()))), None)
-        return None if surface is None else self._records.get(surface)
+        return next(self._chosen(self._containers, sha256), None)
 
     def serves(self, sha256: str) -> bool:
         """Whether a ready surface has this container."""

@@ -93,7 +93,8 @@ class Containers:
         StreamError
             If it is damaged.
         BusyError
-            If the indexes of open containers leave no memory for its index.
+            If the indexes of open containers leave no memory for its index, or it was deleted and stored again at this
+            moment.
         """
         try:
             file = self._storage.container(sha256).open("rb")

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
-from lodestream.errors import OptionError, StreamError
+from lodestream.errors import NotFoundError, OptionError, StreamError
 
 from . import damage, examples
 from .access import anybody
@@ -22,6 +26,7 @@ from .ranges import sort_out
 from .records import Record
 from .routing import Parts, State, matches, readable
 from .scopes import needs
+from .storage import Storage
 
 __all__ = ["router"]
 
@@ -80,7 +85,7 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
         damage.tell(parts.storage, sha256, error)
         raise error
     sort_out(request, status.st_size, etag)
-    return _File(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
+    return _Container(parts.storage, sha256, path, headers, status)
 
 
 @readable(
@@ -112,7 +117,8 @@ async def level(
     if unchanged is not None:
         return unchanged
     key = Key(record.container or "", level, format_name)
-    loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
+    with still_there(parts, surface):
+        loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
     try:
         sort_out(request, loan.size, etag)
         headers["content-disposition"] = f'attachment; filename="{record.id}-{level}.{format_name}"'
@@ -123,13 +129,23 @@ async def level(
 
 
 class _File(FileResponse):
-    """A file; once all of it was sent nothing that befalls it concerns the client."""
+    """A file; once all of it was sent nothing that befalls it concerns the client.
+
+    It is opened before anything is sent, so a file that is not there can still be answered by a problem document.
+    """
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        head: Message | None = None
         complete = False
 
         async def watched(message: Message) -> None:
-            nonlocal complete
+            nonlocal head, complete
+            if message["type"] == "http.response.start":  # the file is opened after it
+                head = message
+                return
+            if head is not None:
+                start, head = head, None
+                await send(start)
             await send(message)
             complete = message["type"] == "http.response.body" and not message.get("more_body", False)
 
@@ -140,6 +156,23 @@ class _File(FileResponse):
                 raise
             # The connection would be cut, perhaps with the client's next request on it.
             _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
+
+
+class _Container(_File):
+    """A stored container, which may be deleted before it is opened."""
+
+    def __init__(
+        self, storage: Storage, sha256: str, path: Path, headers: dict[str, str], status: os.stat_result
+    ) -> None:
+        super().__init__(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
+        self._storage = storage
+        self._sha256 = sha256
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        except FileNotFoundError:
+            raise self._storage.gone(self._sha256) from None
 
 
 class _Borrowed(_File):
@@ -179,6 +212,25 @@ def ready(parts: State, surface: str) -> Record:
         state, progress = parts.builder.state(record)
         raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); try again soon")
     return record
+
+
+@contextmanager
+def still_there(parts: State, surface: str) -> Iterator[None]:
+    """Around what reads the container of a surface: if there is none, raise what is true of the surface now.
+
+    It may have been deleted meanwhile, although another surface has the same container, or been made again.
+
+    Raises
+    ------
+    NotFoundError, NotReadyError, PostponedError, BuildFailedError, MissingError
+        See `ready`.
+    BusyError
+        If its container can be read again.
+    """
+    try:
+        yield
+    except (NotFoundError, MissingError):
+        raise parts.storage.gone(ready(parts, surface).container or "") from None
 
 
 def _check(record: Record, level: int, format_name: str) -> None:

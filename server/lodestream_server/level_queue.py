@@ -353,12 +353,15 @@ class LevelQueue:
             most = self._settings.memory_of_levels >> 20
             raise TooLargeError(f"expected a level that needs at most {most} MiB of memory; {advice}") from None
         except UnforeseenError as error:
-            if error.kind == "FileNotFoundError":
-                raise self._storage.gone(key.container) from None
             if error.errno in _NO_ROOM:
                 raise self._no_room(0) from None
-            if error.errno == errno.EACCES and os.access(wanted.container, os.R_OK):
-                raise _ReplacedError("its container was deleted and built again meanwhile") from None
+            # It may read the file that was there when it began, and no other in its place.
+            if error.kind == "FileNotFoundError" or error.errno == errno.EACCES:
+                gone = self._storage.gone(key.container)
+                if not isinstance(gone, BusyError):
+                    raise gone from None
+                if os.access(wanted.container, os.R_OK):
+                    raise _ReplacedError("its container was deleted and built again meanwhile") from None
             _log.error("making a level failed unexpectedly: %s", error.traceback)
             raise
         except OSError as error:

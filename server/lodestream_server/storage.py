@@ -23,7 +23,7 @@ from .catalog import Catalog, Position
 from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
 from .private import check_writable, make_private, tighten
-from .problems import MissingError
+from .problems import BusyError, MissingError
 from .records import Record, State, serialize
 from .recovery import finish_delete, has_container, has_upload, present, recover
 from .versions import other_version
@@ -139,11 +139,19 @@ class Storage:
             If no surface has it.
         MissingError
             If a surface has it, but it is not on disk.
+        BusyError
+            If it was deleted and stored again at this moment.
         """
-        path = self._at.container(sha256)
-        if not self._catalog.serves(sha256) or not is_file(path):
+        if not self._readable(sha256):
             raise self.gone(sha256)
-        return path
+        return self._at.container(sha256)
+
+    def _readable(self, sha256: str) -> bool:
+        if not self._catalog.has_container(sha256):
+            return False
+        path = self._at.container(sha256)
+        # The container of a surface that is not ready may be another surface's too, which was deleted.
+        return is_file(path) and (self._catalog.serves(sha256) or other_version(path) is None)
 
     def place_of(self, sha256: str) -> Path:
         """Path of a container, whether it exists or not."""
@@ -168,14 +176,25 @@ class Storage:
         return self._catalog.has_size(size, form=form)
 
     def gone(self, sha256: str) -> LodestreamError:
-        """Why a container that was known a moment ago cannot be read: it was deleted, or its disk is missing."""
-        if self._catalog.has_container(sha256):
+        """Why a container that was known a moment ago could not be read.
+
+        It was deleted (NotFoundError), its disk is missing (MissingError), or it was deleted and stored again meanwhile
+        (BusyError).
+        """
+        while True:
+            record = self._catalog.one_of_container(sha256)
+            if record is None:
+                return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
             other = other_version(self._at.container(sha256))
-            if other is not None:
-                return MissingError(other)
-            _log.error("the container %s is not on the disk", sha256)
-            return MissingError(f"the container {sha256} is not on the server's disk now")
-        return NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+            if self._readable(sha256):
+                return BusyError(f"the container {sha256} was deleted and stored again meanwhile; try again")
+            # A container is stored before its record says so, and removed after the record. So it is missing only if
+            # the record is the same before and after the look at the disk.
+            if self._catalog.find(record.id) is record:
+                if other is not None:
+                    return MissingError(other)
+                _log.error("the container %s is not on the disk", sha256)
+                return MissingError(f"the container {sha256} is not on the server's disk now")
 
     def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
         """Store an upload; returns the surface's record, and whether it must be built.

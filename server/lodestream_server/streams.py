@@ -28,7 +28,7 @@ from lodestream.wire import parse, serialize
 from . import damage
 from .access import Caller, anybody
 from .containers import OpenContainer
-from .files import ready
+from .files import ready, still_there
 from .gate import caller_of
 from .logs import event
 from .problems import (
@@ -96,7 +96,8 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
                 caller = parts.access.reader_with(_token(first))
         with parts.limits.stream(caller.key):
             record = ready(parts, surface)
-            container = await asyncio.to_thread(parts.containers.open, record.container or "")
+            with still_there(parts, surface):
+                container = await asyncio.to_thread(parts.containers.open, record.container or "")
             await _stream(_Session(socket, container, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
         return

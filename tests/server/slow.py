@@ -36,6 +36,7 @@ __all__ = [
     "listed",
     "make_coarsest",
     "make_when_told",
+    "miss_when_told",
     "nothing",
     "number",
     "out_of_processor_time",
@@ -227,6 +228,22 @@ def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
     begun.unlink()
     go.unlink()
     return make_level(job)
+
+
+def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Miss the container of the first level once it was deleted, and say so when ``go`` appears beside the folders."""
+    data, until = job.folder.parent.parent, time.monotonic() + _PATIENCE
+    first = not (data / "missed").exists()
+    while first and job.container.exists() and time.monotonic() < until:
+        (data / "begun").touch()
+        time.sleep(0.01)
+    try:
+        return make_level(job)
+    except FileNotFoundError:
+        (data / "missed").touch()
+        while not (data / "go").exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        raise
 
 
 def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:
