@@ -28,7 +28,7 @@ _SHARE_OF_STREAM = 0.005
 #: What a step adds to a layer besides its passes, in bytes.
 _ENTRY = 5
 #: By how much the bytes grow from layer to layer, at least and at most, where there are more than so many ...
-_GROWTH = 1.12, 1.147
+_GROWTH = 1.12, 1.14
 _OFTEN = 3800
 #: ... and before: a layer's frame takes about 50 bytes with its share of the index, which counts there.
 _EARLY_GROWTH = 1.4, 1.8
