@@ -17,6 +17,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from .bodies import MOST_REST, CountedConnection
 from .cuts import Cuts
+from .frames import call_when_lost
 from .open_files import most_connections
 from .pace import Pace
 from .settings import Settings
@@ -130,6 +131,8 @@ class _Connection(H11Protocol):
         self.transport = self._socket
         self._guarded.let_go()
         super().handle_websocket_upgrade(event)
+        if self._watch is not None:
+            call_when_lost(self._socket.get_protocol(), self._watch.end)
         self._socket.resume_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -137,6 +140,8 @@ class _Connection(H11Protocol):
         if self._rest_timer is not None:
             self._rest_timer.cancel()
         self._held.clear()
+        if self._watch is not None:
+            self._watch.end()
         super().connection_lost(exc)
         self._guarded.let_go()
 
@@ -312,7 +317,11 @@ class _Watch:
         self._loop = loop
         self._seconds = seconds
         self._unsent = 0
-        loop.call_later(seconds, self._look)
+        self._timer = loop.call_later(seconds, self._look)
+
+    def end(self) -> None:
+        """Stop looking, so that nothing of a connection that has ended is kept until the next look."""
+        self._timer.cancel()
 
     def _look(self) -> None:
         # A transport that is told to close first sends what it holds, for as long as that takes: this is its end, too.
@@ -325,4 +334,4 @@ class _Watch:
             self._transport.abort()
             return
         self._unsent, self.moved = unsent, False
-        self._loop.call_later(self._seconds, self._look)
+        self._timer = self._loop.call_later(self._seconds, self._look)

@@ -7,6 +7,8 @@ counted. A connection that exceeds a limit is cut: a client that does this does 
 
 from __future__ import annotations
 
+from asyncio import BaseProtocol
+from collections.abc import Callable
 from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -15,7 +17,7 @@ from websockets.frames import Frame
 from .cuts import Allowance, Cuts
 from .pace import Pace
 
-__all__ = ["stream_connections"]
+__all__ = ["call_when_lost", "stream_connections"]
 
 # How many bytes are looked at before the bounds are: at most 42 frames, which take less than a millisecond.
 _PIECE = 256
@@ -52,6 +54,12 @@ def stream_connections(cuts: Cuts, pace: Pace) -> type[WebSocketsSansIOProtocol]
     return Chosen
 
 
+def call_when_lost(connection: BaseProtocol, work: Callable[[], None]) -> None:
+    """Have a function called when a WebSocket connection has ended."""
+    if isinstance(connection, _Connection):
+        connection.when_lost = work
+
+
 class _Connection(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket connection, with the bounds that it does not have.
 
@@ -61,10 +69,13 @@ class _Connection(WebSocketsSansIOProtocol):
         Where it is written down when the connection is cut.
     pace : Pace
         What has come and is not looked at yet waits there.
+    when_lost : callable or None
+        Called when the connection has ended.
     """
 
     cuts: Cuts
     pace: Pace
+    when_lost: Callable[[], None] | None = None
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -77,6 +88,11 @@ class _Connection(WebSocketsSansIOProtocol):
         self._seen = 0
         self._fragments = 0
         self._control_bytes = 0
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        if self.when_lost is not None:
+            self.when_lost()
 
     def data_received(self, data: bytes) -> None:
         if not self._asked:

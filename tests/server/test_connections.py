@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 import socket
@@ -19,7 +20,7 @@ import lodestream as ls
 from lodestream.messages import CODES, Credit, End, Error, Event, Header, Open, Segments, Stop
 from lodestream.protocol import State
 from lodestream.sender import Sender
-from lodestream_server import running_server
+from lodestream_server import connections, running_server
 from tests.server.helpers import PATIENCE, closed, eventually, hills, listed, npy, push, raw_stream
 
 SECONDS = 1.5
@@ -309,3 +310,24 @@ def test_a_plan_that_takes_long_is_no_silence_of_the_client(tmp_path: Path, monk
 
         # On a machine that does much else, the other open may come too late some time; not always.
         eventually(lambda: isinstance(answer(), Header), "the answer to another open")
+
+
+def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> None:
+    def watches() -> int:
+        gc.collect()
+        return sum(isinstance(item, connections._Watch) for item in gc.get_objects())
+
+    # Patient: what is kept until the next look at a connection would be kept for longer than this waits.
+    with running_server(tmp_path, workers=1, idle_seconds=10 * PATIENCE) as url:
+        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+            surface = push(http, npy(hills()))
+        before = watches()
+        for _ in range(5):
+            assert httpx.get(url + surface["url"], trust_env=False).status_code == 200
+            with raw_stream(url + surface["url"]) as stream:
+                stream.send(Open(credit=100_000))
+                stream.until_end()
+                closed(stream, 1000)
+            with raw_stream(url + surface["url"]) as stream:
+                stream.socket.socket.close()
+        eventually(lambda: watches() <= before, "nothing to be kept of the connections")

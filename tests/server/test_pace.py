@@ -148,6 +148,10 @@ class Socket(asyncio.Transport):
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
         self.protocol = protocol
 
+    def get_protocol(self) -> asyncio.BaseProtocol:
+        assert isinstance(self.protocol, asyncio.BaseProtocol)
+        return self.protocol
+
     def pause_reading(self) -> None:
         self.paused = True
 

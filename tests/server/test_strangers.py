@@ -36,6 +36,14 @@ def test_what_is_known_is_taken_as_it_is(name: str) -> None:
     assert sum(map(target.run, target.corpus())) >= 3
 
 
+#: A header whose block has 1,355,388,599,402,494 columns, which the kernels could not count.
+LONG_AXIS = bytes.fromhex("f54c4f44450d0a00011d030104053c080102a23900054051fffffffeffffffff96b402405900007a6bfc86")
+
+
+def test_an_axis_that_is_too_long_is_refused_as_documented() -> None:
+    assert not TARGETS["containers"].run(LONG_AXIS)
+
+
 @pytest.mark.parametrize("name", TARGETS)
 def test_any_change_is_taken_or_refused(name: str) -> None:
     target = TARGETS[name]

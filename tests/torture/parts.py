@@ -139,13 +139,13 @@ def _streams(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
     assert not report.problems, "\n".join((str(report), *report.problems[:20]))
     assert report.identical > 0.9 * report.schedules, report
     growth = streams.growth(report.memory)
-    facts = (str(report), f"memory of the process with both ends: {streams.told(report.memory)}")
+    facts = (str(report), f"memory in use in the process with both ends: {streams.told(report.memory)}")
     if growth is None:
         return report.schedules, (*facts, "too few schedules to tell whether memory grows")
     limits = (
         f"the last fifth beside the first after {streams.WARM_UP:,} schedules; allowed: {streams.MOST_GROWTH >> 20}"
     )
-    grown = f"memory grew by {growth / 2**20:.1f} MiB ({limits})"
+    grown = f"memory in use grew by {growth / 2**20:.1f} MiB ({limits})"
     assert growth <= streams.MOST_GROWTH, "\n".join((*facts, grown))
     return report.schedules, (*facts, grown)
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import gc
 import hashlib
 import sys
@@ -18,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +31,9 @@ from lodestream_client import aio, roads, sync
 from lodestream_server import running_server
 from tests.links import Link, faults_of
 
-__all__ = ["MOST_GROWTH", "WARM_UP", "Report", "growth", "run", "told"]
+__all__ = ["MOST_GROWTH", "WARM_UP", "Memory", "Report", "growth", "memory", "run", "told"]
 
-#: Schedules after which memory must not grow any more, and bytes by which it may seem to.
+#: Schedules after which memory in use must not grow any more, and bytes by which it may seem to.
 WARM_UP = 2000
 MOST_GROWTH = 16 << 20
 
@@ -49,6 +50,36 @@ _REGIONS: tuple[Region | None, ...] = (None, ((0, 5), (0, 5)), ((20, 31), (10, 2
 _TOGETHER = 16
 _SILENCE = 0.5
 _MEMORY_EACH = 500
+
+
+class Memory(NamedTuple):
+    """The memory of the process, with both ends of all streams.
+
+    Attributes
+    ----------
+    schedules : int
+        How many had run.
+    resident : int
+        Bytes that the process holds.
+    free : int
+        Bytes of these that the C library's allocator keeps for later; 0 where it does not tell.
+    blocks : int
+        Blocks of memory that Python has allocated.
+    """
+
+    schedules: int
+    resident: int
+    free: int
+    blocks: int
+
+    @property
+    def used(self) -> int:
+        """Bytes in use.
+
+        Between the few blocks that stay, the allocator's heap gets holes that are too small for asyncio's 256 KiB
+        buffers, and is extended for them: the process grows although nothing in it does.
+        """
+        return self.resident - self.free
 
 
 @dataclass
@@ -68,8 +99,7 @@ class Report:
     connections : int
         Connections and requests in all.
     seconds : float
-    memory : list of (int, int)
-        Schedules that had run, and bytes of memory that the process then had.
+    memory : list of Memory
     """
 
     schedules: int = 0
@@ -78,7 +108,7 @@ class Report:
     problems: list[str] = field(default_factory=list)
     connections: int = 0
     seconds: float = 0.0
-    memory: list[tuple[int, int]] = field(default_factory=list)
+    memory: list[Memory] = field(default_factory=list)
 
     def __str__(self) -> str:
         errors = ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
@@ -95,20 +125,24 @@ def terrain() -> NDArray[np.float32]:
     return np.asarray(90 * np.sin(rows / 9) * np.cos(columns / 13) + noise, np.float32)
 
 
-def growth(memory: Sequence[tuple[int, int]]) -> int | None:
-    """By how many bytes memory has grown since it was warm; None where there is too little to tell.
+def growth(figures: Sequence[Memory]) -> int | None:
+    """By how many bytes memory in use has grown since it was warm; None where there is too little to tell.
 
     Compared are the medians of the first and of the last fifth of the figures after `WARM_UP` schedules.
     """
-    warm = [size for number, size in memory if number >= WARM_UP]
+    warm = [one.used for one in figures if one.schedules >= WARM_UP]
     fifth = len(warm) // 5
     return int(median(warm[-fifth:]) - median(warm[:fifth])) if fifth else None
 
 
-def told(memory: Sequence[tuple[int, int]]) -> str:
+def told(figures: Sequence[Memory]) -> str:
     """About a dozen of the figures, in words."""
-    chosen = {*range(0, len(memory), -(-len(memory) // 12)), len(memory) - 1}
-    return ", ".join(f"{memory[n][1] / 2**20:.1f} MiB after {memory[n][0]:,}" for n in sorted(chosen))
+    chosen = {*range(0, len(figures), -(-len(figures) // 12)), len(figures) - 1}
+    return ", ".join(
+        f"{one.used / 2**20:.1f} MiB and {one.blocks:,} blocks ({one.free / 2**20:.1f} MiB free) after "
+        f"{one.schedules:,}"
+        for one in (figures[number] for number in sorted(chosen))
+    )
 
 
 def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None = None) -> Report:
@@ -157,12 +191,12 @@ async def _all(url: str, container: bytes, count: int, until: tuple[float, float
             number = report.schedules
             await _one(url, container, next(numbers), expected, report)
             if number % _MEMORY_EACH == 0:
-                report.memory.append((number, _memory()))
+                report.memory.append(memory(number))
 
-    report.memory.append((0, _memory()))
+    report.memory.append(memory(0))
     await asyncio.gather(*(some() for _ in range(_TOGETHER)))
     if report.schedules % _MEMORY_EACH:
-        report.memory.append((report.schedules, _memory()))
+        report.memory.append(memory(report.schedules))
 
 
 async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, NDArray[Any]], report: Report) -> None:
@@ -204,10 +238,32 @@ async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, 
         report.connections += stream.connections
 
 
-def _memory() -> int:
-    """Bytes that the process holds."""
+def memory(schedules: int) -> Memory:
+    """What the process holds after so many schedules."""
     gc.collect()
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+    return Memory(schedules, resident, _free(), sys.getallocatedblocks())
+
+
+class _MallInfo(ctypes.Structure):
+    """What glibc tells of its heaps, see mallinfo(3)."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
+            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
+        )
+    ]
+
+
+def _free() -> int:
+    """Bytes that glibc's allocator holds and that are not in use; 0 where there is another library."""
+    look = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if look is None:
+        return 0
+    look.restype = _MallInfo
+    return int(look().fordblks)
 
 
 if __name__ == "__main__":

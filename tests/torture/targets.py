@@ -27,7 +27,14 @@ from lodestream.container import Header as ContainerHeader
 from lodestream.container.frames import section_extent
 from lodestream.container.index import parse_root
 from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
-from lodestream.errors import FormatWarning, InputError, LodestreamError, StreamError, UnsupportedVersionError
+from lodestream.errors import (
+    FormatWarning,
+    InputError,
+    LodestreamError,
+    StreamError,
+    TooLargeError,
+    UnsupportedVersionError,
+)
 from lodestream.messages import Bye, Credit, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
 from lodestream.plan import plan
 from lodestream.protocol import State
@@ -205,7 +212,7 @@ def _container(data: bytes) -> bool:
             if decoder.header is not None and _points(decoder.header) > 1 << 14:
                 return False
         decoder.finish()
-    except StreamError:
+    except (StreamError, TooLargeError):  # axes may be longer than those that kernels count
         whole = False
     if decoder.layers and zlib.crc32(data) % 4 == 0:
         # What came before the damage is drawn, whatever came after. It takes most of the time: one in four is.

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 import psutil
+import pytest
 
 from tests.server.helpers import eventually
 from tests.torture import streams
@@ -20,17 +23,37 @@ from tests.torture.parts import PARTS, Part, Result
 MIB = 1 << 20
 
 
+def figures(used: Iterable[tuple[int, int]], free: int = 0) -> list[streams.Memory]:
+    """Figures of memory: how many schedules had run, and bytes in use, beside as many bytes free for each schedule."""
+    return [streams.Memory(number, size + number * free, number * free, 300_000) for number, size in used]
+
+
 def test_memory_that_grows_is_told_from_memory_that_is_warm_or_uneven() -> None:
     numbers = range(0, 50_001, 500)
     flat = [(number, 200 * MIB + min(number, streams.WARM_UP) * 10_000) for number in numbers]
-    assert streams.growth(flat) == 0
+    assert streams.growth(figures(flat)) == 0
+    assert streams.growth(figures(flat, free=600)) == 0
     uneven = [(number, size + (number // 500 % 3) * MIB) for number, size in flat]
-    assert abs(streams.growth(uneven) or 0) <= MIB
+    assert abs(streams.growth(figures(uneven)) or 0) <= MIB
     leaking = [(number, size + number * 600) for number, size in flat]
-    assert (streams.growth(leaking) or 0) > streams.MOST_GROWTH
-    assert streams.growth(flat[:5]) is None
-    assert streams.told(flat).count("MiB") <= 13
-    assert streams.told(flat).endswith("after 50,000")
+    assert (streams.growth(figures(leaking)) or 0) > streams.MOST_GROWTH
+    assert streams.growth(figures(flat[:5])) is None
+    assert streams.told(figures(flat)).count("blocks") <= 13
+    assert streams.told(figures(flat)).endswith("after 50,000")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc tells what is free")
+def test_holes_between_blocks_in_use_are_not_in_use() -> None:
+    before = streams.memory(0)
+    # Each smaller than what glibc maps for itself, so that all lie one after another.
+    blocks = [bytearray(b"x" * 100_000) for _ in range(640)]
+    grown = streams.memory(1)
+    assert grown.used - before.used > 50 * MIB
+    del blocks[1::2], blocks[2::3]
+    holes = streams.memory(2)
+    assert holes.free - grown.free > 30 * MIB
+    assert holes.used - before.used < 30 * MIB
+    assert len(blocks) > 200
 
 
 def test_a_result_comes_whole_from_another_process() -> None:
