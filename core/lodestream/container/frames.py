@@ -94,6 +94,8 @@ class FrameReader:
     def _next(self) -> Frame | None:
         if not self._started and not self._start():
             return None
+        if self._offset == _START and self._data and self._data[0] != sections.HEADER:
+            raise CorruptStreamError(f"expected the header section first, got kind {self._data[0]}", _START)
         extent = section_extent(self._data, self._offset)
         if extent is None or len(self._data) < extent[1]:
             return None
@@ -107,8 +109,6 @@ class FrameReader:
         sections.check_signature(bytes(self._data[:_START]))
         if len(self._data) < _START:
             return False
-        if len(self._data) > _START and self._data[_START] != sections.HEADER:
-            raise CorruptStreamError(f"expected the header section first, got kind {self._data[_START]}", _START)
         del self._data[:_START]
         self._offset = _START
         self._started = True
