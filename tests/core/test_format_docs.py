@@ -35,5 +35,5 @@ def test_the_page_has_the_version_and_the_magic_of_the_code() -> None:
 def test_the_page_has_the_starts_of_the_contexts_of_large_units() -> None:
     header = (Path(__file__).parents[2] / "core" / "kernels" / "class_tables.h").read_text()
     starts = [int(number) for number in re.findall(r"\d+", header.partition("CLASS_STARTS[68] = {")[2])[:68]]
-    assert numbers_after("They begin with n = 6 and these P, over 2^16:", 68) == starts
+    assert numbers_after("At first n = 6, and P, over 2^16, is", 68) == starts
     assert "enum { STARTING_COUNT = 6 };" in header
