@@ -164,7 +164,7 @@ def a_call(reading: bool, **changes: int) -> tuple[int, bytes]:
     trellis = bool(changes.get("trellis"))
     table = a_table(SHAPE, (False, False), TILE)
     true = gather(table, [coefficients(SHAPE, 9, 0.5, 1)])
-    tiles, tile = Tiles(table, None, 1), len(table.members) - 1
+    tiles, tile = Tiles(table, None, 1), changes.get("tile", len(table.members) - 1)
     lengths = {**ENOUGH, **{name: value for name, value in changes.items() if name in ENOUGH}}
     first = table.first[tile]
     runs = np.array([[first, table.first[tile + 1] - first, tile, 16, 0, 100, lengths["data"], 1]])
@@ -203,6 +203,7 @@ def test_the_calls_that_others_differ_from_are_taken() -> None:
         *((False, {name: length}) for name in ("data", "costs", "symbols") for length in (0, 1, 7, 10, 16, 1000)[:5]),
         *((False, {name: 1000}) for name in ("data", "symbols")),
         *((False, {"symbols": 9 * 30 * 40 + more}) for more in (0, 3000)),
+        (False, {"tile": 1, "symbols": 1000}),  # enough for its few coefficients, but not for any stripe's
         (False, {"run3": -1}),
         (False, {"run3": -1, "data": 0}),
         (False, {"run4": 2}),
