@@ -109,14 +109,24 @@ LODE_INLINE bool code_flags(bool reads, bool first_pass, struct unit *unit, cons
     return any;
 }
 
+/* In the k-th of four numbers a 1 in the byte that comes k-th in memory. */
+LODE_INLINE units_of_four_t one_in_each(void) {
+    static const uint8_t bytes[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    units_of_four_t ones;
+    memcpy(&ones, bytes, sizeof ones);
+    return ones;
+}
+
 /* Add bits of a plane, 0 or 1 a byte, to what is known of eight coefficients. */
 LODE_INLINE void add_bits(uint32_t *known, eight_t ones, int plane) {
-    uint8_t bits[BLOCK];
-    put_eight(bits, ones);
-    units_of_four_t low = {bits[0], bits[1], bits[2], bits[3]}, high = {bits[4], bits[5], bits[6], bits[7]}, now[2];
+    uint32_t halves[2], bit = UINT32_C(1) << plane;
+    units_of_four_t each = one_in_each(), now[2];
+    memcpy(halves, &ones, sizeof halves);
     memcpy(now, known, sizeof now);
-    now[0] += low << (uint32_t)plane;
-    now[1] += high << (uint32_t)plane;
+    for (int k = 0; k < 2; k++) {
+        units_of_four_t bits = {halves[k], halves[k], halves[k], halves[k]};
+        now[k] += (units_of_four_t)((bits & each) != 0) & bit;
+    }
     memcpy(known, now, sizeof now);
 }
 
@@ -319,13 +329,15 @@ static int64_t count_raw(const struct tiles *tiles, const struct band *band, con
 LODE_INLINE eight_t bits_in(const uint32_t *magnitudes, int plane) {
     units_of_four_t all[2];
     memcpy(all, magnitudes, sizeof all);
-    units_of_four_t low = all[0] >> (uint32_t)plane & 1, high = all[1] >> (uint32_t)plane & 1;
-    uint8_t bits[BLOCK];
-    for (int k = 0; k < BLOCK / 2; k++) {
-        bits[k] = (uint8_t)low[k];
-        bits[k + BLOCK / 2] = (uint8_t)high[k];
+    units_of_four_t each = one_in_each();
+    uint32_t halves[2];
+    for (int k = 0; k < 2; k++) {
+        units_of_four_t ones = (0 - (all[k] >> (uint32_t)plane & 1)) & each;
+        halves[k] = ones[0] | ones[1] | ones[2] | ones[3];
     }
-    return eight_at(bits);
+    eight_t bits;
+    memcpy(&bits, halves, sizeof bits);
+    return bits;
 }
 
 /* Write the raw bits of a stripe behind `bits` others into zeros; those that are there then. */

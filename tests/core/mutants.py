@@ -54,7 +54,8 @@ class Anatomy:
         lengths += [fields.varint() for _ in range(3)]
         counts.append(fields.varint())
         optional = [(fields.byte(), fields.varint(), fields.varint()) for _ in range(counts[2])]
-        place, found = 0, []
+        place = 0
+        found: list[list[bytes]] = []
         for _ in range(2):
             counts.append(fields.varint())
             found.append([])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container import sections
@@ -36,7 +37,7 @@ NAMES = ("holes-closed", "infinite-plane", "cylinder-disc", "error-attributes", 
 def containers() -> dict[str, tuple[bytes, int]]:
     """Small ones with everything that a container may have, and how many channels each has."""
     heights = terrain((9, 12), 4)
-    attributes = {"k": np.rint(heights).astype(np.int8), "t": heights.astype(np.float32)}
+    attributes: dict[str, NDArray[Any]] = {"k": np.rint(heights).astype(np.int8), "t": heights.astype(np.float32)}
     with all_large():
         large = ls.encode(ls.Surface(np.rint(heights).astype(np.int16), attributes=attributes))
     found = {name: (FOLDER / f"{name}.lode").read_bytes() for name in NAMES}

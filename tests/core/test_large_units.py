@@ -156,14 +156,15 @@ SHAPE, TILE = (30, 140), (5, 7)
 ENOUGH = {"data": 20_000, "costs": 17, "symbols": symbols_room(30 * 140, 9), "truth": -1, "state": kernels.PASSES_STATE}
 
 
-def a_call(reading: bool, budget: int = 1 << 20, trellis: bool = False, **changes: int) -> tuple[int, bytes]:
+def a_call(reading: bool, **changes: int) -> tuple[int, bytes]:
     """Code the last tile with something else than what fits: fields of the run, the state or the model, or lengths.
 
     What the kernel returns, and what it then has of the bytes.
     """
+    trellis = bool(changes.get("trellis"))
     table = a_table(SHAPE, (False, False), TILE)
     true = gather(table, [coefficients(SHAPE, 9, 0.5, 1)])
-    tiles, tile = Tiles(table, None, 1), len(table.members) - 1
+    tiles, tile = Tiles(table, None, 1), changes.get("tile", len(table.members) - 1)
     lengths = {**ENOUGH, **{name: value for name, value in changes.items() if name in ENOUGH}}
     first = table.first[tile]
     runs = np.array([[first, table.first[tile + 1] - first, tile, 16, 0, 100, lengths["data"], 1]])
@@ -182,7 +183,7 @@ def a_call(reading: bool, budget: int = 1 << 20, trellis: bool = False, **change
     room = np.zeros(lengths["costs"]), np.zeros(lengths["symbols"], np.uint16)
     models = np.zeros((len(table.members), kernels.TRELLIS_MODEL), np.int32) if trellis else tiles.models
     try:
-        done = kernels.passes(reading, trellis, table.bands, runs, *given, models, data, *room, state, budget)
+        done = kernels.passes(reading, trellis, table.bands, runs, *given, models, data, *room, state, 1 << 20)
     finally:
         assert (data[:100] == 9).all()
         assert (data[-100:] == 9).all()
@@ -202,6 +203,7 @@ def test_the_calls_that_others_differ_from_are_taken() -> None:
         *((False, {name: length}) for name in ("data", "costs", "symbols") for length in (0, 1, 7, 10, 16, 1000)[:5]),
         *((False, {name: 1000}) for name in ("data", "symbols")),
         *((False, {"symbols": 9 * 30 * 40 + more}) for more in (0, 3000)),
+        (False, {"tile": 1, "symbols": 1000}),  # enough for its few coefficients, but not for any stripe's
         (False, {"run3": -1}),
         (False, {"run3": -1, "data": 0}),
         (False, {"run4": 2}),

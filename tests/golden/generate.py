@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import encoder, encoding, large_units, preparation
-from lodestream.allocation import TileCurve
+from lodestream.allocation import TileCurve, assign_layers
 from lodestream.predictors import COEFFICIENT_BITS
 from lodestream.tile_coder import TileCoder, planes_of
 from lodestream.tiles import TileTable, gather
@@ -57,7 +57,7 @@ class Crafted:
     @contextlib.contextmanager
     def applied(self) -> Iterator[None]:
         """While a surface is encoded."""
-        code, assign, most = TileCoder.code, encoding.assign_layers, (1 << COEFFICIENT_BITS) - 1
+        code, most = TileCoder.code, (1 << COEFFICIENT_BITS) - 1
 
         def gathered(*arguments: Any) -> NDArray[np.int32]:
             return np.clip(self.factor * gather(*arguments).astype(np.int64), -most, most).astype(np.int32)
@@ -66,7 +66,7 @@ class Crafted:
             return planes_of(table, true, tile) + (self.ones if tile == 0 else 0)
 
         def assigned(curves: list[TileCurve], *arguments: Any) -> list[NDArray[Any]]:
-            states = assign(curves, *arguments)
+            states = assign_layers(curves, *arguments)
             first = np.zeros_like(states[0])
             for curve in curves:
                 first[curve.tile, curve.channel] = len(curve.bits)

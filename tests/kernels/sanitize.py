@@ -32,7 +32,7 @@ MORE_TESTS = tuple(
     for name in (
         *("picture", "bitplanes_kernel", "lifting", "exactness", "single_error", "mesh_walks", "mesh_lattice"),
         *("hostile_walks", "mesh_attributes", "spreading", "rate_distortion", "bitplanes", "fill", "lzf", "transform"),
-        "kernel_calls",
+        *("kernel_calls", "large_units"),
     )
 )
 
