@@ -160,10 +160,10 @@ def test_a_run_is_checked_when_it_is_its_turn() -> None:
     runs = np.array([arrays.run(0, 3, 0, 0, 50), arrays.run(1, 3, 0, 60, 50)])
     state = np.zeros(kernels.PASSES_STATE, np.int64)
     own = arrays.known, arrays.sign, arrays.flags, arrays.early, np.zeros(0, np.int32), arrays.models, data
-    own += np.zeros(0), np.zeros(0, np.uint16)
-    assert kernels.passes(True, False, table.bands, runs, *own, state, 1) == 0
+    nothing = np.zeros(0), np.zeros(0, np.uint16)
+    assert kernels.passes(True, False, table.bands, runs, *own, *nothing, state, 1) == 0
     with pytest.raises(ValueError, match="do not fit"):
-        kernels.passes(True, False, table.bands, runs, *own, state, 1 << 30)
+        kernels.passes(True, False, table.bands, runs, *own, *nothing, state, 1 << 30)
 
 
 def a_call(**changes: Any) -> int:
