@@ -47,7 +47,7 @@ __all__ = [
     "write_errors",
 ]
 
-VERSION = 0
+VERSION = 1
 MAGIC = b"\xf5LODE\r\n"  # a byte that UTF-8 never has, the name, a line end that text transfer would damage
 SIGNATURE = MAGIC + bytes([VERSION])
 #: Containers began so while the format was made, with versions of their own; none was released.

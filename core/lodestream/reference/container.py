@@ -9,7 +9,7 @@ from .header import Header, read_header
 from .masks import Masks, no_holes, read_masks
 
 MAGIC = b"\xf5LODE\r\n"
-VERSION = 0
+VERSION = 1
 HEADER, LAYER, EXACTNESS, METADATA, ROOT, MASKS, KEPT_MASKS, PAGES, OPTIONAL = 1, 2, 3, 4, 5, 6, 7, 8, 128
 METADATA_LIMIT = 65536
 
