@@ -289,7 +289,7 @@ def test_other_files_and_newer_versions_are_told_apart() -> None:
             Decoder().feed(other)
         assert caught.value.offset == 0
     others = {
-        sections.MAGIC + bytes([sections.VERSION + 1]): "got version 1$",
+        sections.MAGIC + bytes([sections.VERSION + 1]): f"got version {sections.VERSION + 1}$",
         b"\x89LODE\r\n\3": "got version 3 of an",
     }
     for start, words in others.items():
