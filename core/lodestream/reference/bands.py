@@ -30,14 +30,14 @@ class Band:
         rows, columns = -(-shape[0] // 8), -(-shape[1] // 8)
         self.flags = [[0] * columns for _ in range(rows)]
 
-    def look_up(self, plane: int) -> tuple[Magnitudes, list[list[int]]]:
+    def look_up(self, plane: int) -> tuple[Magnitudes | None, list[list[int]]]:
         """Read the parents at a plane.
 
         Returns `part` (int32 (rows, columns)): the parents' part of a context; `grey` (list of list of int): for each
         row of blocks and each block the g of its flag's context.
         """
-        if self.parents is None:
-            return np.zeros(self.shape, np.int32), [[0] * len(row) for row in self.flags]
+        if self.parents is None or not self.parents[1].magnitude.max() >> plane:
+            return None, [[0] * len(row) for row in self.flags]
         geometry, band = self.parents
         part, parent = geometry.look(band.magnitude, plane)
         for axis in (0, 1):

@@ -64,6 +64,10 @@ class Decoder:
             large = 0 < self.header.large <= self.tile(number).level and not indices
             bands = self.bands(number)
             self.units[number] = LargeUnit(bands, top) if large else SmallUnit(bands, top, indices)
+        channels, parent = len(self.header.types), self.tile(number).parent
+        above = parent * channels + number % channels
+        if parent >= 0 and above in self.units:
+            self.units[above].store()
         self.units[number].decode(segment.data, segment.passes)
         self.remaining[number] = self.units[number].remaining
 
@@ -118,6 +122,7 @@ class Decoder:
             shares = header.tiles[tile].shares[channel >= header.coordinates]
             if state[unit] < 0 or unit not in self.units:
                 return [np.zeros(share.shape, np.int64) for share in shares]
+            self.units[unit].store()
             found = []
             for share, band in zip(shares, self.bands(unit), strict=True):
                 step = 0

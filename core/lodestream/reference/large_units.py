@@ -69,7 +69,9 @@ class _Striped:
         middle = w[:, 2:-2]
         down = slice(1, -3), slice(3, -1)
         near = 3 * (across[2:-2] + middle[down[0]] + middle[down[1]]) + 2 * (across[down[0]] + across[down[1]])
-        far = 2 * (wide[2:-2] + middle[:-4] + middle[4:]) + wide[down[0]] + wide[down[1]] + part.astype(np.int16)
+        far = 2 * (wide[2:-2] + middle[:-4] + middle[4:]) + wide[down[0]] + wide[down[1]]
+        if part is not None:
+            far += part.astype(np.int16)
         far += across[:-4] + across[4:] + wide[:-4] + wide[4:]
         self.near_s = (near > 0).ravel()[self.order]
         self.context_s = (NEAR[near] + FAR[far]).ravel()[self.order].astype(np.int64)
@@ -128,6 +130,9 @@ class LargeUnit:
             position += 2 * self.next
             if second:
                 position += self._raw(data[position:], plane)
+
+    def store(self) -> None:
+        """Do nothing: the bands' arrays are up to date."""
 
     def _pass(self, striped: _Striped, plane: int, second: bool) -> None:
         fresh = striped.m_s == 0

@@ -58,6 +58,7 @@ class _Lists:
         self.odd = [0] * self.size
         self.visited = [0] * self.size
         self.sums: list[int] = []
+        self.found: list[int] = []
         self.neighbours = _neighbours(band.kind, stride)
         places = (np.arange(rows)[:, None] + 2) * stride + np.arange(columns) + 2
         self.blocks = [
@@ -69,12 +70,23 @@ class _Lists:
     def begin(self, plane: int) -> None:
         """Take the sums and the parents of a plane."""
         part, self.grey = self.band.look_up(plane)
-        u = np.minimum(np.array(self.magnitudes, np.int32) >> plane, 3)
-        sums = np.pad(part, 2).ravel()
-        low, high = 2 * self.stride + 2, self.size - 2 * self.stride - 2
-        for offset, weight in self.neighbours:
-            sums[low:high] += weight * u[low + offset : high + offset]
-        self.sums = sums.tolist()
+        dense = 4 * len(self.found) > self.size
+        if part is None and not dense:
+            self.sums = [0] * self.size
+        else:
+            sums = np.zeros(self.size, np.int32) if part is None else np.pad(part, 2).ravel()
+            if dense:
+                u = np.minimum(np.array(self.magnitudes, np.int32) >> plane, 3)
+                low, high = 2 * self.stride + 2, self.size - 2 * self.stride - 2
+                for offset, weight in self.neighbours:
+                    sums[low:high] += weight * u[low + offset : high + offset]
+            self.sums = sums.tolist()
+        if not dense:  # then it takes less time to go from one significant coefficient to the next
+            sums_, magnitudes = self.sums, self.magnitudes
+            for i in self.found:
+                u_ = min(magnitudes[i] >> plane, 3)
+                for offset, weight in self.neighbours:
+                    sums_[i + offset] += weight * u_
 
     def _array(self, values: list[int]) -> NDArray[np.int32]:
         rows, columns = self.band.shape
@@ -101,6 +113,7 @@ class SmallUnit:
         self.remaining = 2 * top - 1
         self.top = top
         self.indices = indices
+        self.stale = False
         self.contexts = new_contexts(INDICES + (76 if indices else 0))
         self.coder = RangeCoder(b"", self.contexts)
 
@@ -119,8 +132,14 @@ class SmallUnit:
                     self._second(lists, plane)
                 elif plane or not self.indices:
                     self._first(lists, plane)
-        for lists in self.bands:
-            lists.store()
+        self.stale = True
+
+    def store(self) -> None:
+        """Bring the bands' arrays up to date."""
+        if self.stale:
+            for lists in self.bands:
+                lists.store()
+        self.stale = False
 
     def _first(self, lists: _Lists, plane: int) -> None:
         for row, flags in zip(lists.blocks, lists.band.flags, strict=True):
@@ -218,6 +237,7 @@ class SmallUnit:
                         sums[i + offset] += weight
                 if magnitude:
                     break
+                lists.found.append(i)
                 if first:
                     lists.early[i] = 1
                 across = SIGNUM[signs[i - 1] + signs[i + 1]]
