@@ -41,20 +41,21 @@ class Index:
 
     `layer_errors`, `level_errors` (list of Errors): after each layer, and of each level; `segments` (list of list of
     Entry): for each layer its segments by rising number of the unit; `pieces` (list of Entry): in the order of the
-    exactness section.
+    exactness section; `optional` (list of (int, int, int)): of each optional section its kind, offset and length.
     """
 
     layer_errors: list[Errors]
     level_errors: list[Errors]
     segments: list[list[Entry]]
     pieces: list[Entry]
+    optional: list[tuple[int, int, int]]
 
 
 def read_index(data: bytes, container: Container) -> Index:
     """Read the index of a whole container.
 
     `data` (bytes): the file; `container` (Container): what `read_container` found in it. Raises CorruptStreamError if
-    footer, root or pages are damaged or contradict each other; TruncatedStreamError if A section is not all there.
+    footer, root or pages are damaged or contradict each other; TruncatedStreamError if a section is not all there.
     """
     header = container.header
     channels = len(header.types)
@@ -79,11 +80,8 @@ def read_index(data: bytes, container: Container) -> Index:
     level_errors = [fields.errors(channels) for _ in range(header.finest + 1)]
     position = fields.varint()
     lengths += [fields.varint(), fields.varint()]
-    optional = {}
-    for _ in range(fields.count(3)):
-        fields.u8()
-        place = fields.varint()
-        optional[place] = fields.varint()
+    directory = [(fields.u8(), fields.varint(), fields.varint()) for _ in range(fields.count(3))]
+    optional = {place: length for _, place, length in directory}
     tables = []
     for count in (len(header.tiles), len(windows_of(header, container.masks)) if lengths[-2] else 0):
         if fields.varint() != -(-count // PAGE):
@@ -102,7 +100,7 @@ def read_index(data: bytes, container: Container) -> Index:
     parts = [[_page(book, *entry) for entry in table] for table in tables]
     book.end()
     segments = _segments(parts[0], container, [ends[layer] - 4 for layer in range(header.layers)])
-    return Index(layer_errors, level_errors, segments, _pieces(parts[1], container, ends[-3] - 4))
+    return Index(layer_errors, level_errors, segments, _pieces(parts[1], container, ends[-3] - 4), directory)
 
 
 def _page(book: Fields, length: int, told: int) -> Fields:
