@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lodestream.errors import CorruptStreamError, StreamError
 from lodestream.exactness import decode_piece, encode_piece
 from lodestream.lattice import offset_lattice
+from lodestream.number_line import PATTERNS, from_line
 from lodestream.reference import exactness as reference
 
 Values = NDArray[Any]
@@ -255,3 +256,15 @@ def test_the_reference_reads_the_same() -> None:
         assert decode_piece(restored, piece, 0).tobytes() == values.tobytes()
         rules.add(piece[0] & 3)
     assert rules == {1, 3}
+
+
+@given(
+    places=st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-(2**32), 2**32), min_size=1, max_size=20),
+    argument=st.integers(0, 63),
+    dtype=st.sampled_from(["i1", "u2", "i4", "u8", "f4", "f8"]),
+)
+def test_any_place_has_the_value_that_the_reference_gives_it(places: list[int], argument: int, dtype: str) -> None:
+    kind, given_places = np.dtype(dtype), np.array(places, np.int64)
+    argument %= 8 * kind.itemsize
+    expected = reference._values(given_places, kind, 1, argument)
+    assert from_line(PATTERNS, argument, given_places, kind).tobytes() == expected.tobytes()

@@ -196,6 +196,15 @@ def test_other_values_of_iblank_are_kept(tmp_path: Path) -> None:
     assert surface.attributes["iblank"].tolist() == [[1, 1], [0, 2], [-3, 1], [1, 1]]
 
 
+@pytest.mark.parametrize(("word", "value"), [("7e30", 2**31 - 1), ("-7e30", -(2**31)), ("1e99", 2**31 - 1)])
+def test_values_of_iblank_beyond_32_bits_are_the_nearest_ones(tmp_path: Path, word: str, value: int) -> None:
+    path = tmp_path / "grid.fmt"
+    numbers = " ".join(f"{value}.5" for value in range(24))
+    path.write_text(f"2 4\n {numbers[: numbers.index('16.5')]} 1 1 0 2 -3 1 1 {word}\n")
+    surface = formats.read(path, dimensions="2")
+    assert surface.attributes["iblank"].tolist() == [[1, 1], [0, 2], [-3, 1], [1, value]]
+
+
 def test_q_and_function_files_give_attributes(tmp_path: Path) -> None:
     grid = Written(((4, 3, 1), (2, 3, 1)), multi=True, iblank=False, endian=">", records=True)
     (tmp_path / "g.x").write_bytes(grid.binary())

@@ -169,7 +169,10 @@ class _Text:
 
     def array(self, place: int, count: int, layout: Layout, kind: str) -> NDArray[Any]:
         values = self._numbers[place : place + count]
-        return values if kind == "f" else np.nan_to_num(values).astype(np.int32)
+        if kind == "f":
+            return values
+        limits = np.iinfo(np.int32)
+        return np.clip(np.nan_to_num(values), limits.min, limits.max).astype(np.int32)
 
 
 class _Binary:

@@ -91,7 +91,7 @@ def _values(places: NDArray[np.int64], dtype: np.dtype[Any], rule: int, t: int) 
     high = 8 * dtype.itemsize - 1
     m = np.where(places < 0, -1 - places, places).astype(np.uint64) << np.uint64(t)
     sign = (places < 0).astype(np.uint64) << np.uint64(high)
-    return ((m & np.uint64((1 << high) - 1)) | sign).astype(_bits(dtype)).view(dtype)
+    return (m | sign).astype(_bits(dtype)).view(dtype)
 
 
 def _differences(
