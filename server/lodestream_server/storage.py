@@ -330,7 +330,10 @@ class Storage:
                     sync_folder(self._at.containers)
 
     def failed(self, surface: str, reason: str) -> None:
-        """Record that a reader rejected the files of a surface; they stay until the surface is deleted."""
+        """Record that a reader rejected the files of a surface; they stay until the surface is deleted.
+
+        Where that cannot be recorded the surface waits: what is told as failed stays so, after a restart too.
+        """
         self._stop(surface, "failed", reason)
 
     def postpone(self, surface: str, reason: str) -> None:
@@ -348,6 +351,8 @@ class Storage:
             except OSError as error:
                 # What this says is found out again after a restart.
                 _log.error("%s: the record could not be written: %s", surface, error)
+                if state == "failed":
+                    made = replace(made, state="waiting", reason=f"{reason} (this could not be recorded: {error})")
                 self._catalog.put(made)
 
     def retry(self, surface: str) -> Record:

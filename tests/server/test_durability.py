@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import itertools
 import logging
@@ -127,3 +128,26 @@ def test_the_power_fails_after_any_step(
     storage.delete(second)
     storage.close()
     assert len(seen) > 50
+
+
+def test_a_surface_has_not_failed_until_that_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a client was told as failed would be queued again after a restart."""
+    surface = next(iter(UPLOADS))
+    storage = Storage(tmp_path / "data")
+    take(storage, surface)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "_write", full)
+        storage.failed(surface, "no surface")
+    record = storage.get(surface)
+    assert record.state == "waiting"
+    assert record.reason is not None
+    assert record.reason.startswith("no surface (this could not be recorded: ")
+    storage.failed(surface, "no surface")
+    storage.close()
+    again = Storage(tmp_path / "data")
+    assert again.get(surface).state == "failed"
+    again.close()
