@@ -16,10 +16,10 @@ help: ## this list
 demo: kernels ## stream a million points over a slow link, stop early, and show what came
 	@$(BIN)/lodestream demo $(ARGS)
 
-# The tests start many processes: none is to compile every module again, whatever the shell's environment says. Three
+# The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
 # of pytest's share two processors, since some of the tests wait for a clock.
 test: kernels ## run the tests; ARGS="-k name" for some of them
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 3 --dist loadfile $(ARGS)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 4 --dist loadfile $(ARGS)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
