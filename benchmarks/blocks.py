@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 import lodestream
 from lodestream import Block, Surface
-from lodestream.mask import encode_mask
+from lodestream.entropy.mask import encode_mask
 
 from .arrays import fractal, load
 from .measure import note, table

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream
-from lodestream import bitplanes, transform
-from lodestream.layout import Layout
-from lodestream.tiles import Tiles, TileTable, gather
+from lodestream.entropy import bitplanes
+from lodestream.entropy.tiles import Tiles, TileTable, gather
+from lodestream.grid.layout import Layout
+from lodestream.transform import pyramid
 
 from .arrays import Array, load
 from .measure import medians, note, table
@@ -43,10 +44,10 @@ class Channel:
     def of(cls, plane: NDArray[Any], step: float) -> Channel:
         """Quantise and transform a channel."""
         layout = Layout.single((plane.shape[0], plane.shape[1]), (False, False), TILE)
-        work = transform.allocate(layout.grids[0].shape)
+        work = pyramid.allocate(layout.grids[0].shape)
         centre = (float(plane.min()) + float(plane.max())) / 2
         work[...] = np.rint((plane.astype(np.float64) - centre) / step)
-        transform.forward([work], layout)
+        pyramid.forward([work], layout)
         bands = [[work[slice(*band.rows), slice(*band.columns)] for band in tile.bands] for tile in layout.tiles]
         planes = tuple(max(int(np.abs(band).max()).bit_length() for band in tile) for tile in bands)
         room = tuple(
@@ -169,13 +170,13 @@ def _decode(prefix: bytes) -> NDArray[Any]:
 
 def _inverse(plane: NDArray[Any], step: float) -> Callable[[], None]:
     layout = Layout.single((plane.shape[0], plane.shape[1]), (False, False), TILE)
-    work = transform.allocate(layout.grids[0].shape)
+    work = pyramid.allocate(layout.grids[0].shape)
     work[...] = np.rint((plane.astype(np.float64) - float(plane.mean())) / step)
-    predictors = transform.forward([work], layout, True)
+    predictors = pyramid.forward([work], layout, True)
     coefficients = np.array(work)
 
     def undo() -> None:
         work[...] = coefficients
-        transform.inverse([work], layout, predictors, layout.levels)
+        pyramid.inverse([work], layout, predictors, layout.levels)
 
     return undo

@@ -9,8 +9,8 @@ import numpy as np
 
 import lodestream
 from lodestream.container import read_index
-from lodestream.plan import plan
-from lodestream.plans import Mark
+from lodestream.planning.plan import Mark
+from lodestream.planning.planner import plan
 
 from .arrays import Array, load
 from .measure import note, table

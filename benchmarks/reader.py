@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 
 import msgpack
 
-from lodestream.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, Open
-from lodestream.wire import serialize
+from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, Open
+from lodestream.protocol.wire import serialize
 
 _BINARY, _CLOSE, _PING, _PONG = 2, 8, 9, 10
 _BUFFER = 256 * 1024

@@ -30,7 +30,7 @@ import numpy as np
 
 import lodestream as ls
 from lodestream.container import read_index
-from lodestream.plan import plan
+from lodestream.planning.planner import plan
 from lodestream_client import sync
 
 from .__main__ import processor

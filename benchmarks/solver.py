@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import scipy.linalg
 
-from lodestream import paper
+from lodestream.transform import paper
 
 from .measure import medians, table
 

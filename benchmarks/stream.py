@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 
 import lodestream as ls
-from lodestream.messages import MAX_CREDIT
+from lodestream.protocol.messages import MAX_CREDIT
 from lodestream_client import aio, sync
 from lodestream_server import running_server
 from tests.links import Fault, Link

@@ -6,8 +6,8 @@ import numpy as np
 import pywt
 
 import lodestream
-from lodestream import paper, transform
-from lodestream.layout import Layout
+from lodestream.grid.layout import Layout
+from lodestream.transform import paper, pyramid
 
 from .arrays import fractal
 from .measure import medians, note, table
@@ -19,26 +19,26 @@ def main() -> None:
     warm = surface.copy()
     layout = Layout.single(surface.shape, (False, False), (7, 7))
     lattice = (surface - 32768).astype(np.int32)
-    work = transform.allocate(lattice.shape)
+    work = pyramid.allocate(lattice.shape)
 
     work[...] = lattice
-    predictors = transform.forward([work], layout)
+    predictors = pyramid.forward([work], layout)
     coefficients = np.array(work)
     bands = pywt.wavedec2(surface, "bior2.2")
 
     def forward(fit: bool) -> None:
         work[...] = lattice
-        transform.forward([work], layout, fit)
+        pyramid.forward([work], layout, fit)
 
     def inverse() -> None:
         work[...] = coefficients
-        transform.inverse([work], layout, predictors, layout.levels)
+        pyramid.inverse([work], layout, predictors, layout.levels)
 
     seconds = medians(
         {
             "np.copyto, float64": lambda: np.copyto(warm, surface),
             "lodestream.hierarchy, float64": lambda: lodestream.hierarchy(surface),
-            "lodestream.paper.hierarchy, float64": lambda: paper.hierarchy(surface),
+            "lodestream.transform.paper.hierarchy, float64": lambda: paper.hierarchy(surface),
             "pywt.wavedec2(x, 'bior2.2'), float64": lambda: pywt.wavedec2(surface, "bior2.2"),
             "pywt.waverec2(c, 'bior2.2'), float64": lambda: pywt.waverec2(bands, "bior2.2"),
             "integers, forward": lambda: forward(False),

@@ -12,10 +12,10 @@ import numpy as np
 import lodestream as ls
 from lodestream.container import Index, read_index
 from lodestream.container.sections import FOOTER_LENGTH
-from lodestream.plan import plan
-from lodestream.range_download import RangeDownload
-from lodestream.reception import Reception
-from lodestream.selection import wish_of
+from lodestream.planning.planner import plan
+from lodestream.planning.selection import wish_of
+from lodestream.transfer.range_download import RangeDownload
+from lodestream.transfer.receiver_state import Reception
 
 from .arrays import fractal
 from .measure import note, table

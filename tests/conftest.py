@@ -29,21 +29,21 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 #: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
 LONGEST = (
     "tests/history/test_runs.py",
-    "tests/core/test_reference_decoder.py",
-    "tests/core/test_many_parts.py",
-    "tests/core/test_watertight.py",
-    "tests/client/test_interrupted.py",
-    "tests/core/test_fallback.py",
+    "tests/core/decoding/test_reference_decoder.py",
+    "tests/core/grid/test_many_patches.py",
+    "tests/core/grid/test_watertight.py",
+    "tests/client/stream/test_interrupted.py",
+    "tests/core/decoding/test_fallback.py",
     "tests/client/test_without_kernels.py",
-    "tests/core/test_decoder.py",
+    "tests/core/decoding/test_decoder.py",
     "tests/kernels/test_sanitizers.py",
-    "tests/core/test_topology.py",
-    "tests/server/test_floods.py",
-    "tests/server/test_levels.py",
+    "tests/core/grid/test_topology.py",
+    "tests/server/connections/test_floods.py",
+    "tests/server/builds/test_levels.py",
     "tests/faults/test_sample.py",
-    "tests/server/test_crowds.py",
-    "tests/server/test_kills.py",
-    "tests/server/test_strangers.py",
+    "tests/server/connections/test_crowds.py",
+    "tests/server/storage/test_kills.py",
+    "tests/server/access/test_strangers.py",
 )
 
 
@@ -80,9 +80,9 @@ def one_fork_server() -> Iterator[None]:
     Those that are programs of their own do as they always do. For the whole session, since tests of several folders
     take turns in a process of pytest-xdist.
     """
-    from lodestream_server import jobs
-    from lodestream_server.processes import ForkServer
-    from tests.server import slow
+    from lodestream_server.builds import jobs
+    from lodestream_server.builds.processes import ForkServer
+    from tests.server.builds import slow
 
     class Shared(ForkServer):
         def close(self) -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 import lodestream
 from lodestream.container import read_index
-from lodestream.plan import plan
-from lodestream.plans import Mark
+from lodestream.planning.plan import Mark
+from lodestream.planning.planner import plan
 
 from .trial import TARGETS, Trial
 

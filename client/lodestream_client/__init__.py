@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     )
     from .aio import list_surfaces as list
     from .errors import SilenceError, UnreachableError
-    from .requests import Description, Identity
+    from .requests.api import Description, Identity
 
 _HOMES = {
     "Description": ("requests", "Description"),

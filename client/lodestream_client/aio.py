@@ -20,11 +20,11 @@ from typing import Any, TypeVar
 
 from lodestream.target import Tolerance
 
-from . import problems, requests
-from .aio_stream import Stream, connect
-from .answers import Answer, Incoming
-from .bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
-from .requests import Description, Flow, Identity, Progress
+from .requests import api, problems
+from .requests.answers import Answer, Incoming
+from .requests.api import Description, Flow, Identity, Progress
+from .requests.bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
+from .stream.aio_stream import Stream, connect
 
 __all__ = [
     "Stream",
@@ -63,24 +63,24 @@ async def upload(
     parcel = await _prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
-        return await _run(requests.upload(url, parcel.parameters, body, wait, progress), url, token)
+        return await _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)
 
 
 async def retry(
     url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None
 ) -> Description:
     """Ask the server to build a surface again that waits, failed or is missing; see `lodestream_client.sync.retry`."""
-    return await _run(requests.retry(url, wait, progress), url, token)
+    return await _run(api.retry(url, wait, progress), url, token)
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
     """All surfaces of a server; also exported as ``list``."""
-    return await _run(requests.list_surfaces(url), url, token)
+    return await _run(api.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
     """State and description of one surface."""
-    return await _run(requests.describe(url), url, token)
+    return await _run(api.describe(url), url, token)
 
 
 async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
@@ -88,24 +88,24 @@ async def describe_file(url: str, *, token: str | None = None, max_vertices: int
 
     `max_vertices` limits the memory of the container's tables, see `connect`.
     """
-    return await _run(requests.describe_file(url, max_vertices), url, token)
+    return await _run(api.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
     """What identifies a surface's container, or a container file."""
-    return await _run(requests.identify(url), url, token)
+    return await _run(api.identify(url), url, token)
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
     """Delete a surface from its server."""
-    await _run(requests.delete(url), url, token)
+    await _run(api.delete(url), url, token)
 
 
 async def fetch_range(
-    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = requests.TIMEOUT
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT
 ) -> bytes:
     """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
-    return await _run(requests.fetch_range(url, offset, length), url, token, timeout)
+    return await _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 
 class _GivenUpError(Exception):
@@ -128,24 +128,24 @@ async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress 
         raise
 
 
-async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = requests.TIMEOUT) -> T:
+async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
     import httpx
 
     answer: Answer | None = None
-    async with httpx.AsyncClient(**requests.client_options(url, timeout, asynchronous=True)) as client:
+    async with httpx.AsyncClient(**api.client_options(url, timeout, asynchronous=True)) as client:
         while True:
             try:
                 step = flow.send(answer)
             except StopIteration as end:
                 result: T = end.value
                 return result
-            if isinstance(step, requests.Pause):
+            if isinstance(step, api.Pause):
                 await asyncio.sleep(step.seconds)
                 answer = None
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
-                async with client.stream(content=content, **requests.request_options(step, url, token)) as response:
+                async with client.stream(content=content, **api.request_options(step, url, token)) as response:
                     incoming = Incoming(response, step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
                         async for piece in response.aiter_raw():

@@ -18,11 +18,11 @@ from typing import Any, TypeVar
 
 from lodestream.target import Tolerance
 
-from . import problems, requests
-from .answers import Answer, Incoming
-from .bodies import Asked, Closure, Source, opened, prepared
-from .requests import Description, Flow, Identity, Progress
-from .sync_stream import Stream, connect
+from .requests import api, problems
+from .requests.answers import Answer, Incoming
+from .requests.api import Description, Flow, Identity, Progress
+from .requests.bodies import Asked, Closure, Source, opened, prepared
+from .stream.sync_stream import Stream, connect
 
 __all__ = [
     "Stream",
@@ -105,7 +105,7 @@ def upload(
     parcel = prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
-        return _run(requests.upload(url, parcel.parameters, body, wait, progress), url, token)
+        return _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)
 
 
 def retry(url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None) -> Description:
@@ -135,17 +135,17 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
     UnreachableError
         If there is no connection.
     """
-    return _run(requests.retry(url, wait, progress), url, token)
+    return _run(api.retry(url, wait, progress), url, token)
 
 
 def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
     """All surfaces of a server; also exported as ``list``."""
-    return _run(requests.list_surfaces(url), url, token)
+    return _run(api.list_surfaces(url), url, token)
 
 
 def describe(url: str, *, token: str | None = None) -> Description:
     """State and description of one surface."""
-    return _run(requests.describe(url), url, token)
+    return _run(api.describe(url), url, token)
 
 
 def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
@@ -153,44 +153,42 @@ def describe_file(url: str, *, token: str | None = None, max_vertices: int | Non
 
     `max_vertices` limits the memory of the container's tables, see `connect`.
     """
-    return _run(requests.describe_file(url, max_vertices), url, token)
+    return _run(api.describe_file(url, max_vertices), url, token)
 
 
 def identify(url: str, *, token: str | None = None) -> Identity:
     """What identifies a surface's container, or a container file."""
-    return _run(requests.identify(url), url, token)
+    return _run(api.identify(url), url, token)
 
 
 def delete(url: str, *, token: str | None = None) -> None:
     """Delete a surface from its server."""
-    _run(requests.delete(url), url, token)
+    _run(api.delete(url), url, token)
 
 
-def fetch_range(
-    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = requests.TIMEOUT
-) -> bytes:
+def fetch_range(url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT) -> bytes:
     """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
-    return _run(requests.fetch_range(url, offset, length), url, token, timeout)
+    return _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 
-def _run(flow: Flow[T], url: str, token: str | None, timeout: float = requests.TIMEOUT) -> T:
+def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
     import httpx
 
     answer: Answer | None = None
-    with httpx.Client(**requests.client_options(url, timeout)) as client:
+    with httpx.Client(**api.client_options(url, timeout)) as client:
         while True:
             try:
                 step = flow.send(answer)
             except StopIteration as end:
                 result: T = end.value
                 return result
-            if isinstance(step, requests.Pause):
+            if isinstance(step, api.Pause):
                 time.sleep(step.seconds)
                 answer = None
                 continue
             content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
             try:
-                with client.stream(content=content, **requests.request_options(step, url, token)) as response:
+                with client.stream(content=content, **api.request_options(step, url, token)) as response:
                     incoming = Incoming(response, step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
                         for piece in response.iter_raw():

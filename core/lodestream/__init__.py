@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from . import paper
-    from .decoder import Decoder, decode
-    from .encoder import encode
+    from .decoding.decoder import Decoder, decode
+    from .decoding.view import View
+    from .encoding.encoder import encode
     from .errors import (
         CorruptStreamError,
         FormatError,
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
         UnsupportedVersionError,
     )
     from .formats import read, write
-    from .levels import coarsen, hierarchy
     from .surface import Block, Surface
     from .target import Target, Tolerance
-    from .view import View
+    from .transform import paper
+    from .transform.least_squares import coarsen, hierarchy
 
 _HOMES = {
     "Block": "surface",
-    "Decoder": "decoder",
-    "View": "view",
-    "decode": "decoder",
-    "encode": "encoder",
+    "Decoder": "decoding.decoder",
+    "View": "decoding.view",
+    "decode": "decoding.decoder",
+    "encode": "encoding.encoder",
     "CorruptStreamError": "errors",
     "FormatError": "errors",
     "FormatWarning": "errors",
@@ -61,8 +61,8 @@ _HOMES = {
     "UnsupportedVersionError": "errors",
     "read": "formats",
     "write": "formats",
-    "coarsen": "levels",
-    "hierarchy": "levels",
+    "coarsen": "transform.least_squares",
+    "hierarchy": "transform.least_squares",
     "Surface": "surface",
     "Target": "target",
     "Tolerance": "target",
@@ -102,7 +102,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "paper":
-        return importlib.import_module(".paper", __name__)
+        return importlib.import_module(".transform.paper", __name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .app import create_app
+    from .operation.settings import Settings
     from .running import running_server
-    from .settings import Settings
 
 _HOMES = {"Settings": "settings", "create_app": "app", "running_server": "running"}
 

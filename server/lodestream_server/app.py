@@ -13,20 +13,21 @@ from fastapi.middleware.cors import CORSMiddleware
 import lodestream
 from lodestream.library import require
 
-from . import files, interface, pages, problems, streams, surfaces
-from .access import Access
-from .containers import Containers
-from .gate import Gate
-from .jobs import Builder
-from .level_files import LevelFiles
-from .level_queue import LevelQueue
-from .limits import Limits
-from .metrics import Metrics
-from .observation import Observation
-from .pace import Pace, Paced
-from .routing import State
-from .settings import Settings
-from .storage import Storage
+from . import problems
+from .access.access import Access
+from .access.gate import Gate
+from .access.limits import Limits
+from .builds.jobs import Builder
+from .builds.level_files import LevelFiles
+from .builds.level_queue import LevelQueue
+from .operation.metrics import Metrics
+from .operation.observation import Observation
+from .operation.pace import Pace, Paced
+from .operation.settings import Settings
+from .routes import files, interface, pages, streams, surfaces
+from .routes.routing import State
+from .storage.containers import Containers
+from .storage.storage import Storage
 
 __all__ = ["create_app"]
 

@@ -135,8 +135,8 @@ class _Answer:
     title: str
 
 
-#: The first row whose class fits says what is answered. The codes of streams (`lodestream.messages.CODES`) are the same
-#: words where they mean the same.
+#: The first row whose class fits says what is answered. The codes of streams (`lodestream.protocol.messages.CODES`) are
+#: the same words where they mean the same.
 _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (TooLargeError, _Answer(413, "too-large", "The request is too large")),
     (OptionError, _Answer(422, "bad-option", "An option does not exist, or its value is not valid")),

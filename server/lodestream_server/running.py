@@ -15,15 +15,15 @@ from typing import Any
 import uvicorn
 
 from lodestream.errors import LodestreamError
-from lodestream.messages import MAX_MESSAGE
+from lodestream.protocol.messages import MAX_MESSAGE
 
 from .app import create_app
-from .connections import connections
-from .cuts import Cuts
-from .frames import stream_connections
-from .logs import drain
-from .settings import Settings
-from .storage import Storage
+from .connections.connections import connections
+from .connections.cuts import Cuts
+from .connections.frames import stream_connections
+from .operation.logs import drain
+from .operation.settings import Settings
+from .storage.storage import Storage
 
 __all__ = ["Server", "make_server", "running_server", "serve_alone"]
 

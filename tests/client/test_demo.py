@@ -13,7 +13,7 @@ import pytest
 from lodestream_client.demo.plain import beginning, overview
 from lodestream_client.demo.terrain import bilinear, terrain
 
-from .test_program import environment
+from .commands.test_program import environment
 
 SHAPE = (128, 160)
 

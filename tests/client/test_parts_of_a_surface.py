@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 import lodestream as ls
 import lodestream_client as client
 from lodestream.container import read_index
-from lodestream.plan import plan
-from lodestream.selection import wish_of
+from lodestream.planning.planner import plan
+from lodestream.planning.selection import wish_of
 from lodestream_client import sync
-from lodestream_client.stream import BaseStream
+from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, linked
 
 ROWS, COLUMNS = 260, 230

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream.seams import restore
+from lodestream.coordinates.seams import restore
 from tests.core.test_real_surfaces import DATA, ROWS, Row, needed, of, read, valid_of
 
 from .conftest import Run

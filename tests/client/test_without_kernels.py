@@ -80,7 +80,7 @@ def test_decode_takes_every_limit(bare: Bare, run: Run, container_file: Path, tm
 
 def test_what_decodes_nothing_says_nothing(bare: Bare, container_file: Path) -> None:
     assert bare.done("info", container_file) == ""
-    code = "import numpy, lodestream.paper; lodestream.coarsen(numpy.ones((9, 9)))"
+    code = "import numpy, lodestream.transform.paper; lodestream.coarsen(numpy.ones((9, 9)))"
     assert bare.run("-W", "error", "-c", code).stderr == ""
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import large_units
 from lodestream.container import Index, read_index
 from lodestream.container.fields import told
-from lodestream.decoder import Decoder, View
-from lodestream.plans import Plan
+from lodestream.decoding.decoder import Decoder, View
+from lodestream.encoding import large_units
+from lodestream.planning.plan import Plan
 
 __all__ = [
     "SAMPLES",

@@ -18,9 +18,9 @@ from lodestream import CorruptStreamError
 from lodestream.container import describe, sections
 from lodestream.container.fields import FieldWriter
 from lodestream.container.frames import section_extent
-from lodestream.mask import encode_mask
-from lodestream.plan import plan
-from lodestream.selection import wish_of
+from lodestream.entropy.mask import encode_mask
+from lodestream.planning.planner import plan
+from lodestream.planning.selection import wish_of
 
 from .surfaces import follow, index_of, terrain, torus
 

@@ -16,7 +16,7 @@ SOURCE = Path(ls.__file__)
 def test_every_public_name_is_there_sorted_and_from_where_it_is_said_to_be() -> None:
     assert sorted(ls.__all__, key=str.lower) == sorted([*ls._HOMES, "paper"], key=str.lower)
     assert len(set(ls.__all__)) == len(ls.__all__)
-    assert ls.paper is importlib.import_module("lodestream.paper")
+    assert ls.paper is importlib.import_module("lodestream.transform.paper")
     for name in ls._HOMES:
         home = importlib.import_module(f"lodestream.{ls._HOMES[name]}")
         assert name in home.__all__

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import formats
+from lodestream.encoding.preparation import Preparation
 from lodestream.errors import FormatWarning
-from lodestream.preparation import Preparation
 from lodestream.surface import Block, Surface
 
 #: What these files have that a surface, or a mesh that is written, has not.

@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
+from lodestream.coordinates.seams import restore
 from lodestream.errors import FormatError
-from lodestream.seams import restore
 from lodestream.surface import Surface
 
-from .meshes import drawn
+from .mesh.meshes import drawn
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import formats
+from lodestream.coordinates.height_fields import coordinates, to_xyz
+from lodestream.coordinates.seams import restore
+from lodestream.encoding.preparation import Preparation
 from lodestream.errors import FormatError, FormatWarning
-from lodestream.heights import coordinates, to_xyz
-from lodestream.preparation import Preparation
-from lodestream.seams import restore
 from lodestream.surface import Surface
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -1,7 +1,7 @@
 """Folders as servers leave them: with surfaces in every state, with leftovers, with damage.
 
 These are the only lines of the harness that know how a folder is laid out (docs/formats.md and the head of
-`lodestream_server.storage`).
+`lodestream_server.storage.storage`).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from lodestream_server import forkserver, jobs, processes, worker
+from lodestream_server.builds import forkserver, jobs, processes, worker
 
 __all__ = ["DIED", "main"]
 
@@ -36,10 +36,10 @@ _MODULES = (
     "lodestream_client.__main__",
     "lodestream_client.program",
     "lodestream_server.app",
-    "lodestream_server.fsck_command",
-    "lodestream_server.repair",
+    "lodestream_server.commands.fsck",
+    "lodestream_server.maintenance.repair",
     "lodestream_server.running",
-    "lodestream_server.token_command",
+    "lodestream_server.commands.token",
     "uvicorn.protocols.http.auto",
     "uvicorn.protocols.websockets.websockets_sansio_impl",
 )

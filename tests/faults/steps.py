@@ -11,8 +11,8 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.server.connections.sockets import Place, Reader, read_stream
 from tests.server.helpers import npy
-from tests.server.sockets import Place, Reader, read_stream
 
 from .forking import DIED
 from .operation import Operation, Step, UnusableError

@@ -20,11 +20,11 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import encoder, encoding, large_units, preparation
-from lodestream.allocation import TileCurve, assign_layers
-from lodestream.predictors import COEFFICIENT_BITS
-from lodestream.tile_coder import TileCoder, planes_of
-from lodestream.tiles import TileTable, gather
+from lodestream.encoding import encoder, large_units, preparation, stages
+from lodestream.encoding.allocation import TileCurve, assign_layers
+from lodestream.entropy.tile_coder import TileCoder, planes_of
+from lodestream.entropy.tiles import TileTable, gather
+from lodestream.transform.predictors import COEFFICIENT_BITS
 
 __all__ = ["FOLDER", "Original", "digest", "digests", "expectations", "lines", "originals"]
 
@@ -86,10 +86,10 @@ class Crafted:
                 patch.setattr(preparation, "tile_exponents", lambda *_: self.tile)
             if self.factor > 1:
                 patch.setattr(encoder, "_COARSER", ())  # no container of fewer bits is tried
-                patch.setattr(encoding, "gather", gathered)
+                patch.setattr(stages, "gather", gathered)
             if self.ones:
-                patch.setattr(encoding, "planes_of", planes)
-                patch.setattr(encoding, "assign_layers", assigned)
+                patch.setattr(stages, "planes_of", planes)
+                patch.setattr(stages, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)
             yield
 

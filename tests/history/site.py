@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from lodestream_server.tokens import TokenFile
+from lodestream_server.access.tokens import TokenFile
 from tests.server import programs
 from tests.server.helpers import eventually
 from tests.torture.small_disk import can_mount

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.test_mask import blobs
+from tests.core.entropy.test_mask import blobs
 
 from .compiling import KERNELS
 from .recording import recorded
@@ -42,7 +42,7 @@ def sources(tmp_path: Path) -> Sources:
 @pytest.fixture(scope="session")
 def masks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recorded calls that write and read masks."""
-    from lodestream.mask import decode_mask, encode_mask
+    from lodestream.entropy.mask import decode_mask, encode_mask
 
     path = tmp_path_factory.mktemp("calls") / "masks.calls"
     with recorded(path, names=NAMES) as recorder:

@@ -25,7 +25,7 @@ from .fuzzing import FAULTS, fuzz_all
 __all__ = ["TESTS", "main", "run_tests"]
 
 #: Tests that decode the golden files at every layer, their prefixes, and files with a bit flipped.
-TESTS = ("tests/core/test_golden.py", "tests/core/test_mask.py", "tests/kernels/test_refusals.py")
+TESTS = ("tests/core/container/test_golden.py", "tests/core/entropy/test_mask.py", "tests/kernels/test_refusals.py")
 #: With these they run every line of the kernels; that takes minutes more.
 MORE_TESTS = tuple(
     f"tests/core/test_{name}.py"

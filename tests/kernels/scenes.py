@@ -14,11 +14,11 @@ import numpy as np
 
 import lodestream as ls
 from lodestream.errors import FormatError
-from lodestream.formats.lzf import decompress
+from lodestream.formats.pcd.lzf import decompress
 from lodestream.mesh.recognise import recognise
-from tests.core.meshes import FaceList, collapse, cut_in_two, grid_faces, mesh_of, scrambled, star
+from tests.core.mesh.meshes import FaceList, collapse, cut_in_two, grid_faces, mesh_of, scrambled, star
+from tests.core.mesh.test_mesh_attributes import sphere, with_texture
 from tests.core.surfaces import all_large
-from tests.core.test_mesh_attributes import sphere, with_texture
 from tests.golden.generate import FOLDER, expectations, originals
 
 from .declared import declarations

@@ -58,7 +58,7 @@ def library_of(sources: Sources) -> Path:
 
 @pytest.mark.skipif(COMPILER != "gcc", reason="there is no gcc")
 def test_a_fault_in_the_library_fails_the_tests_that_reach_it(sources: Sources, tmp_path: Path) -> None:
-    arguments = ["tests/core/test_mask.py", "-k", "missing_bytes", "-n0"]
+    arguments = ["tests/core/entropy/test_mask.py", "-k", "missing_bytes", "-n0"]
     reports = tmp_path / "reports"
     assert run_tests(COMPILER, library_of(sources), arguments, reports) == []
     lines = {file.file: file for file in lines_run(sources.folder.parent / "library", sources.folder)}

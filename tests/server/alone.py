@@ -39,7 +39,7 @@ def main() -> None:
     """Serve until told to end."""
     gc.disable()  # what is imported stays: to look through it again and again frees nothing
     from lodestream_server import Settings
-    from lodestream_server.logs import configure
+    from lodestream_server.operation.logs import configure
     from lodestream_server.running import serve_alone
 
     gc.enable()

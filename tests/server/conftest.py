@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from lodestream_server import running_server
-from lodestream_server.tokens import SCOPES, TokenFile
+from lodestream_server.access.tokens import SCOPES, TokenFile
 from tests.server.helpers import Keys
 
 
@@ -21,8 +21,8 @@ def _one_fork_server(one_fork_server: None) -> None:
 @pytest.fixture
 def called_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """``serve`` may be called within this process: its log and its limits stay as they are."""
-    monkeypatch.setattr("lodestream_server.logs.configure", lambda *_: None)
-    monkeypatch.setattr("lodestream_server.open_files.raise_file_limit", lambda _: None)
+    monkeypatch.setattr("lodestream_server.operation.logs.configure", lambda *_: None)
+    monkeypatch.setattr("lodestream_server.connections.open_files.raise_file_limit", lambda _: None)
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from lodestream.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
-from lodestream.wire import parse, serialize
-from lodestream_server.markers import MARKER
+from lodestream.protocol.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
+from lodestream.protocol.wire import parse, serialize
+from lodestream_server.storage.markers import MARKER
 
 T = TypeVar("T")
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lodestream_server.bounds import Bounds
-from lodestream_server.table import GROUPS, TABLE, Setting
+from lodestream_server.operation.bounds import Bounds
+from lodestream_server.operation.table import GROUPS, TABLE, Setting
 
 PATH = Path(__file__).parents[2] / "docs" / "settings.md"
 
@@ -25,8 +25,8 @@ All settings of `lodestream serve`. A server for yourself needs none of them. Fo
   with the reason. In a stream the server sends an `error` message with the same code word, and closes with 4000 plus
   the status.
 
-This page is written by `python -m tests.server.manual` from `lodestream_server.table` and `lodestream_server.bounds`; a
-test checks it.
+This page is written by `python -m tests.server.manual` from `lodestream_server.operation.table` and
+`lodestream_server.operation.bounds`; a test checks it.
 """
 
 

@@ -11,10 +11,20 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from lodestream.messages import MAX_CREDIT, Open
-from lodestream.wire import serialize
+from lodestream.protocol.messages import MAX_CREDIT, Open
+from lodestream.protocol.wire import serialize
+from tests.server.connections.sockets import (
+    CHUNKS,
+    CONTINUATION,
+    PING,
+    Place,
+    Reader,
+    chunked,
+    frame,
+    handshake,
+    read_stream,
+)
 from tests.server.programs import Server, Within, resident
-from tests.server.sockets import CHUNKS, CONTINUATION, PING, Place, Reader, chunked, frame, handshake, read_stream
 
 from .health import Health, watched
 

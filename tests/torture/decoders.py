@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream import reference
-from tests.core.comparison import agree_on, surfaces
+from tests.core.decoding.comparison import agree_on, surfaces
 
 __all__ = ["Compared", "run"]
 

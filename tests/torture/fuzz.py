@@ -37,13 +37,13 @@ PATIENCE = 20
 _INSTRUMENTED = [
     "lodestream.container",
     "lodestream.formats",
-    "lodestream.messages",
-    "lodestream.plan",
-    "lodestream.protocol",
-    "lodestream.sender",
-    "lodestream.wire",
-    "lodestream_server.options",
-    "lodestream_server.uploads",
+    "lodestream.protocol.messages",
+    "lodestream.planning.planner",
+    "lodestream.protocol.connection",
+    "lodestream.transfer.sender",
+    "lodestream.protocol.wire",
+    "lodestream_server.builds.options",
+    "lodestream_server.storage.uploads",
     "python_multipart",
 ]
 

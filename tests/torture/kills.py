@@ -23,11 +23,11 @@ import httpx
 import numpy as np
 
 import lodestream as ls
-from lodestream_server.fsck import check
-from lodestream_server.storage import Storage
+from lodestream_server.maintenance.fsck import check
+from lodestream_server.storage.storage import Storage
+from tests.server.connections.sockets import Place, Reader, read_stream
 from tests.server.helpers import eventually, hills, npy
 from tests.server.programs import Server, alive, descendants
-from tests.server.sockets import Place, Reader, read_stream
 
 __all__ = ["Kills", "run"]
 

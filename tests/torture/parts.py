@@ -97,7 +97,7 @@ class Part:
 def sent(container: bytes) -> str:
     """Hash of what a stream of the whole surface carries, in its order."""
     from lodestream.container import read_index
-    from lodestream.plan import plan
+    from lodestream.planning.planner import plan
 
     chosen = plan(read_index(lambda offset, length: container[offset : offset + length], len(container)))
     places = (*chosen.before, *chosen.ranges, *chosen.after)

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import CorruptStreamError, LodestreamError
 from lodestream.target import Region
-from lodestream_client import aio, roads, sync
+from lodestream_client import aio, sync
+from lodestream_client.stream import transport
 from lodestream_server import running_server
 from tests.links import Link, faults_of
 
@@ -165,12 +166,12 @@ def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None =
 @contextmanager
 def _hasty() -> Iterator[None]:
     """Waits between attempts that are in proportion to links of milliseconds."""
-    usual = roads._FIRST_PAUSE, roads._LONGEST_PAUSE
-    roads._FIRST_PAUSE, roads._LONGEST_PAUSE = 0.002, 0.1
+    usual = transport._FIRST_PAUSE, transport._LONGEST_PAUSE
+    transport._FIRST_PAUSE, transport._LONGEST_PAUSE = 0.002, 0.1
     try:
         yield
     finally:
-        roads._FIRST_PAUSE, roads._LONGEST_PAUSE = usual
+        transport._FIRST_PAUSE, transport._LONGEST_PAUSE = usual
 
 
 async def _all(url: str, container: bytes, count: int, until: tuple[float, float], seed: int, report: Report) -> None:

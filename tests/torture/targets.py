@@ -35,13 +35,25 @@ from lodestream.errors import (
     TooLargeError,
     UnsupportedVersionError,
 )
-from lodestream.messages import Bye, Credit, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
-from lodestream.plan import plan
-from lodestream.protocol import State
-from lodestream.sender import Sender
-from lodestream.wire import parse, serialize
-from lodestream_server.options import SurfaceOptions, check
-from lodestream_server.uploads import Upload, take_apart
+from lodestream.planning.planner import plan
+from lodestream.protocol.connection import State
+from lodestream.protocol.messages import (
+    Bye,
+    Credit,
+    End,
+    Error,
+    Event,
+    Header,
+    Layer,
+    MessageError,
+    Open,
+    Segments,
+    Stop,
+)
+from lodestream.protocol.wire import parse, serialize
+from lodestream.transfer.sender import Sender
+from lodestream_server.builds.options import SurfaceOptions, check
+from lodestream_server.storage.uploads import Upload, take_apart
 
 __all__ = ["EDGES", "KINDS", "TARGETS", "Edit", "Target", "edit", "mutate"]
 

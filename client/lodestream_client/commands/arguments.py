@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from lodestream.errors import OptionError
 from lodestream.target import Region, Target, Tolerance
 
-from .. import addresses
+from ..requests import addresses
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]

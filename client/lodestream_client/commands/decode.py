@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from lodestream.container import Index
-    from lodestream.decoder import Decoder, View
+    from lodestream.decoding.decoder import Decoder, View
 
 __all__ = ["register", "run"]
 
@@ -112,8 +112,8 @@ class _Job:
         started: float,
         progress: Callable[[float], None],
     ) -> None:
-        from lodestream.decoder import Decoder
-        from lodestream.selection import wish_of
+        from lodestream.decoding.decoder import Decoder
+        from lodestream.planning.selection import wish_of
 
         self.decoder: Decoder = Decoder(wish_of(target), max_vertices=max_vertices, level=target.level)
         self.ended = "complete"
@@ -130,8 +130,8 @@ class _Job:
 
     def decode(self) -> None:
         """Decode as far as the target says; `ended` says why it ends there."""
-        from lodestream.capacity import Capacity
         from lodestream.container import read_index
+        from lodestream.container.capacity import Capacity
 
         try:
             index = read_index(self._read, self._size, Capacity(self.decoder.capacity.max_vertices))
@@ -156,7 +156,7 @@ class _Job:
         return limit is not None and time.monotonic() - self._started >= limit and bool(self.decoder.layers)
 
     def _decode_planned(self, index: Index) -> None:
-        from lodestream.plan import plan
+        from lodestream.planning.planner import plan
 
         chosen = plan(index, self._target)
         self.ended = chosen.ended

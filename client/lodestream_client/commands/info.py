@@ -9,7 +9,7 @@ from typing import Any
 
 from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
 
-from .. import addresses
+from ..requests import addresses
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
 from .inputs import input_files, named
 from .output import cell, console, human_size, point_words, print_json
@@ -63,8 +63,8 @@ def _of_url(args: argparse.Namespace) -> Mapping[str, Any]:
 
 
 def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
-    from lodestream.capacity import Capacity
     from lodestream.container import describe, read_index
+    from lodestream.container.capacity import Capacity
 
     with input_files(args.parser, [args.what]) as files, files.paths[0].open("rb") as file:
         size = file.seek(0, 2)

@@ -9,20 +9,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from lodestream.errors import (
-    CorruptStreamError,
-    FormatError,
-    LodestreamError,
-    OptionError,
-    RemoteError,
-    TooLargeError,
-)
+from lodestream.errors import CorruptStreamError, FormatError, LodestreamError, OptionError, RemoteError, TooLargeError
 
 from .output import human_size, note
 
 if TYPE_CHECKING:
-    from ..cache import Part
-    from ..requests import Identity
+    from ..requests.api import Identity
+    from ..stream.cache import Part
     from ..sync import Stream
 
 __all__ = ["Kept"]
@@ -177,7 +170,7 @@ class Kept:
 
 
 def _opened(name: str, size: int) -> Part:
-    from ..cache import Part, cache_folder, forget_old
+    from ..stream.cache import Part, cache_folder, forget_old
 
     folder: Path = cache_folder()
     forget_old(folder)

@@ -17,7 +17,7 @@ from lodestream.errors import (
 )
 from lodestream.target import Target
 
-from .. import addresses
+from ..requests import addresses
 from .arguments import (
     Subparsers,
     add_command,
@@ -121,7 +121,7 @@ def _written(
     args: argparse.Namespace, target: Target, kept: Kept, name: str
 ) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
     """What has been written, and what ended the stream before it had all that was asked for."""
-    import lodestream.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
+    import lodestream.decoding.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
     from .. import sync
 
@@ -234,7 +234,8 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     # A stop of our own takes effect at once, so the stream has not brought the metadata, which stand at the end.
     from lodestream.container import ByteRange, read_metadata
 
-    from .. import requests, sync
+    from .. import sync
+    from ..requests import api
 
     place = stream.metadata_place
     if place is None:  # over HTTP layers may come before it is known
@@ -243,7 +244,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     if (data := kept.read(*place)) is not None:
         return read_metadata(data, ByteRange(*place)), 0
     try:
-        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else requests.TIMEOUT)
+        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else api.TIMEOUT)
     except LodestreamError as error:
         if isinstance(error, NotFoundError) and not hurried:
             raise

@@ -22,7 +22,7 @@ from .inputs import input_files
 from .output import human_size, note_details, print_json, progress_bar, say
 
 if TYPE_CHECKING:
-    from ..bodies import Source
+    from ..requests.bodies import Source
 
 __all__ = ["register", "run"]
 

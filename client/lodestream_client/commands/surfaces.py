@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from .arguments import (
-    Subparsers,
-    add_command,
-    add_json_option,
-    add_token_option,
-    parse_server,
-    parse_surface,
-    token_of,
-)
+from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_server, parse_surface, token_of
 from .output import cell, console, human_size, note, print_json
 
 __all__ = ["register", "run_list", "run_rm"]

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from lodestream.decoder import View
+    from lodestream.decoding.decoder import View
 
     from ..commands.output import Progress
-    from ..requests import Description
+    from ..requests.api import Description
 
 __all__ = ["show"]
 

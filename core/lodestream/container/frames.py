@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
-from ..metadata import check_length
 from . import sections
+from .metadata import check_length
 
 __all__ = [
     "Frame",

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrangement import grids_of
 from ..errors import CorruptStreamError, TooLargeError
-from ..lattice import Lattice
-from ..layout import Layout
-from ..predictors import CURVES, default_predictors, fitted_steps
-from ..quantiser import MOST_BASE, Quantiser
+from ..grid.layout import Layout
+from ..grid.multiblock import grids_of
+from ..quantization.band_steps import MOST_BASE, Quantiser
+from ..quantization.lattice import Lattice
+from ..transform.predictors import CURVES, default_predictors, fitted_steps
 from . import codecs
 from .fields import LARGEST, FieldReader, FieldWriter
 from .frames import Frame

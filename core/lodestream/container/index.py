@@ -13,12 +13,12 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from ..errors import CorruptStreamError
-from ..metadata import check_length
-from ..predictors import COEFFICIENT_BITS
+from ..transform.predictors import COEFFICIENT_BITS
+from .chunks import count_windows
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
+from .metadata import check_length
 from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Piece, Segment
-from .pieces import count_windows
 from .sections import FOOTER_LENGTH, OPTIONAL, read_errors, section_start, write_errors
 
 __all__ = ["PAGE", "PagePlace", "Root", "parse_index", "parse_root", "serialize_index"]

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrangement import grids_of, shared_points
 from ..errors import CorruptStreamError
+from ..grid.connectivity import Arrangement, Part, whole_part
+from ..grid.layout import Layout
+from ..grid.multiblock import grids_of, shared_points
+from ..grid.patches import level_shapes
 from ..joints import Change, Groups, Joints, Runs
-from ..lattice import Lattice
-from ..layout import Layout
-from ..parts import level_shapes
-from ..quantiser import Quantiser
-from ..sides import Arrangement, Part, whole_part
+from ..quantization.band_steps import Quantiser
+from ..quantization.lattice import Lattice
 from ..surface import Closed
 
 __all__ = [
@@ -119,7 +119,8 @@ class Header:
     codecs : tuple of int
         What is needed to decode, by rising number, see `container.codecs`.
     plane : mapping or None
-        Of heights that came with the x and y of a regular lattice: what restores them, see `lodestream.heights`.
+        Of heights that came with the x and y of a regular lattice: what restores them, see
+        `lodestream.coordinates.height_fields`.
     masked : bool
         A section of masks follows the header.
     hole : int
@@ -245,7 +246,7 @@ class Header:
         """For each block which points are valid; None: all."""
         if not self.masked:
             return (None,) * len(self.blocks)
-        from ..mask import decode_mask  # only where there is one: it needs the compiler
+        from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
 
         return tuple(
             decode_mask(data, shape, self.length) if data else None
@@ -263,7 +264,7 @@ class Header:
         """
         if not any(self.kept):
             return (None,) * len(self.blocks)
-        from ..mask import decode_mask  # only where there is one: it needs the compiler
+        from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
 
         found: list[NDArray[np.bool_] | None] = []
         for mask, count, data, (shape, _) in zip(self.masks, self.kept, self.kept_data, self.blocks, strict=True):

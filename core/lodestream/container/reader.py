@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from ..capacity import Capacity
-from ..digest import DIGEST
 from ..errors import CorruptStreamError, TruncatedStreamError
 from . import headers, sections
+from .capacity import Capacity
+from .digest import DIGEST
 from .frames import Frame, FrameReader, index_sections, whole_section
 from .index import parse_index
 from .model import ByteRange, Header, Index, LayerRecord, LevelRecord

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import msgpack
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
-from ..metadata import check_length, packed
-from ..predictors import COEFFICIENT_BITS
+from ..transform.predictors import COEFFICIENT_BITS
+from .chunks import windows
 from .fields import FieldReader, FieldWriter
+from .metadata import check_length, packed
 from .model import ByteRange, Errors, Header
-from .pieces import windows
 
 __all__ = [
     "EXACTNESS",

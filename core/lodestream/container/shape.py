@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from ..arrangement import covers
-from ..coordinate_rules import are_rules
+from ..coordinates.coordinate_rules import are_rules
 from ..errors import CorruptStreamError
+from ..grid.connectivity import Arrangement, Curve, Part, Side
+from ..grid.multiblock import covers
 from ..joints import check_runs
-from ..sides import Arrangement, Curve, Part, Side
 from ..surface import Closed
 from .fields import LARGEST, FieldReader, FieldWriter
 from .model import AttributeKind, JointChanges

@@ -15,37 +15,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .. import metadata
+from ..container import metadata
+from ..coordinates.seams import restore
 from ..errors import FormatError, InputError, OptionError
-from ..seams import restore
 from ..surface import Closed, Surface
-from . import (
-    ascii_grid,
-    bezier,
-    cgns,
-    geotiff,
-    glb,
-    netcdf,
-    notes,
-    npy,
-    npz,
-    obj,
-    obj_writer,
-    off,
-    pcd,
-    plot3d,
-    ply,
-    ply_writer,
-    png,
-    srtm_hgt,
-    text_arrays,
-    usgs_dem,
-    vtk_legacy,
-    vtk_xml,
-    vts_writer,
-)
+from . import bezier, glb, notes, npy, npz, off, text_arrays
+from .netcdf import reader as netcdf
 from .non_finite import note_infinities
+from .obj import reader as obj
+from .obj import writer as obj_writer
+from .pcd import reader as pcd
+from .plot3d import reader as plot3d
+from .ply import reader as ply
+from .ply import writer as ply_writer
+from .raster import ascii_grid, geotiff, png, srtm_hgt, usgs_dem
 from .source import DEFAULT_MAX_VERTICES, Source, check_allowed
+from .vtk import cgns
+from .vtk import legacy as vtk_legacy
+from .vtk import writer as vts_writer
+from .vtk import xml_files as vtk_xml
 
 __all__ = [
     "DEFAULT_MAX_VERTICES",
@@ -242,8 +230,8 @@ def read(
         and, if the file has them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a number,
         or text if it is not finite), ``unit``, ``scale`` and ``offset`` (for values kept as stored), ``scalars``
         (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that docs/formats.md lists. A
-        `FormatWarning` tells what was left out; so also if metadata exceed `lodestream.metadata.MAX_BYTES` and their
-        largest entries are dropped.
+        `FormatWarning` tells what was left out; so also if metadata exceed `lodestream.container.metadata.MAX_BYTES`
+        and their largest entries are dropped.
 
     Raises
     ------

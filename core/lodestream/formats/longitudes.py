@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..seams import merge
+from ..coordinates.seams import merge
 from ..surface import Closed, Surface
 
 __all__ = ["TURN", "close_around", "encircles"]
@@ -40,7 +40,7 @@ def close_around(surface: Surface, longitude: tuple[int, float], closed: Closed 
     Returns
     -------
     Surface
-        With a last row or column that repeats the first merged into it, see `lodestream.seams.merge`.
+        With a last row or column that repeats the first merged into it, see `lodestream.coordinates.seams.merge`.
     """
     axis, step = longitude
     around: Closed = (axis == 0, axis == 1)

@@ -9,8 +9,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..coordinates.height_fields import coordinates
 from ..errors import FormatError
-from ..heights import coordinates
 from ..mesh import weld
 from ..surface import Block, Surface
 from .notes import metadata_left_out, warn_left_out

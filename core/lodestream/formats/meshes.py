@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ..coordinates.seams import merge
 from ..errors import TooLargeError
 from ..mesh import Mesh
-from ..seams import merge
 from ..surface import Surface
 from .notes import warn
 from .source import Source, number

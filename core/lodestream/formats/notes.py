@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..digest import DIGEST
+from ..container.digest import DIGEST
 from ..errors import FormatWarning
 from ..surface import Surface
 from .source import number

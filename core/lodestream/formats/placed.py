@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coordinate_rules import VALUES, evaluate, fit_axis
+from ..container.metadata import fitted
+from ..coordinates.coordinate_rules import VALUES, evaluate, fit_axis
+from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
-from ..metadata import fitted
-from ..seams import merge, unwrap, wrapped
 from ..surface import Closed, Surface
 from .longitudes import TURN, close_around, encircles
 

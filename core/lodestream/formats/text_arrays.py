@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..coordinates.seams import merge
 from ..errors import FormatError, OptionError, TooLargeError
-from ..seams import merge
 from ..surface import Surface
 from .source import Source, number
 

@@ -1,0 +1,1 @@
+"""Requests over HTTP: addresses, bodies, and answers that are checked before use."""

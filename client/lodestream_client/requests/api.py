@@ -1,0 +1,405 @@
+"""HTTP requests to a server, without I/O.
+
+Each function here is a generator. It yields a `Call` and is sent the answer, or yields a `Pause` and is resumed after
+it; its return value is the result. `lodestream_client.sync` and `lodestream_client.aio` run the same generators.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import re
+import ssl
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from lodestream.errors import CorruptStreamError, RemoteError, RemoteProtocolError
+from lodestream.target import Target
+
+from . import addresses, problems
+from .answers import LONGEST_ANSWER, Answer, check_figures, parse
+from .bodies import Body
+
+if TYPE_CHECKING:
+    import httpx
+
+__all__ = [
+    "TIMEOUT",
+    "Call",
+    "Description",
+    "Flow",
+    "Identity",
+    "Pause",
+    "Progress",
+    "client_options",
+    "delete",
+    "describe",
+    "describe_file",
+    "fetch_range",
+    "identify",
+    "identity_of_file",
+    "list_surfaces",
+    "request_options",
+    "retry",
+    "upload",
+]
+
+T = TypeVar("T")
+
+#: Called as ``progress(stage, fraction)``; the stages are ``encoding``, ``sending`` and ``building``.
+Progress: TypeAlias = Callable[[str, float], None]
+
+# Seconds between looks at a surface that is being built: soon at first, since most builds are short, then rarely.
+_LOOKS = (0.05, 0.1, 0.2, 0.4, 0.8)
+_LOOKS_AFTER = 1.5
+
+_STATES = ("queued", "building", "ready", "failed", "waiting", "missing")
+# What a surface does not leave by itself.
+_ENDS = ("failed", "waiting", "missing")
+
+# What a container is called becomes the name of a file.
+_CONTAINER = re.compile(r"[0-9a-f]{64}")
+_LENGTH = re.compile(r"[0-9]{1,18}")
+_LARGEST_FILE = 2**62
+
+# Of all the pages of a list together.
+_LONGEST_LIST = 64 * 1024 * 1024
+_MOST_PAGES = 10_000
+
+_MOVED = (301, 302, 303, 307, 308)
+
+#: Seconds for each step of a request: connecting, one piece sent, one piece received.
+TIMEOUT = 30.0
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request to make; the complete answer is sent back.
+
+    With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
+    bytes are read.
+    """
+
+    method: str
+    url: str
+    parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    body: Body | None = None
+    partial: bool = False
+    most: int = LONGEST_ANSWER
+
+
+@dataclass(frozen=True)
+class Pause:
+    """A wait of so many seconds."""
+
+    seconds: float
+
+
+Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What identifies a container, so that stored data of it can be found again.
+
+    Attributes
+    ----------
+    name : str or None
+        A name in hexadecimal digits; None if the server does not distinguish versions of the file.
+    container : str or None
+        SHA-256 of the container, if the server gives it.
+    size : int or None
+        Bytes of the container.
+    """
+
+    name: str | None
+    container: str | None
+    size: int | None
+
+
+@dataclass(frozen=True)
+class Description:
+    """A server's description of one surface.
+
+    Attributes
+    ----------
+    url : str
+        The surface's URL, as `connect` and `delete` take it.
+    id : str
+        Id of the surface on its server.
+    state : str
+        ``queued``, ``building``, ``ready``; ``failed``: the reader rejected the file; ``waiting``: it could not be
+        built for a reason on the server; ``missing``: it is not on the server's disk now. For the last three see
+        `retry`.
+    details : mapping
+        The complete description, by the server's keys: build progress, or what ``info --json`` prints.
+    """
+
+    url: str
+    id: str
+    state: str
+    details: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the surface can be streamed."""
+        return self.state == "ready"
+
+
+def client_options(
+    url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False, home: Callable[[], str] | None = None
+) -> dict[str, Any]:
+    """Arguments for an httpx client of the server at `url`.
+
+    Parameters
+    ----------
+    url : str
+    timeout : float
+        Seconds for each step.
+    asynchronous : bool
+        Whether it is an asyncio client.
+    home : callable, optional
+        Returns the URL whose origin may receive the token, if that is not always `url`.
+    """
+
+    def guard(request: httpx.Request) -> None:
+        # httpx itself lets a token go on from a host's port 80 to its port 443; here an origin is an origin.
+        if not addresses.same_origin(str(request.url), home() if home is not None else url):
+            request.headers.pop("Authorization", None)
+
+    async def guard_later(request: httpx.Request) -> None:
+        guard(request)
+
+    return {
+        "follow_redirects": True,
+        "timeout": timeout,
+        "verify": _trusted(),
+        # No proxy of the environment comes between two programs on one machine.
+        "trust_env": not addresses.is_loopback(url),
+        "headers": {"Accept-Encoding": "identity"},
+        "event_hooks": {"request": [guard_later if asynchronous else guard]},
+    }
+
+
+@functools.cache
+def _trusted() -> ssl.SSLContext:
+    # Reading all the certificates takes longer than many a request.
+    import httpx
+
+    return httpx.create_ssl_context()
+
+
+def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
+    """Arguments for the ``request`` method of an httpx client, except the body of a single file.
+
+    The token is sent only to the server at `url`, wherever redirects lead.
+    """
+    headers = dict(call.headers)
+    if token is not None and addresses.same_origin(call.url, url):
+        headers["Authorization"] = f"Bearer {token}"
+    options: dict[str, Any] = {"method": call.method, "url": call.url, "headers": headers}
+    if call.method not in ("GET", "HEAD"):
+        options["follow_redirects"] = False  # nothing is changed, and no file sent, where nobody said so
+    if call.parameters:
+        options["params"] = dict(call.parameters)
+    if call.body is not None and len(call.body.files) > 1:
+        options["files"] = call.body.parts()
+    elif call.body is not None:
+        headers["Content-Length"] = str(call.body.size)
+        headers["Content-Type"] = "application/octet-stream"
+    return options
+
+
+def upload(
+    url: str, parameters: Mapping[str, str | list[str]], body: Body, wait: bool, progress: Progress | None
+) -> Flow[Description]:
+    """Send files, and wait until their surface is ready."""
+    collection = addresses.surfaces_url(url)
+    answer = yield Call("POST", collection, _named(parameters, body), body=body)
+    surface = _described(_checked(answer, collection), _location(answer, collection))
+    return (yield from _followed(surface, wait, progress))
+
+
+def retry(url: str, wait: bool, progress: Progress | None) -> Flow[Description]:
+    """Ask for another build of a surface, and wait until it is ready."""
+    address = addresses.surface_url(url)
+    answer = yield Call("POST", f"{address}/retry")
+    surface = _described(_checked(answer, address), address)
+    return (yield from _followed(surface, wait, progress))
+
+
+def _followed(surface: Description, wait: bool, progress: Progress | None) -> Flow[Description]:
+    """Wait until a surface is ready, or will not become so by itself."""
+    looks = itertools.chain(_LOOKS, itertools.repeat(_LOOKS_AFTER))
+    while wait and not surface.ready:
+        if surface.state in _ENDS:
+            reason = str(_reason(surface.details))
+            if surface.state != "failed":
+                reason = f"{surface.url} is {surface.state}: {reason}"
+            raise RemoteError(surface.state, reason)
+        if progress is not None:
+            progress("building", _fraction(surface.details))
+        yield Pause(next(looks))
+        answer = yield Call("GET", surface.url)
+        surface = _described(_checked(answer, surface.url), surface.url)
+    return surface
+
+
+def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str, str | list[str]]:
+    # A form names its files itself; a raw body has no other place for the name than the query.
+    name = body.files[0][0] if len(body.files) == 1 else ""
+    return {**parameters, "filename": name} if name else parameters
+
+
+def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
+    """All surfaces of a server, page by page."""
+    page: str | None = addresses.surfaces_url(url)
+    surfaces: list[Description] = []
+    seen = set[str]()
+    left = _LONGEST_LIST
+    while page is not None and page not in seen:
+        seen.add(page)
+        if len(seen) > _MOST_PAGES or not addresses.same_origin(page, url):
+            raise RemoteProtocolError(f"expected at most {_MOST_PAGES} pages of {addresses.origin(url)}, got {page}")
+        answer = yield Call("GET", page, most=min(left, LONGEST_ANSWER))
+        document = _checked(answer, page)
+        left -= len(answer.content) if answer is not None else 0
+        entries = document.get("surfaces")
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise RemoteProtocolError(f"expected a list of surfaces from {page}, got something else")
+        surfaces += [_described(entry, _own_address(entry, page)) for entry in entries]
+        following = document.get("next")
+        page = addresses.resolved(page, following) if isinstance(following, str) and following else None
+    return tuple(surfaces)
+
+
+def describe(url: str) -> Flow[Description]:
+    """State and description of one surface."""
+    address = addresses.surface_url(url)
+    answer = yield Call("GET", address)
+    return _described(_checked(answer, address), address)
+
+
+def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str, Any]]:
+    """Description of a container file on any web server."""
+    from lodestream.container import describe
+    from lodestream.transfer.range_download import RangeDownload
+    from lodestream.transfer.receiver_state import Reception
+
+    # Of the coarsest level nothing needs to come before the index.
+    reception = Reception(Target(level=0), max_vertices=max_vertices)
+    download = RangeDownload(reception)
+    while reception.index is None:
+        request, _ = download.request()
+        if request is not None and reception.index is None:
+            call = Call("GET", url, headers=request.headers, partial=True, most=request.length)
+            answer = _refuse((yield call), url)
+            download.answer(answer.status, answer.headers)
+            download.receive(answer.content)
+            download.finish()
+    return describe(reception.index, channels=True)
+
+
+def identify(url: str) -> Flow[Identity]:
+    """What identifies a surface's container, or a file."""
+    if addresses.is_surface(url):
+        surface = yield from describe(url)
+        container, size = surface.details.get("container"), surface.details.get("bytes")
+        if not surface.ready or not isinstance(container, str) or not isinstance(size, int):
+            raise RemoteError("not-ready", f"expected {url} to be ready, got {surface.state}")
+        if not _CONTAINER.fullmatch(container) or size is True or not 0 < size <= _LARGEST_FILE:
+            raise RemoteProtocolError(
+                f"expected the SHA-256 and size of a container from {url}, got {container!a:.80} and {size!r:.80}"
+            )
+        return Identity(container, container, size)
+    answer = _refuse((yield Call("HEAD", url, headers={"Accept-Encoding": "identity"})), url)
+    version = answer.headers.get("etag") or answer.headers.get("last-modified")
+    length = answer.headers.get("content-length", "")
+    return identity_of_file(url, version, int(length) if _LENGTH.fullmatch(length) else None)
+
+
+def identity_of_file(url: str, version: str | None, size: int | None) -> Identity:
+    """What identifies a container file; `version` is its entity tag or date."""
+    if version is None or size is None:
+        return Identity(None, None, None)
+    return Identity(hashlib.sha256(f"{url}\n{version}\n{size}".encode()).hexdigest(), None, size)
+
+
+def delete(url: str) -> Flow[None]:
+    """Delete one surface from its server."""
+    address = addresses.surface_url(url)
+    answer = yield Call("DELETE", address)
+    _refuse(answer, address)
+
+
+def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
+    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file."""
+    address = addresses.container_url(url)
+    headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
+    response = _refuse((yield Call("GET", address, headers=headers, partial=True, most=length)), address)
+    if response.status != 206:
+        raise RemoteProtocolError(
+            f"expected part of the container from {address}, got all of it: Range is not supported"
+        )
+    if len(response.content) != length:
+        raise CorruptStreamError(f"expected {length} bytes of the container, got {len(response.content)}", offset)
+    return response.content
+
+
+def _refuse(answer: Answer | None, url: str) -> Answer:
+    if answer is None:
+        raise AssertionError("a call was resumed without its answer")
+    if answer.status in _MOVED and (location := answer.headers.get("location")):
+        place = addresses.counterpart(url, url, addresses.resolved(url, location))
+        raise RemoteProtocolError(
+            f"{url} redirects a request that changes something, which is not followed; use {place}"
+        )
+    if not 200 <= answer.status < 300:
+        error = problems.from_response(answer.status, answer.reason, answer.content, url)
+        error.args = (f"{error}{answer.withheld}", *error.args[1:])
+        raise error
+    return answer
+
+
+def _checked(answer: Answer | None, url: str) -> Mapping[str, Any]:
+    response = _refuse(answer, url)
+    try:
+        return parse(response.content)
+    except ValueError:
+        kind = response.headers.get("content-type", "nothing")
+    raise RemoteProtocolError(f"expected a JSON object from {url}, got {kind}: is this a Lodestream server?")
+
+
+def _location(answer: Answer | None, collection: str) -> str:
+    response = _refuse(answer, collection)
+    location = response.headers.get("location", "")
+    if not location:
+        raise RemoteProtocolError(f"expected the new surface's Location from {collection}, got none")
+    return addresses.resolved(collection, location)
+
+
+def _own_address(entry: Mapping[str, Any], page: str) -> str:
+    location = entry.get("url") or f"{page.partition('?')[0]}/{entry.get('id')}"
+    return addresses.resolved(page, str(location))
+
+
+def _described(document: Mapping[str, Any], url: str) -> Description:
+    state, name = document.get("state"), document.get("id")
+    if state not in _STATES or not isinstance(name, str):
+        raise RemoteProtocolError(
+            f"expected a surface's id and state from {url}, got id {name!a:.80} and state {state!a:.80}"
+        )
+    check_figures(document, url)
+    return Description(url, name, state, document)
+
+
+def _reason(details: Mapping[str, Any]) -> object:
+    return details.get("reason") or "the surface could not be built, and the server does not say why"
+
+
+def _fraction(details: Mapping[str, Any]) -> float:
+    progress = details.get("progress")
+    return float(progress) if isinstance(progress, int | float) else 0.0

@@ -1,0 +1,149 @@
+"""Surfaces in memory: recognising them, and encoding them before they are sent."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from lodestream.errors import InputError, OptionError
+from lodestream.target import Tolerance
+
+if TYPE_CHECKING:
+    from lodestream.surface import Closed, Surface
+
+__all__ = ["Asked", "Closure", "encoded", "in_memory"]
+
+#: Which axes of a grid wrap, in the words of the command line.
+Closure = Literal["auto", "none", "rows", "cols", "both"]
+
+_CLOSED: Mapping[str, Closed] = {
+    "none": (False, False),
+    "rows": (True, False),
+    "cols": (False, True),
+    "both": (True, True),
+}
+_ARRAYS = ("__array__", "__array_interface__", "__array_struct__")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The options of an upload, see `lodestream_client.sync.upload`."""
+
+    precision: Tolerance | float | str | None = None
+    rms: Tolerance | float | str | None = None
+    closed: Closure = "auto"
+    name: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+    attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
+
+
+def in_memory(source: object) -> bool:
+    """Whether a source is a surface or an array, not a file; decided without importing their libraries.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if isinstance(source, str | os.PathLike | bytes | bytearray) or _is_bytes(source):
+        return False
+    if hasattr(source, "read") and hasattr(source, "seek") and not isinstance(source, io.TextIOBase):
+        return False
+    known = sys.modules.get("lodestream.surface")  # loaded by whoever made one
+    if known is not None and isinstance(source, known.Surface):
+        return True
+    if isinstance(source, list | tuple | memoryview) or any(hasattr(source, name) for name in _ARRAYS):
+        return True
+    found = "a file open for text" if isinstance(source, io.TextIOBase) else type(source).__name__
+    raise InputError(
+        f"expected the name of a file, an open binary file, its bytes, a Surface or an array of points, got {found}"
+    )
+
+
+def _is_bytes(source: object) -> bool:
+    return isinstance(source, memoryview) and source.ndim == 1 and source.itemsize == 1
+
+
+def encoded(source: object, asked: Asked, progress: Callable[[str, float], None] | None) -> bytes:
+    """The container of a surface or an array. What a container does not keep is a `FormatWarning`, and one of its
+    ``notes``.
+
+    Parameters
+    ----------
+    source : Surface or array
+    asked : Asked
+        The name becomes the surface's own. Format options are refused, because there is no file.
+    progress : callable or None
+        Called as ``progress("encoding", fraction)``.
+
+    Raises
+    ------
+    OptionError
+        If there are format options, or an option has an invalid value.
+    InputError
+        If the surface cannot be encoded.
+    UnavailableError
+        If the compiled kernels are missing.
+    """
+    for option in asked.options:
+        raise OptionError(f"expected no options of a file's format for a surface in memory, got {option}")
+    if asked.closed != "auto" and asked.closed not in _CLOSED:
+        raise OptionError(f"expected closed to be one of auto, {', '.join(_CLOSED)}, got {asked.closed!r}")
+
+    from lodestream.encoding.encoder import encode
+
+    surface = _surface(source, asked)
+    surface.metadata = _noted(surface)
+    return encode(
+        surface,
+        asked.precision,
+        rms=asked.rms,
+        attribute_precision=asked.attribute_precision,
+        progress=None if progress is None else (lambda fraction: progress("encoding", fraction)),
+    )
+
+
+def _surface(source: Any, asked: Asked) -> Surface:
+    """With the closure and the name that are asked for, whoever's the given one is."""
+    from lodestream.surface import Block, Surface
+
+    if isinstance(source, Surface):
+        surface = copy(source)
+        surface.metadata = dict(source.metadata)
+    else:
+        try:
+            surface = Surface(source)
+        except InputError:
+            raise
+        except (TypeError, ValueError) as error:  # numpy's, of what is no array
+            raise InputError(f"expected an array of points, got {type(source).__name__}: {error}") from None
+    if asked.closed != "auto":
+        if len(surface.blocks) > 1:
+            raise OptionError(f"expected closed=auto for a surface of several blocks, got {len(surface.blocks)} blocks")
+        block = surface.blocks[0]
+        closed = Block(block.points, _CLOSED[asked.closed], mask=block.mask, attributes=block.attributes)
+        surface.blocks = (closed,)
+    if asked.name:
+        surface.metadata["name"] = asked.name
+    return surface
+
+
+def _noted(surface: Surface) -> dict[str, Any]:
+    """Its metadata, with a note of what a container does not keep: others are told by the container alone."""
+    from lodestream.container.metadata import check
+    from lodestream.encoding.losses import at_holes
+
+    lost, known = at_holes(surface), surface.metadata.get("notes", [])
+    if lost is None or not isinstance(known, list):
+        return surface.metadata
+    noted = {**surface.metadata, "notes": [*known, lost]}
+    try:
+        check(noted)
+    except InputError:  # there is no room for it; or for what was there before, which is refused in a moment
+        return surface.metadata
+    return noted

@@ -1,0 +1,154 @@
+"""Conversion of server answers and socket errors to the exceptions of Lodestream."""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Mapping
+from typing import Any
+
+from lodestream.errors import (
+    FormatError,
+    InputError,
+    LodestreamError,
+    NotFoundError,
+    OptionError,
+    RemoteError,
+    RemoteProtocolError,
+    TooLargeError,
+    TruncatedStreamError,
+)
+from lodestream.protocol.messages import CODES
+
+from ..errors import SilenceError, UnreachableError
+from . import addresses
+from .answers import parse
+
+__all__ = ["NoStreamError", "blocks_sockets", "from_code", "from_connection", "from_response", "passes"]
+
+_LONGEST = 1000
+
+# The server's words, over HTTP and in the stream alike; then statuses, for what other servers and proxies answer.
+_BY_CODE: Mapping[str, type[LodestreamError]] = {
+    "bad-file": FormatError,
+    "bad-input": InputError,
+    "bad-option": OptionError,
+    "bad-target": OptionError,
+    "not-found": NotFoundError,
+    "too-large": TooLargeError,
+}
+_BY_STATUS: Mapping[int, type[LodestreamError]] = {
+    400: InputError,
+    404: NotFoundError,
+    413: TooLargeError,
+    415: InputError,
+    422: InputError,
+}
+
+
+# What a server says when it may be otherwise a little later.
+_PASSING = {"restarting", "idle", "busy", "too-many", "internal"}
+_PASSING |= {f"http-{status}" for status in (408, 425, 429, 500, 502, 503, 504)}
+
+
+# What is answered to the handshake of a WebSocket that has lost its Upgrade, or the subprotocol, on its way.
+_NO_HANDSHAKE = {400, 404, 405, 426}
+
+
+class NoStreamError(RemoteProtocolError):
+    """A WebSocket was opened, but it does not speak the stream protocol."""
+
+
+def from_code(code: str, message: str) -> LodestreamError:
+    """The exception for an error code of the server."""
+    kind = _BY_CODE.get(code)
+    return RemoteError(code, message) if kind is None else kind(message)
+
+
+def from_response(status: int, reason: str, body: bytes, url: str) -> LodestreamError:
+    """The exception for an HTTP answer.
+
+    Parameters
+    ----------
+    status, reason : int, str
+        The status line.
+    body : bytes
+        A problem document (RFC 9457), whose ``detail`` becomes the message, or anything else.
+    url : str
+        The URL of the request; named if the answer does not explain itself.
+    """
+    document = _document(body)
+    detail = document.get("detail") or document.get("title")
+    message = str(detail)[:_LONGEST] if detail else f"the server answered {status} {reason} for {url}"
+    code = document.get("code")
+    if isinstance(code, str):
+        if status >= 500 and detail and document.get("title") not in (None, detail):
+            message = f"{document['title']}: {message}"[:_LONGEST]  # the detail may be no more than where to look
+        return from_code(code, message)
+    return _BY_STATUS[status](message) if status in _BY_STATUS else RemoteError(f"http-{status}", message)
+
+
+def passes(error: LodestreamError) -> bool:
+    """Whether the same request may succeed a little later."""
+    if isinstance(error, RemoteError):
+        return error.code in _PASSING
+    return isinstance(error, UnreachableError | SilenceError | TruncatedStreamError) or _broke_off(error)
+
+
+def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
+    """Whether something on the way seems to block WebSockets only, so that plain HTTP may work.
+
+    A connection that broke during its handshake counts as a sign of this only if no handshake has succeeded (`met`).
+    """
+    from websockets import exceptions as ws
+
+    cause = error.__cause__
+    if isinstance(cause, ws.InvalidStatus):
+        # A server that is asked for a stream by a plain GET, since something between took the rest of the handshake
+        # away, knows no such path. What else it says in its own words it would say by the other road too.
+        code = _document(bytes(cause.response.body or b"")).get("code")
+        own = isinstance(code, str) and code in CODES
+        return not own or cause.response.status_code in _NO_HANDSHAKE
+    if _broke_off(error):
+        return not met
+    return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake | ws.InvalidURI)
+
+
+def _broke_off(error: BaseException) -> bool:
+    """Whether a connection ended in the middle of an answer."""
+    import httpx
+
+    cause = error.__cause__
+    while cause is not None:
+        if isinstance(cause, EOFError | ConnectionError | httpx.RemoteProtocolError | httpx.NetworkError):
+            return True
+        cause = cause.__cause__
+    return False
+
+
+def _document(body: bytes) -> Mapping[str, Any]:
+    try:
+        return parse(body)
+    except ValueError:  # also what is not UTF-8
+        return {}
+
+
+def from_connection(error: Exception, url: str) -> LodestreamError:
+    """The exception for a failed connection of websockets or httpx; `url` is that of the surface or server."""
+    import httpx
+    from websockets import exceptions as ws
+
+    if isinstance(error, LodestreamError):
+        return error
+    if isinstance(error, ws.InvalidStatus):
+        response = error.response
+        return from_response(response.status_code, response.reason_phrase, bytes(response.body or b""), url)
+    if isinstance(error, ws.InvalidURI):  # ours is one
+        use = addresses.counterpart(url, addresses.stream_url(url), error.uri)
+        return RemoteProtocolError(f"{url} redirects its stream to an address that is not a WebSocket's; use {use}")
+    if isinstance(error, (ws.InvalidHandshake, httpx.RemoteProtocolError, httpx.DecodingError)):
+        return RemoteProtocolError(f"{url} does not answer like a Lodestream server: {error}")
+    if isinstance(error, (ssl.SSLError, ssl.CertificateError)):
+        return UnreachableError(f"no secure connection to {url}: {error}")
+    if isinstance(error, TimeoutError | httpx.TimeoutException):
+        return UnreachableError(f"no answer from {url} in time")
+    return UnreachableError(f"no connection to {url}: {error or type(error).__name__}")

@@ -1,0 +1,1 @@
+"""Streams that go on after lost connections, for synchronous and asyncio programs."""

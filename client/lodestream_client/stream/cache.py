@@ -1,0 +1,229 @@
+"""Received data of incomplete surfaces, on disk, so that a later program can continue from there.
+
+There is one log file for each container: a head, then a record for each received piece, with its offset, its length and
+a checksum over all three. Records are appended at once and never changed. So a program that is killed loses nothing,
+and a machine that loses power loses at most records whose checksum does not match.
+
+The name of a file comes from a server. So only names of 64 hexadecimal digits are accepted, symbolic links are not
+followed, and no file is written or removed that does not begin like a file of this module.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import stat
+import struct
+import time
+import zlib
+from bisect import bisect_right, insort
+from pathlib import Path
+
+from lodestream.errors import InputError, LodestreamError
+from lodestream.planning.byte_ranges import RangeSet
+
+__all__ = ["Part", "cache_folder", "forget_old", "is_name"]
+
+_MAGIC = b"LODEPART"
+_VERSION = 1
+_HEAD = struct.Struct("<8sIQ")  # magic, version, bytes of the container
+_RECORD = struct.Struct("<QII")  # offset, length, CRC-32 of both and of the data
+
+_DAYS_KEPT = 30
+
+_NAME = re.compile(r"[0-9a-f]{64}")
+# Not a link, and not a wait for whoever is at the other end of what is no file.
+_OPENING = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+class _TakenError(Exception):
+    """Another program has the file open."""
+
+
+def cache_folder() -> Path:
+    """The folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
+    chosen = os.environ.get("LODESTREAM_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME", "").strip() or os.path.expanduser("~/.cache")
+    return Path(chosen) if chosen else Path(base, "lodestream")
+
+
+def is_name(name: object) -> bool:
+    """Whether a text is a valid name: 64 hexadecimal digits."""
+    return isinstance(name, str) and _NAME.fullmatch(name) is not None
+
+
+class Part:
+    """The stored data of one container; locked against other programs while it is open.
+
+    Parameters
+    ----------
+    folder : Path
+        Created with access for the user only, if it does not exist.
+    name : str
+        Name of the container, 64 hexadecimal digits.
+    size : int
+        Bytes of the container.
+
+    Attributes
+    ----------
+    folder : Path
+    ranges : RangeSet
+        The bytes that are stored.
+    discarded : bool
+        Whether closing removes the file. A file without data is removed in any case.
+
+    Raises
+    ------
+    InputError
+        If the name is not valid.
+    LodestreamError
+        If another program has the file open.
+    OSError
+        If the folder cannot be written, or something else has this name: a symbolic link, a file of another user or
+        with other contents. It is not touched.
+    """
+
+    def __init__(self, folder: Path, name: str, size: int) -> None:
+        if not is_name(name):
+            raise InputError(f"expected a container's name of 64 hexadecimal digits, got {name!a}")
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder = folder
+        self._path = folder / f"{name}.part"
+        self.ranges = RangeSet()
+        self.discarded = False
+        self._pieces: list[tuple[int, int, int]] = []  # offset, length, place in the file
+        try:
+            self._handle = _held(self._path, os.O_CREAT)
+        except _TakenError:
+            raise LodestreamError(f"another program is receiving the same surface into {folder}") from None
+        try:
+            self._end = self._recover(size)
+        except BaseException:
+            os.close(self._handle)
+            raise
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read stored bytes."""
+        data = bytearray()
+        number = bisect_right(self._pieces, (offset, 1 << 63, 0)) - 1
+        while len(data) < length:
+            start, size, place = self._pieces[number]
+            skipped = offset + len(data) - start
+            data += os.pread(self._handle, min(size - skipped, length - len(data)), place + skipped)
+            number += 1
+        return bytes(data)
+
+    def write(self, offset: int, data: bytes) -> None:
+        """Store bytes that are not stored yet."""
+        record = _RECORD.pack(offset, len(data), _checksum(offset, data)) + data
+        written = os.pwrite(self._handle, record, self._end)
+        if written != len(record):
+            raise OSError(f"expected to write {len(record)} bytes to {self._path}, got {written}")
+        self._add(offset, len(data), self._end + _RECORD.size)
+        self._end += len(record)
+
+    def used(self, offset: int, length: int) -> None:
+        """Do nothing: used bytes stay stored."""
+
+    def close(self) -> None:
+        """Release the file, or remove it."""
+        if self.discarded or not self.ranges.total:
+            # Whoever opens it just now finds that it has no name any more, and makes another.
+            self._path.unlink(missing_ok=True)
+        os.close(self._handle)
+
+    def _add(self, offset: int, length: int, place: int) -> None:
+        insort(self._pieces, (offset, length, place))
+        self.ranges.add(offset, length)
+
+    def _recover(self, size: int) -> int:
+        """Read what is there; the end of the last record that is whole. What follows it is cut off."""
+        head = _HEAD.pack(_MAGIC, _VERSION, size)
+        end = len(head)
+        with open(self._handle, "rb", closefd=False) as file:
+            if file.read(end) != head:
+                os.ftruncate(self._handle, 0)
+                os.pwrite(self._handle, head, 0)
+                return end
+            while len(fields := file.read(_RECORD.size)) == _RECORD.size:
+                offset, length, checksum = _RECORD.unpack(fields)
+                if offset + length > size or not self._is_new(offset, length):
+                    break
+                data = file.read(length)
+                if len(data) != length or _checksum(offset, data) != checksum:
+                    break
+                self._add(offset, length, end + _RECORD.size)
+                end += _RECORD.size + length
+        os.ftruncate(self._handle, end)
+        os.utime(self._handle)
+        return end
+
+    def _is_new(self, offset: int, length: int) -> bool:
+        """Whether no byte of a range is kept yet."""
+        return length > 0 and next(self.ranges.overlap(offset, length), None) is None
+
+
+def forget_old(folder: Path) -> None:
+    """Remove files that were not used for a month; files of other programs in the folder are not touched."""
+    if not folder.is_dir():
+        return
+    before = time.time() - _DAYS_KEPT * 24 * 3600
+    for path in folder.glob("*.part"):
+        try:
+            if not is_name(path.stem) or path.lstat().st_mtime >= before:
+                continue
+            handle = _held(path)
+        except (OSError, _TakenError):
+            continue
+        try:
+            path.unlink(missing_ok=True)
+        finally:
+            os.close(handle)
+
+
+def _held(path: Path, create: int = 0) -> int:
+    """Open a file of ours, locked until it is closed.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened, or is not ours.
+    """
+    while True:
+        handle = os.open(path, _OPENING | create, 0o600)
+        try:
+            _check_ours(handle, path)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise _TakenError from None
+            if _is_at(handle, path):
+                return handle
+            # It was removed by whoever held it. Without O_CREAT the next attempt finds none.
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _check_ours(handle: int, path: Path) -> None:
+    """Refuse what is no file that this program made, before anything is done to it."""
+    found = os.fstat(handle)
+    own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
+    # A program that was killed may have left less than a head.
+    if not own or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
+        raise FileExistsError(errno.EEXIST, "not a file of an earlier pull; it is not changed", str(path))
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether this is still the file of that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.lstat())
+    except FileNotFoundError:
+        return False
+
+
+def _checksum(offset: int, data: bytes) -> int:
+    return zlib.crc32(data, zlib.crc32(_RECORD.pack(offset, len(data), 0)))

@@ -1,0 +1,170 @@
+"""Limits on the memory that decoding a container may take, computed from its header before memory is allocated.
+
+A header of a few hundred bytes can announce a surface of billions of points. So the memory that it implies is added up
+first:
+
+- for each point of each block and for every channel, attributes included: what the coder keeps of a coefficient (7
+  bytes; more in blocks of few rows or columns, because of the edges of their bands), an integer each in a
+  reconstruction and in the next one (16 bytes), and the value twice; with masks 4 bytes more;
+- for each tile of each channel, and for each block: 2 KiB.
+
+A second budget of the same size counts what is read: every byte, and tables with the size they have after parsing.
+Surfaces and views that the caller keeps are not counted, nor is memory for writing a file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ..errors import TooLargeError
+from ..library import why_missing
+
+__all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
+
+#: What a vertex of a capacity stands for: three coordinates in float64 take somewhat less.
+BYTES_PER_VERTEX = 128
+
+# In any case: headers, metadata, the tables of small surfaces.
+_LEAST = 16 * 1024 * 1024
+
+# Of the memory that this process can have: the surface takes as much, and what is read of its container as well.
+# Plain Python takes up to five times as much for a surface as the compiled kernels, for which this counts.
+_SHARE = 0.4
+_PLAIN_SHARE = 0.08
+
+_COEFFICIENT, _PICTURE, _MASKS, _TABLE = 7, 16, 4, 2048
+_EDGE = 12  # rows or columns
+
+#: Rows and columns of a grid, and the bytes of a number in each of its channels.
+Extent = tuple[tuple[int, int], Iterable[int]]
+
+
+class Capacity:
+    """A memory limit for one container; it counts what has been read.
+
+    Parameters
+    ----------
+    max_vertices : int or None
+        Allows this many vertices and `BYTES_PER_VERTEX` bytes for each, plus 16 MiB. None: two fifths of the memory
+        available to this process, see `memory_limit`.
+
+    Attributes
+    ----------
+    bytes : int
+        Bytes allowed for the surface, and again for what is read.
+    """
+
+    def __init__(self, max_vertices: int | None = None) -> None:
+        self.max_vertices = max_vertices
+        if max_vertices is None:
+            self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
+            self.bytes = max(int(memory_limit() * self._share), _LEAST)
+        else:
+            self.bytes = _LEAST + max_vertices * BYTES_PER_VERTEX
+        self._read = 0
+
+    def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
+        """Refuse a surface that needs more memory than this.
+
+        Parameters
+        ----------
+        vertices : int
+            Vertices to be decoded.
+        grids : iterable of ((rows, columns), bytes of a number in each channel)
+            Grids to be decoded.
+        masked : int
+            Points for which masks are kept.
+        tables : int
+            Tiles of all channels, plus blocks.
+
+        Raises
+        ------
+        TooLargeError
+        """
+        if self.max_vertices is not None and vertices > self.max_vertices:
+            raise TooLargeError(f"expected at most {self.max_vertices:,} vertices (max_vertices), got {vertices:,}")
+        needed = masked * _MASKS + tables * _TABLE
+        for (rows, columns), sizes in grids:
+            edges = (1 + _EDGE / rows) * (1 + _EDGE / columns)
+            each = sum(_PICTURE + 2 * size + _COEFFICIENT * edges for size in sizes)
+            needed += int(rows * columns * each)
+        if needed > self.bytes:
+            enough = -(-(needed - _LEAST) // BYTES_PER_VERTEX)
+            raise TooLargeError(
+                f"expected a surface that takes at most {_size(self.bytes)} to decode "
+                f"({self._words}), got one of {vertices:,} vertices that takes {_size(needed)}; "
+                f"max_vertices={max(enough, vertices)} allows it"
+            )
+
+    def take(self, count: int) -> None:
+        """Count bytes that are read and kept, or that tables take after parsing.
+
+        Raises
+        ------
+        TooLargeError
+            If there are more than a surface of this size can have.
+        """
+        self._read += count
+        if self._read > self.bytes:
+            raise TooLargeError(
+                f"expected a container whose data take at most {_size(self.bytes)} ({self._words}), got more"
+            )
+
+    @property
+    def _words(self) -> str:
+        if self.max_vertices is not None:
+            return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
+        return f"{self._share:.0%} of the available memory"
+
+
+def memory_limit() -> int:
+    """Memory available to this process, in bytes: the least of the limits of machine, control group and process."""
+    return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
+
+
+def _physical() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError):
+        return 0
+
+
+def _own_limits() -> Iterator[int]:
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA):
+        limit = resource.getrlimit(kind)[0]
+        if limit != resource.RLIM_INFINITY:
+            yield limit
+
+
+def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
+    """The limits of the control group that this process is in, and of those above it."""
+    try:
+        lines = proc.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            folder, name = root, "memory.max"
+        elif "memory" in controllers.split(","):
+            folder, name = root / "memory", "memory.limit_in_bytes"
+        else:
+            continue
+        within = Path(path.lstrip("/"))
+        for group in (within, *within.parents):
+            try:
+                text = (folder / group / name).read_text().strip()
+            except OSError:
+                continue
+            if text.isdecimal():
+                yield int(text)
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:,.0f} MiB"

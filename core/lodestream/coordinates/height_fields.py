@@ -1,0 +1,307 @@
+"""Height fields: surfaces whose x and y are a rule, so that heights alone need to be stored.
+
+Surfaces that come as xyz and have such an x and y are taken for heights and given back as xyz, bit for bit.
+In the metadata of a surface, ``grid`` holds the two rules of x and y where the surface came as xyz. For heights that
+came with coordinates of their own, ``axes`` is a map of the rules "x" and "y", of the "dtype" of the coordinates unless
+that is float64, and of "rows": "x" where x runs along the rows. Without either, ``geotransform`` says where they lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..surface import Closed, Surface
+from .coordinate_rules import VALUES, Rule, bits, evaluate, fit_axis, neighbours, plain, rounded
+from .georeference import has_gap, level_coordinates, level_geotransform
+from .seams import wrapped
+
+__all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz", "window_axes"]
+
+_STRIP = 1 << 18
+
+
+def to_heights(surface: Surface, exactly: bool = True) -> Surface | None:
+    """Take xyz over a regular lattice for heights.
+
+    Parameters
+    ----------
+    surface : Surface
+    exactly : bool
+        The rules have to hold under the holes that are kept (`Block.kept`) as well.
+
+    Returns
+    -------
+    Surface or None
+        Heights with ``grid`` in the metadata, of which `to_xyz` makes every value again, bit for bit; None where x and
+        y follow no rule, or the surface is no single block of x, y, z with at least two rows and columns.
+    """
+    if len(surface.blocks) != 1 or surface.points.ndim != 3 or surface.points.shape[2] != 3 or min(surface.shape) < 2:
+        return None
+    mask, kept = surface.mask, surface.blocks[0].kept
+    if mask is not None and kept is not None and exactly:
+        mask = mask | kept
+        if not np.isfinite(surface.points[..., :2][mask]).all():
+            return None
+    rules = []
+    for channel in (0, 1):
+        rule = _fit(surface.points[..., channel], mask, down=channel == 1)
+        if rule is None:
+            return None
+        rules.append(rule)
+    metadata = {**surface.metadata, "grid": rules}
+    heights = surface.points[..., 2]
+    return Surface(heights, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
+
+
+def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
+    """Put x and y beside heights; surfaces of another kind come back as they are.
+
+    Parameters
+    ----------
+    surface : Surface
+    kept : bool, shape (H, W), optional
+        Holes that have x and y; by default those of infinite height.
+
+    Returns
+    -------
+    Surface
+        xyz in the type of the heights where it came as xyz, otherwise in one that holds the coordinates as well
+        (float64). Float coordinates of holes that are not kept are NaN. What says where the heights lie is gone from
+        the metadata.
+    """
+    if len(surface.blocks) != 1 or surface.points.ndim != 2:
+        return surface
+    x, y = coordinates(surface)
+    dtype = surface.dtype if "grid" in surface.metadata else np.result_type(x, y, surface.dtype)
+    points = np.empty((*surface.shape, 3), dtype)
+    for channel, values in enumerate((x, y, surface.points)):
+        points[..., channel] = values
+    if surface.mask is not None and dtype.kind == "f":
+        kept = surface.blocks[0].kept if kept is None else kept
+        points[~surface.mask if kept is None else ~(surface.mask | kept)] = np.nan
+    metadata = {key: value for key, value in surface.metadata.items() if key not in ("grid", "axes", "nodes")}
+    if metadata.pop("angles", None):
+        metadata.pop("turn", None)
+    return Surface(points, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
+
+
+def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
+    """x and y of a height field, each of shape (H, W).
+
+    By the metadata's ``grid`` (then in the type of the heights), ``axes`` or ``geotransform`` (of the centres of the
+    cells), else x is the column and y the row; at the places that ``nodes`` gives for a coarser level.
+
+    Raises
+    ------
+    InputError
+        When the metadata do not hold such rules.
+    """
+    metadata, shape = surface.metadata, surface.shape
+    nodes = metadata.get("nodes") or [None, None]
+    row, column = (
+        np.arange(n, dtype=np.float64) if at is None else np.asarray(at, np.float64)
+        for n, at in zip(shape, nodes, strict=True)
+    )
+    dtype: np.dtype[Any] = np.dtype(np.float64)
+    swapped = False
+    if "grid" in metadata:
+        rules, dtype = metadata["grid"], surface.dtype
+    elif "axes" in metadata:
+        rules, dtype, swapped = _axes(metadata["axes"])
+    elif metadata.get("geotransform") is not None:
+        rules = _geotransform_rules(metadata["geotransform"])
+    else:
+        rules = [[0, 1], [0, 1]]
+        dtype = np.dtype(np.int64) if not any(nodes) else dtype
+    planes = []
+    for channel, rule in enumerate(rules):
+        try:
+            values = evaluate(rule, row[:, None], column[None, :], down=(channel == 1) != swapped)
+        except (TypeError, ValueError, IndexError):
+            raise InputError(f"expected two rules of coordinates in the metadata, got {str(rules)[:80]}") from None
+        for angle in metadata.get("angles", ()):
+            if angle["channel"] == channel:
+                values = wrapped(values, angle["period"], angle["low"])
+        planes.append(np.broadcast_to(rounded(values, dtype), shape))
+    return planes[0], planes[1]
+
+
+def _axes(axes: Any) -> tuple[list[Rule], np.dtype[Any], bool]:
+    """The two rules, the type of coordinates, and whether x runs along the rows."""
+    try:
+        return [axes["x"], axes["y"]], np.dtype(axes.get("dtype", "float64")), axes.get("rows") == "x"
+    except (TypeError, KeyError, AttributeError):
+        raise InputError(f"expected axes of x and y in the metadata, got {str(axes)[:80]}") from None
+
+
+def _geotransform_rules(transform: Any) -> list[Rule]:
+    try:
+        x0, x_column, x_row, y0, y_column, y_row = map(float, transform)
+    except (TypeError, ValueError):
+        raise InputError(f"expected a geotransform of six numbers in the metadata, got {transform!r}") from None
+    return [[x0, x_column, x_row, 0.5], [y0, y_column, y_row, 0.5]]
+
+
+def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rule | None:
+    """The rule of one coordinate, (H, W); `down`: it is y, whose short rules run along the rows."""
+    for axis in (0, 1) if down else (1, 0):
+        line, known = _profile(plane, mask, axis)
+        if line is None:
+            continue
+        rule = fit_axis(line, known)
+        if rule is None:
+            continue
+        if axis == (0 if down else 1):
+            return rule
+        shift = 0.5 if rule[-1] is False else 0
+        if len(rule) == 3 and not shift:
+            continue
+        rule = [rule[0], rule[1], 0, shift] if axis == 1 else [rule[0], 0, rule[1], shift]
+        return rule if _holds(rule, plane, mask, down) else None
+    return _fit_plane(plane, mask, down)
+
+
+def _profile(
+    plane: NDArray[Any], mask: NDArray[np.bool_] | None, axis: int
+) -> tuple[NDArray[Any] | None, NDArray[np.bool_]]:
+    """The values along an axis where they do not change along the other, and which of them are known."""
+    lines = plane if axis == 1 else plane.T
+    if mask is None:
+        line = lines[0]
+        return (line if _same(lines, line) else None), np.ones(len(line), np.bool_)
+    valid = mask if axis == 1 else mask.T
+    line = lines[valid.argmax(axis=0), np.arange(lines.shape[1])]
+    return (line if _same(lines, line, valid) else None), np.asarray(valid.any(axis=0))
+
+
+def _same(lines: NDArray[Any], line: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> bool:
+    height = max(1, _STRIP // lines.shape[1])
+    wanted = bits(line)
+    for start in range(0, len(lines), height):
+        equal: NDArray[np.bool_] = bits(lines[start : start + height]) == wanted
+        if valid is not None:
+            equal |= ~valid[start : start + height]
+        if not equal.all():
+            return False
+    return True
+
+
+def _holds(rule: Rule, plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> bool:
+    rows, width = plane.shape
+    height = max(1, _STRIP // width)
+    column = np.arange(width, dtype=np.float64)[None, :]
+    for start in range(0, rows, height):
+        row = np.arange(start, min(start + height, rows), dtype=np.float64)[:, None]
+        made = np.broadcast_to(rounded(evaluate(rule, row, column, down), plane.dtype), (len(row), width))
+        equal: NDArray[np.bool_] = bits(made) == bits(plane[start : start + height])
+        if mask is not None:
+            equal |= ~mask[start : start + height]
+        if not equal.all():
+            return False
+    return True
+
+
+def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rule | None:
+    """The rule of a coordinate that changes along both axes, as of a rotated lattice."""
+    if mask is not None and not mask[[0, 0, -1], [0, -1, 0]].all():
+        return None
+    origin, right, below = (float(plane[i, j]) for i, j in ((0, 0), (0, -1), (-1, 0)))
+    rows, width = plane.shape
+    across, by_row = (right - origin) / (width - 1), (below - origin) / (rows - 1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        values = plane.astype(np.float64)
+    near = values - (origin + across * np.arange(width) + by_row * np.arange(rows)[:, None])
+    spread = abs(across) + abs(by_row)
+    if not 0 < spread < np.inf or not np.isfinite(origin) or np.nanmax(np.abs(near)) > spread:
+        return None
+    for one in neighbours(across)[:7]:
+        for two in neighbours(by_row)[:7]:
+            for shift in (0.0, 0.5):
+                for start in neighbours(origin - shift * (one + two))[:7]:
+                    rule = [start, one, two, shift]
+                    corner = plane[:8, :8], None if mask is None else mask[:8, :8]
+                    if _holds(rule, *corner, down) and _holds(rule, plane, mask, down):
+                        return [plain(number) for number in rule]
+    return None
+
+
+def level_metadata(
+    metadata: dict[str, Any], shape: tuple[int, int], coarse: tuple[int, int], closed: Closed, halvings: int
+) -> dict[str, Any]:
+    """Metadata of the grid of a coarser level.
+
+    Parameters
+    ----------
+    metadata : dict
+        Of the whole surface.
+    shape, coarse : (int, int)
+        Of the whole grid, and of the level's.
+    closed : (bool, bool)
+    halvings : int
+        How many levels the grid is below the surface.
+
+    Returns
+    -------
+    dict
+        Without ``seam`` (the level's own grid is what was asked for). For heights (a surface of another kind keeps the
+        rest), x and y span what they span in the surface; where an axis has a gap, ``nodes`` has the places of the
+        nodes along rows and columns, in steps of the level's even grid, or None for the axis without one.
+    """
+    result = {key: value for key, value in metadata.items() if key not in ("seam", "turn")}
+    result["geotransform"] = level_geotransform(metadata.get("geotransform"), shape, coarse, closed)
+    across = [
+        full / nodes if wraps else (full - 1) / max(nodes - 1, 1)
+        for full, nodes, wraps in zip(shape, coarse, closed, strict=True)
+    ]
+    if "grid" in metadata:
+        result["grid"] = [
+            _coarser(rule, shape, coarse, across, down=channel == 1) for channel, rule in enumerate(metadata["grid"])
+        ]
+    if "axes" in metadata:
+        rules, _, swapped = _axes(metadata["axes"])
+        for name, channel in (("x", 0), ("y", 1)):
+            rule = _coarser(rules[channel], shape, coarse, across, down=(channel == 1) != swapped)
+            result["axes"] = {**result["axes"], name: rule}
+    nodes = [
+        (level_coordinates(n, wraps, halvings) / ratio).tolist() if has_gap(n, wraps, halvings) else None
+        for n, wraps, ratio in zip(shape, closed, across, strict=True)
+    ]
+    if any(nodes):
+        result["nodes"] = nodes
+    return result
+
+
+def window_axes(axes: Any, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> dict[str, Any]:
+    """The ``axes`` of a window: the numbers themselves, from the first row and column to before the last.
+
+    Raises
+    ------
+    InputError
+        When these are no axes.
+    """
+    rules, _, swapped = _axes(axes)
+    result = dict(axes)
+    for name, rule, down in (("x", rules[0], swapped), ("y", rules[1], not swapped)):
+        place, still = np.arange(shape[0 if down else 1], dtype=np.float64), np.zeros((1, 1))
+        values = evaluate(rule, place[:, None] if down else still, still if down else place[None, :], down).ravel()
+        result[name] = [*values[slice(*(rows if down else columns))].tolist(), VALUES]
+    return result
+
+
+def _coarser(rule: Rule, shape: tuple[int, int], coarse: tuple[int, int], ratios: Sequence[float], down: bool) -> Rule:
+    down_by, across_by = ratios
+    axis = 0 if down else 1
+    if len(rule) == 4 and rule[-1] != VALUES:
+        origin, across, by_row, shift = map(float, rule)
+        return [origin + shift * (across + by_row), across * across_by, by_row * down_by, 0.0]
+    place = np.arange(shape[axis], dtype=np.float64)
+    values = evaluate(rule, place[:, None], place[None, :], down).ravel()
+    at = np.arange(coarse[axis]) * ratios[axis]
+    if rule[-1] == VALUES:
+        return [*np.interp(at, place, values).tolist(), VALUES]
+    return [float(values[0]), float((values[-1] - values[0]) / (shape[axis] - 1) * ratios[axis])]

@@ -1,0 +1,246 @@
+"""Repeated last rows and columns, and angles that jump: smoothed on the way in, put back on the way out.
+
+A file that closes a surface by repeating its first row or column at the end stores those points twice. `merge` finds
+that bit by bit and makes the axis closed instead; `restore`, which comes before every writer, repeats the points again.
+Likewise `unwrap` adds whole turns to angles so that neighbours are near each other, and `restore` takes them away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..surface import DTYPES, Block, Closed, Surface
+
+__all__ = ["merge", "restore", "unwrap", "wrapped"]
+
+_WORDS: Mapping[Closed, str] = {(True, False): "rows", (False, True): "cols", (True, True): "both"}
+_AXES: Mapping[str, Closed] = {word: closed for closed, word in _WORDS.items()}
+
+#: A closed axis has at least three points, and the one that repeats the first.
+_FEWEST = 4
+
+#: A channel of angles, and a full turn.
+Turns = tuple[int, float]
+
+
+def merge(surface: Surface, closed: Closed | None = None, *, angle: Turns | None = None) -> Surface:
+    """Merge repeated last rows and columns into closed axes, of every block.
+
+    Points repeat where their bits do, and those of their mask and attributes. A row whose points all coincide is a pole
+    and no seam.
+
+    Parameters
+    ----------
+    surface : Surface
+        Of a height field, whose heights say nothing of where they lie, only an axis that `closed` names is looked at.
+    closed : (bool, bool), optional
+        The axes that may be merged; None: both.
+    angle : (int, float), optional
+        A channel, and the full turn by which its last row or column may differ from the first.
+
+    Returns
+    -------
+    Surface
+        The same one when nothing repeats. Otherwise with ``seam`` in the metadata: "rows", "cols" or "both", or a list
+        of these (or "") for several blocks; and ``turn``: [channel, number, axis], where a seam adds a full turn.
+    """
+    blocks, words, turn = [], [], []
+    for block in surface.blocks:
+        found = [False, False]
+        for axis in (0, 1):
+            wanted = closed[axis] if closed is not None else block.points.ndim == 3
+            if not wanted or block.closed[axis] or block.shape[axis] < _FEWEST:
+                continue
+            by = _repeats(block, axis, angle)
+            if by is not None:
+                found[axis] = True
+                block = _without_last(block, axis)
+                if angle is not None and by:
+                    turn = [angle[0], by, axis]
+        blocks.append(block)
+        words.append(_WORDS.get((found[0], found[1]), ""))
+    if not any(words):
+        return surface
+    metadata = {**surface.metadata, "seam": words[0] if len(words) == 1 else words}
+    if turn:
+        metadata["turn"] = turn
+    return Surface(blocks=blocks, metadata=metadata)
+
+
+def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
+    """The turn by which the last line differs from the first, 0 for none; None where it does not repeat it."""
+    valid = told = np.ones(block.shape[1 - axis], np.bool_)
+    if block.mask is not None:
+        mask = np.moveaxis(block.mask, axis, 0)
+        if not np.array_equal(mask[0], mask[-1]) or not mask[0].any():
+            return None
+        valid = told = mask[0]
+        if block.kept is not None:
+            kept = np.moveaxis(block.kept, axis, 0)
+            if not np.array_equal(kept[0], kept[-1]):
+                return None
+            told = valid | kept[0]
+    for array in block.attributes.values():
+        lines = np.moveaxis(array, axis, 0)
+        if lines[0][told].tobytes() != lines[-1][told].tobytes():
+            return None
+    points = np.moveaxis(block.points, axis, 0)
+    first, last, turn = points[0], points[-1], 0.0
+    if angle is not None and first.ndim == 2:
+        channel, period = angle
+        turn = float(np.sign(last[valid][0, channel] - first[valid][0, channel])) * period
+        first = first.copy()
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            first[:, channel] += first.dtype.type(turn)
+    if first[told].tobytes() != last[told].tobytes():
+        return None
+    first = first[valid]
+    collapsed = first.ndim == 2 and len(first) > 1 and bool((first == first[0]).all())
+    return None if collapsed else turn
+
+
+def _without_last(block: Block, axis: int) -> Block:
+    kept = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+    return Block(
+        block.points[kept],
+        (block.closed[0] or axis == 0, block.closed[1] or axis == 1),
+        mask=None if block.mask is None else block.mask[kept],
+        attributes={name: array[kept] for name, array in block.attributes.items()},
+    )
+
+
+def unwrap(surface: Surface, channel: int, period: float) -> Surface:
+    """Add whole turns to a channel of angles, so that neighbours are within half a turn where they can be.
+
+    Parameters
+    ----------
+    surface : Surface
+        Of one block of planar points or xyz. Where its type cannot hold the sums without rounding it becomes float64;
+        the type that it had is kept as ``dtype`` in the metadata.
+    channel : int
+    period : float
+        A full turn.
+
+    Returns
+    -------
+    Surface
+        The same one when no angle jumps or the turns could not be taken away bit by bit; otherwise with ``angles`` in
+        the metadata: a list of {"channel", "period", "low"}, where angles lie between low and low + period.
+    """
+    angles = surface.points[..., channel]
+    valid = np.isfinite(angles) if surface.mask is None else surface.mask
+    told = valid if surface.blocks[0].kept is None else valid | surface.blocks[0].kept
+    least, greatest = angles[valid].min(), angles[valid].max()
+    # The angle of a hole is often known, and then tells how its neighbours hang together.
+    known = valid | ((angles >= least) & (angles <= greatest))
+    turns = _turns(np.where(known, angles, np.nan).astype(np.float64), period)
+    if not turns.any():
+        return surface
+    low = float((least + (greatest - period)) / 2)
+    for dtype in dict.fromkeys((surface.dtype, np.dtype(np.float64))):
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            points = surface.points.astype(dtype)
+            points[..., channel] += (turns * period).astype(dtype)
+            back = wrapped(points[..., channel], period, low).astype(surface.dtype)
+        if back[told].tobytes() == angles[told].tobytes():
+            break
+    else:
+        return surface
+    metadata = {**surface.metadata, "angles": [{"channel": channel, "period": period, "low": low}]}
+    if dtype != surface.dtype:
+        metadata["dtype"] = surface.dtype.name
+    return Surface(points, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
+
+
+def _turns(angles: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+    """Whole turns to add, (H, W): along the first column, and from it along every row; holes are stepped over."""
+    filled = _filled(angles)
+    smooth = np.unwrap(filled, period=period, axis=1)
+    smooth += (np.unwrap(filled[:, 0], period=period) - filled[:, 0])[:, None]
+    turns = np.rint((smooth - filled) / period)
+    if _jumps(filled + turns * period, period) >= _jumps(filled, period):
+        turns[:] = 0
+    turns[np.isnan(angles)] = 0
+    return turns
+
+
+def _filled(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take for a missing angle the one before it in its row, or the first of the row, or that of the row before."""
+    holes = np.isnan(angles)
+    if not holes.any():
+        return angles
+    places = np.where(holes, 0, np.arange(angles.shape[1]))
+    filled = np.take_along_axis(angles, np.maximum.accumulate(places, axis=1), axis=1)
+    first = np.take_along_axis(angles, (~holes).argmax(axis=1)[:, None], axis=1)[:, 0]
+    rows = np.where(np.isnan(first), 0, np.arange(len(first)))
+    first = first[np.maximum.accumulate(rows)]
+    first = np.where(np.isnan(first), angles[~holes][0], first)
+    return np.where(np.isnan(filled), first[:, None], filled)
+
+
+def _jumps(angles: NDArray[np.float64], period: float) -> int:
+    return sum(int((np.abs(np.diff(angles, axis=axis)) > period / 2).sum()) for axis in (0, 1))
+
+
+def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float64]:
+    """Angles between low and low + period, by whole turns; what is no number stays as it is."""
+    values = angles.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        values -= np.where(np.isfinite(values), period * np.floor((values - low) / period), 0.0)
+    return values
+
+
+def restore(surface: Surface) -> Surface:
+    """Give a surface the rows, columns, angles and type that it came with; its metadata no longer say so then.
+
+    The ``angles`` of a height field stay: they are those of coordinates that are made where they are needed.
+
+    Raises
+    ------
+    InputError
+        When the metadata name a type that points cannot have.
+    """
+    metadata = dict(surface.metadata)
+    seam, turn, dtype = (metadata.pop(key, None) for key in ("seam", "turn", "dtype"))
+    heights = surface.blocks[0].points.ndim == 2
+    angles = () if heights else metadata.pop("angles", ())
+    if not angles and seam is None and dtype is None:
+        return surface
+    if dtype is not None and dtype not in DTYPES:
+        # Whoever made the container may have written anything: a long text, of which each point would be one.
+        raise InputError(f"expected a type of points in the metadata, got {dtype!a:.80}")
+    words = [seam] if isinstance(seam, str) else list(seam or ())
+    words += [""] * (len(surface.blocks) - len(words))
+    blocks, nodes = [], []
+    for block, word in zip(surface.blocks, words, strict=False):
+        points = block.points.copy() if angles else block.points
+        for angle in angles:
+            channel = points[..., angle["channel"]]
+            channel[:] = wrapped(channel, angle["period"], angle["low"])
+        points = points.astype(dtype or points.dtype, copy=False)
+        repeat = _AXES.get(word, (False, False))
+        points = _with_last(points, repeat, None if heights else turn)
+        attributes = {name: _with_last(array, repeat) for name, array in block.attributes.items()}
+        mask = None if block.mask is None else _with_last(block.mask, repeat)
+        closed = (block.closed[0] and not repeat[0], block.closed[1] and not repeat[1])
+        blocks.append(Block(points, closed, mask=mask, attributes=attributes))
+        rows, columns = (np.arange(length + again) % length for length, again in zip(block.shape, repeat, strict=True))
+        nodes.append((rows, columns))
+    restored = Surface(blocks=blocks, metadata=metadata)
+    restored.joints = None if surface.joints is None else surface.joints.at(nodes)
+    return restored
+
+
+def _with_last(array: NDArray[Any], repeat: Closed, turn: tuple[int, float, int] | None = None) -> NDArray[Any]:
+    for axis in (0, 1):
+        if repeat[axis]:
+            line = np.take(array, [0], axis=axis)
+            if turn is not None and turn[2] == axis:
+                line[..., turn[0]] += line.dtype.type(turn[1])
+            array = np.concatenate((array, line), axis=axis)
+    return array

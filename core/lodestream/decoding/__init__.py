@@ -1,0 +1,1 @@
+"""From slices of a container to views of the surface."""

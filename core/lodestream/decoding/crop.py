@@ -1,0 +1,173 @@
+"""The picture of a window: of every level only what the window is made of, so that it costs what a window costs.
+
+From the finest level down, an axis is followed by the samples that are wanted, see `lodestream.grid.support`. The nodes
+and details that give them back are one stretch of the axis. It is stepped like an axis of its own: where it ends inside
+the surface, what lies beyond would be extended wrongly, but nothing that is wanted looks there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Header
+from ..entropy.tiles import Tiles
+from ..grid.axis import AxisStep
+from ..grid.support import coefficients_needed
+from ..target import Region
+from ..transform.lifting import CLAMP, FRACTION_BITS, inverse_step
+from ..transform.predictors import predictor
+from ..transform.pyramid import allocate
+
+__all__ = ["AxisCrop", "crop_axis", "window_picture"]
+
+#: Nodes that the third step wants of a run.
+_LEAST_NODES = 4
+
+
+class AxisCrop(NamedTuple):
+    """What one step along an axis takes for the samples that are wanted.
+
+    Attributes
+    ----------
+    first : int
+        The first node, and the first detail, that is taken.
+    step : AxisStep
+        Of the nodes and details that are taken, as an axis of their own.
+    start : int
+        Where the samples that are wanted begin among those that the step makes.
+    """
+
+    first: int
+    step: AxisStep
+    start: int
+
+
+def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
+    """What gives the samples from ``start`` to before ``stop`` back.
+
+    An axis that wraps is taken whole.
+    """
+    if step.wraps:
+        return AxisCrop(0, step, start)
+    if not step.midpoints:
+        length = stop - start
+        return AxisCrop(start, AxisStep(length, length, 0, length, False, False, False), 0)
+    samples = np.zeros(step.length, np.bool_)
+    samples[start:stop] = True
+    line = coefficients_needed(samples, step)
+    nodes, details = np.flatnonzero(line[: step.coarse]), np.flatnonzero(line[step.coarse :])
+    first, last = int(nodes[0]), min(int(nodes[-1]), step.run - 1)
+    if details.size:
+        first, last = min(first, int(details[0])), max(last, int(details[-1]) + 1)
+    first = max(min(first, last + 1 - _LEAST_NODES), 0)
+    last = min(max(last, first + _LEAST_NODES - 1), step.run - 1)
+    # The sample of its own at the end of an axis of even length goes with the last node of the run.
+    tail = int(step.tail and last == step.run - 1)
+    run = last - first + 1
+    made = AxisStep(
+        2 * run - 1 + tail,
+        run + tail,
+        run - 1,
+        run,
+        False,
+        step.left and first == 0,
+        step.right and last == step.run - 1,
+    )
+    return AxisCrop(first, made, start - 2 * first)
+
+
+def window_picture(
+    header: Header, channel: int, tiles: Tiles, state: NDArray[np.int8], region: Region
+) -> tuple[NDArray[np.int32], int]:
+    """A window of one channel in a state, of a surface of one grid.
+
+    Parameters
+    ----------
+    tiles : Tiles
+        Of this channel.
+    state : int8, shape (tile,)
+        Passes that remain of each tile; 0 where nothing is needed.
+    region : ((int, int), (int, int))
+        Rows and columns, half-open, of the surface.
+
+    Returns
+    -------
+    int32, shape (row, column), and int
+        Lattice coordinates over two to the power of the second: those that `channel_picture` has there.
+    """
+    layout = header.layout
+    whole = 0
+    while whole < layout.levels and not state[layout.tiles_of(whole + 1)].any():
+        whole += 1
+    crops: list[tuple[AxisCrop, AxisCrop]] = []
+    spans = region
+    for level in range(layout.levels, 0, -1):
+        rows, columns = (crop_axis(step, *span) for step, span in zip(layout.steps(0, level), spans, strict=True))
+        crops.append((rows, columns))
+        spans = _nodes(rows), _nodes(columns)
+    sizes = spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]
+    picture = allocate(sizes)
+    _put(tiles, 0, state, False, picture, ((spans[0][0], sizes[0], 0), (spans[1][0], sizes[1], 0)))
+    for level, crop in enumerate(reversed(crops), start=1):
+        steps = crop[0].step, crop[1].step
+        finer = crops[-level - 1] if level < layout.levels else None
+        wanted = region if finer is None else (_nodes(finer[0]), _nodes(finer[1]))
+        canvas = allocate((steps[0].length, steps[1].length))
+        corner = canvas[: steps[0].coarse, : steps[1].coarse]
+        corner[...] = picture
+        if level == whole + 1:
+            np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
+            corner <<= FRACTION_BITS
+        full = layout.steps(0, level)
+        places = tuple((c.first, c.step.coarse, f.coarse) for c, f in zip(crop, full, strict=True))
+        _put(tiles, level, state, level > whole, canvas, places)
+        for axis in (1, 0):
+            if steps[axis].midpoints:
+                rule = predictor(header.predictors[channel], layout.grids[0], full[axis], level, axis)
+                inverse_step(canvas, axis, steps[axis], rule)
+        (top, bottom), (left, right) = wanted
+        rows_made, columns_made = crop[0].start, crop[1].start
+        picture = canvas[rows_made : rows_made + bottom - top, columns_made : columns_made + right - left]
+    return picture, FRACTION_BITS if whole < layout.levels else 0
+
+
+def _nodes(crop: AxisCrop) -> tuple[int, int]:
+    """The nodes that are taken: samples that are wanted of the coarser level."""
+    return crop.first, crop.first + crop.step.coarse
+
+
+def _put(
+    tiles: Tiles,
+    level: int,
+    state: NDArray[np.int8],
+    finer: bool,
+    canvas: NDArray[np.int32],
+    places: tuple[tuple[int, int, int], ...],
+) -> None:
+    """Put the bands of a level where they belong in what is taken of it.
+
+    ``finer``: they are multiplied by 2**`FRACTION_BITS`.
+    ``places``: of each axis the first node and detail, nodes that are taken, and nodes that there are.
+    """
+    table = tiles.table
+    for number in table.layout.tiles_of(level):
+        for band_number, band in enumerate(table.members[number], start=table.first[number]):
+            spans = [
+                _span(*axis) for axis in zip(band.kind, (band.rows, band.columns), places, canvas.shape, strict=True)
+            ]
+            if all(stop > start for _, start, stop in spans):
+                values = tiles.band(band_number, state, finer)
+                (above, top, bottom), (before, left, right) = spans
+                canvas[top:bottom, left:right] = values[above : above + bottom - top, before : before + right - left]
+
+
+def _span(details: bool, span: tuple[int, int], place: tuple[int, int, int], length: int) -> tuple[int, int, int]:
+    """Where a band begins in itself to be taken, and from where to where it goes along an axis of what is taken."""
+    first, taken, nodes = place
+    offset = taken - nodes - first if details else -first
+    least, most = (taken, length) if details else (0, taken)
+    start, stop = max(span[0] + offset, least), min(span[1] + offset, most)
+    return start - offset - span[0], start, stop

@@ -1,0 +1,423 @@
+"""Decoding a container while its bytes arrive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container import headers, sections
+from ..container.capacity import Capacity
+from ..container.digest import DIGEST
+from ..container.frames import Frame, FrameReader, index_extent, section_extent
+from ..container.model import ByteRange, Header, Index, Piece
+from ..container.reader import INDEX_GROWTH, index_from, index_of, read_metadata
+from ..container.slices import Slices, State
+from ..entropy.dequantize import UNANNOUNCED
+from ..errors import CorruptStreamError, TruncatedStreamError
+from ..library import why_missing
+from ..planning.selection import Wish, select
+from ..surface import Surface
+from ..target import Region
+from .reconstruction import Coded, Progress, Reconstruction
+from .view import View
+
+__all__ = ["Decoder", "View", "decode"]
+
+# What an entry of a layer's table becomes until its segment has been decoded.
+_ENTRY = 256
+
+Bytes = bytes  # the name within classes that have a property of this name
+
+
+class Decoder:
+    """Decodes a container piece by piece, and gives a `View` for each state whose errors are known.
+
+    `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
+    `CorruptStreamError` with its offset; everything before it stays usable.
+
+    Parameters
+    ----------
+    wish : Wish, optional
+        A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
+        not known (NaN) before it is complete.
+    max_vertices : int or None
+        Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
+        as fits this process's memory.
+    level : int or None
+        The finest level that the caller will use; None: the whole surface. Only memory for this level is then counted.
+
+    Raises
+    ------
+    TooLargeError
+        From methods that take bytes: if the header announces a surface that needs more memory than allowed, or if there
+        are more bytes than such a surface can have.
+    """
+
+    def __init__(self, wish: Wish | None = None, *, max_vertices: int | None = None, level: int | None = None) -> None:
+        self._wish = wish or Wish()
+        self._finest = level
+        self.capacity = Capacity(max_vertices)
+        self.header: Header | None = None
+        self.index: Index | None = None
+        self.metadata: dict[str, Any] | None = None
+        self.layers: list[View] = []
+        self._values: dict[str, Any] = {}
+        self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
+        self._frames = FrameReader()
+        self._pages: Frame | None = None  # of the index, before its root
+        self._slices: Slices | None = None
+        self._focus: Region | None = None  # the region that comes first
+        self._near: NDArray[np.bool_] | None = None  # its tiles, once the index is known
+        self._turned = False
+        self._early: list[tuple[int, bytes]] = []
+        self._loose: dict[int, tuple[int, bytearray]] = {}  # unfinished service sections, by where each goes on
+        self._footer = bytearray()
+
+    def feed(self, chunk: bytes | bytearray | memoryview) -> list[View]:
+        """Decode the next bytes of the file; returns the views that they complete.
+
+        Raises
+        ------
+        CorruptStreamError, UnsupportedVersionError
+            The layers before the damage stay usable.
+        """
+        self.capacity.take(len(chunk))
+        if self._frames.ended:
+            self._take_footer(bytes(chunk))
+            return []
+        before = len(self.layers)
+        for frame in self._frames.feed(bytes(chunk)):
+            self._take(frame)
+        if self._frames.ended:
+            self._take_footer(self._frames.rest())
+        return self.layers[before:]
+
+    def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
+        """Decode a slice of the container that starts at ``offset``; returns the views that it completes.
+
+        Slices must come in the order of a `plan`. They may be cut into pieces of any size.
+        """
+        before = len(self.layers)
+        if self._slices is not None:
+            self.capacity.take(len(chunk))
+            self._take_slice(offset, bytes(chunk))
+        elif offset == self._frames.position + self._frames.pending:
+            self.feed(chunk)
+            if self.header is not None and (self.header.holes or not self.header.masked):
+                early, self._early = self._early, []
+                for place, data in early:
+                    self._take_loose(place, data)
+        else:
+            self.capacity.take(len(chunk))
+            if self.header is None or (self.header.masked and not self.header.holes):
+                self._early.append((offset, bytes(chunk)))
+            else:
+                self._take_loose(offset, bytes(chunk))
+        return self.layers[before:]
+
+    def focus(self, region: Region | None) -> None:
+        """Announce another order of the bytes: first what a region needs; with None, the plan's own order.
+
+        The index must have come before, or be among these bytes. A view is given whenever a layer or level is complete
+        in the region, and when it is complete everywhere. Its errors are NaN if more data have arrived than belong to
+        the layer.
+
+        Raises
+        ------
+        OptionError
+            If the header is known and the surface has no such region.
+        """
+        self._focus, self._turned = region, True
+        if self.header is not None:
+            Wish(region).check(self.header)
+        self._follow_focus()
+
+    def finish(self) -> None:
+        """Declare that no more bytes will come.
+
+        Raises
+        ------
+        TruncatedStreamError
+            If the surface is not complete. What has come stays usable.
+        """
+        if not self.complete:
+            got, wanted = len(self.layers), self.header.layer_count if self.header else None
+            what = f"{got} of {wanted} layers" if got != wanted else f"{got} layers without what makes them exact"
+            raise TruncatedStreamError(
+                f"expected a whole container, got {what if self.header else 'no header'} in "
+                f"{self._frames.position + self._frames.pending} bytes: it is cut short"
+            )
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole surface has arrived; metadata and index may still be missing."""
+        return bool(self.layers) and self.layers[-1].complete
+
+    def view(self) -> View:
+        """The current state.
+
+        Raises
+        ------
+        TruncatedStreamError
+            If the first layer is not complete.
+        """
+        if not self.layers:
+            raise TruncatedStreamError("expected at least one whole layer, got less")
+        return self.layers[-1]
+
+    def surface(self, level: int | None = None) -> Surface:
+        """The current state as a surface, see `View.surface`."""
+        return self.view().surface(level)
+
+    def points_at(self, level: int) -> NDArray[Any]:
+        """The current grid of a level, see `View.points_at`."""
+        return self.view().points_at(level)
+
+    @property
+    def level(self) -> int:
+        """Finest level of which there are decoded data, see `view`."""
+        return self.view().level
+
+    @property
+    def bytes(self) -> int:
+        """Bytes received of header, layers and exactness; 0 before the first layer is complete."""
+        return self.layers[-1].bytes if self.layers else 0
+
+    @property
+    def rms(self) -> float:
+        """Measured RMS error of the current state, see `view`."""
+        return self.view().rms
+
+    @property
+    def max_error(self) -> float:
+        """Measured maximum error of the current state, see `view`."""
+        return self.view().max_error
+
+    def _take(self, frame: Frame) -> None:
+        if frame.kind == sections.HEADER:
+            self._take_header(frame)
+        elif self.header is None:
+            raise CorruptStreamError(f"expected the header, got a section of kind {frame.kind}", frame.offset)
+        elif frame.kind in (sections.MASKS, sections.KEPT_MASKS):
+            self._take_masks(frame, self.header)
+        elif self.header.masked and not self.header.holes:
+            raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
+        elif frame.kind == sections.LAYER:
+            self._take_layer(frame, self.header)
+        elif frame.kind == sections.EXACTNESS:
+            self._take_exactness(frame, self.header)
+        elif frame.kind == sections.METADATA:
+            self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+        elif frame.kind == sections.PAGES:
+            self._pages = frame
+        else:
+            self._take_index(frame, self.header)
+
+    def _take_index(self, root: Frame, header: Header) -> None:
+        pages, self._pages = self._pages, None
+        if pages is None:
+            raise CorruptStreamError("expected the pages of an index before its root, got the root", root.offset)
+        self.capacity.take(INDEX_GROWTH * (root.end - pages.offset))
+        known = index_of(pages, root, header)
+        self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
+
+    def _take_footer(self, data: Bytes) -> None:
+        offset, length = self._frames.position, sections.FOOTER_LENGTH
+        self._footer += data[: length + 1 - len(self._footer)]
+        if len(self._footer) > length:
+            raise CorruptStreamError(
+                "expected the end of the container, got more bytes", offset + sections.FOOTER_LENGTH
+            )
+        if len(self._footer) == length:
+            sections.parse_footer(bytes(self._footer), offset)
+
+    def _take_header(self, frame: Frame) -> None:
+        if self.header is not None:
+            raise CorruptStreamError("expected one header, got a second", frame.offset)
+        self.header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
+        self._wish.check(self.header)
+        self._wish.check_size(self.header, self.capacity, self._finest)
+        if not self.header.masked:
+            self._begin(self.header)
+
+    def _begin(self, header: Header) -> None:
+        self._wanted = self._wish.tiles(header)
+        self._progress = Progress(header)
+        self._reconstruction = _reconstruction(header)
+        self._level = 0
+
+    def _take_masks(self, frame: Frame, header: Header) -> None:
+        if not header.masked or header.holes:
+            raise CorruptStreamError("expected layers, got masks", frame.offset)
+        self.header = headers.parse_masks(header, frame)
+        self._begin(self.header)
+
+    def _take_layer(self, frame: Frame, header: Header) -> None:
+        number = len(self.layers)
+        if number >= header.layer_count:
+            raise CorruptStreamError(f"expected {header.layer_count} layers, got more", frame.offset)
+        errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
+        self.capacity.take(_ENTRY * len(entries))
+        segments = []
+        for entry in entries:
+            place = frame.payload_offset + start
+            first = self._progress.advance(entry.tile, entry.channel, entry.top, entry.passes, place)
+            data = bytes(frame.payload[start : start + entry.length])
+            segments.append(Coded(entry.tile, entry.channel, first, entry.passes, data, place))
+            start += entry.length
+            self._level = max(self._level, header.layout.tiles[entry.tile].level)
+        for segment in segments:
+            self._reconstruction.add(segment)
+        last = number + 1 == header.layer_count
+        complete = last and not header.corrected
+        whole = complete or (last and self._level == header.levels)
+        self._show(State(number, self._level, frame.end, errors.rms, errors.maximum, complete, whole))
+
+    def _take_exactness(self, frame: Frame, header: Header) -> None:
+        if len(self.layers) != header.layer_count or not header.corrected:
+            raise CorruptStreamError("expected layers, got exactness", frame.offset)
+        errors, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, header)
+        for number, piece in enumerate(pieces):
+            self._reconstruction.correct(number, *piece)
+        self._show(State(len(self.layers), header.levels, frame.end, errors.rms, errors.maximum, True, True))
+
+    def _take_metadata(self, values: dict[str, Any]) -> None:
+        if DIGEST in values:
+            self._digest[DIGEST] = values.pop(DIGEST)
+        self.metadata = values
+        self._values.update(values)
+
+    def _show(self, made: State) -> None:
+        corrected = made.complete and self.header is not None and self.header.corrected
+        length, state = self._reconstruction.length, self._progress.snapshot(made.all_planes)
+        self.capacity.take(state.nbytes)
+        if self.header is not None and made.whole_level >= 0:
+            # The index says that there is nothing more of these levels.
+            levels = state[: self.header.layout.tiles_of(made.whole_level).stop]
+            levels[levels == UNANNOUNCED] = 0
+        if made.whole_near and self._near is not None:
+            state[self._near[:, None] & (state == UNANNOUNCED)] = 0
+        if self.header is not None and self._wish.region is not None:
+            # What lies outside has no part in the window.
+            state[~self._wanted] = 0
+        self.layers.append(
+            View(
+                made.number,
+                made.level,
+                made.bytes,
+                made.rms,
+                made.max_error,
+                made.complete,
+                self._reconstruction,
+                length,
+                state,
+                corrected,
+                self._values,
+                self._digest,
+                self._wish,
+            )
+        )
+
+    def _take_loose(self, offset: int, data: Bytes) -> None:
+        """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
+        start, run = self._loose.pop(offset, (offset, bytearray()))
+        run += data
+        kind, place = run[0], ByteRange(start, len(run))
+        if kind not in (sections.PAGES, sections.METADATA):
+            raise CorruptStreamError(f"expected the index or the metadata, got a section of kind {kind}", offset)
+        if kind == sections.METADATA:
+            extent = section_extent(run, start)
+            end = None if extent is None else extent[1]
+        else:
+            end = index_extent(run, start)
+        if end is None or len(run) < end:
+            self._loose[start + len(run)] = start, run
+            return
+        if len(run) > end:
+            raise CorruptStreamError("expected a section by itself, got bytes after it", start + end)
+        if kind == sections.METADATA:
+            self._take_metadata(read_metadata(bytes(run), place))
+        elif self.header is not None:
+            self.capacity.take(INDEX_GROWTH * len(run))
+            self.index = index_from(bytes(run), place, self.header)
+            chosen = select(self.index, self._wish)
+            partial = self._wish.region is not None
+            self._slices = Slices(self.index, chosen.segments, chosen.pieces, partial, chosen.whole)
+            if self.layers or self._frames.pending:
+                # The file was read in its own order so far, and is not any more.
+                self._slices.continue_file(self._frames.position)
+                self._follow_focus()
+                self._take_slice(self._frames.position, self._frames.rest())
+                for begun, part in self._loose.values():
+                    self._take_slice(begun, bytes(part))
+            else:
+                self._follow_focus()
+                if (state := self._slices.state()) is not None:
+                    self._show(state)
+
+    def _follow_focus(self) -> None:
+        if self._turned and self._slices is not None and self.header is not None:
+            self._near = None if self._focus is None else Wish(self._focus).tiles(self.header)
+            self._slices.focus(self._near)
+
+    def _take_slice(self, offset: int, data: Bytes) -> None:
+        assert self._slices is not None
+        self._slices.add(offset, data)
+        for item, payload in self._slices.items():
+            place = item.range.offset
+            if sections.check_of(payload) != item.check:
+                raise CorruptStreamError("expected a segment or piece to match its CRC, got other bytes", place)
+            if isinstance(item, Piece):
+                self._reconstruction.correct(self._slices.number(item), payload, place)
+                state = self._slices.hold_piece(item)
+            else:
+                known = bool(self._progress.top[item.tile, item.channel])
+                top = 0 if known else item.top
+                first = self._progress.advance(item.tile, item.channel, top, item.passes, place)
+                self._reconstruction.add(Coded(item.tile, item.channel, first, item.passes, payload, place))
+                state = self._slices.hold(item)
+            if state is not None:
+                self._show(state)
+        frame = self._slices.metadata()
+        if frame is not None:
+            self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
+
+
+def _reconstruction(header: Header) -> Reconstruction:
+    if why_missing() is None:
+        return Reconstruction(header)
+    from .fallback import PlainReconstruction
+
+    return PlainReconstruction(header)
+
+
+def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | None = None) -> Surface:
+    """Decode a complete container.
+
+    Parameters
+    ----------
+    container : bytes
+    max_vertices : int or None
+        Limit on the memory of the surface, see `Decoder`.
+
+    Returns
+    -------
+    Surface
+        With the dtype and axes of the original. The values are bit for bit the same, unless a precision or an error was
+        chosen in `encode`.
+
+    Raises
+    ------
+    CorruptStreamError, UnsupportedVersionError
+    TruncatedStreamError
+        If the container is cut short; use `Decoder` for a prefix.
+    TooLargeError
+        If it needs more memory than allowed.
+    """
+    decoder = Decoder(max_vertices=max_vertices)
+    decoder.feed(container)
+    decoder.finish()
+    return decoder.surface()

@@ -1,0 +1,376 @@
+"""Segments into points: the state of a surface that is being refined, and pictures of any state that it passed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.chunks import Window, windows
+from ..container.model import Header
+from ..entropy.bitplanes import pass_count
+from ..entropy.dequantize import UNANNOUNCED
+from ..entropy.tiles import Tiles, TileTable
+from ..errors import CorruptStreamError
+from ..grid.patches import assemble, level_masks, numbered_by_block
+from ..quantization.distortion import store_values
+from ..residual import chunk_coder
+from ..target import Region
+from ..transform.lifting import FRACTION_BITS
+from ..transform.predictors import COEFFICIENT_BITS
+from ..transform.pyramid import allocate, inverse
+from .crop import window_picture
+
+__all__ = [
+    "Coded",
+    "Picture",
+    "Progress",
+    "Reconstruction",
+    "Values",
+    "channel_picture",
+    "initial_state",
+    "to_values",
+]
+
+#: Lattice coordinates of each grid, over two to the power of the second.
+Picture = tuple[list[NDArray[np.int32]], int]
+
+_BATCH = 64  # segments decoded in one go: few enough that an interruption is not kept waiting
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A segment with its bytes: ``passes`` passes of a tile down from ``first``; ``offset`` is its place."""
+
+    tile: int
+    channel: int
+    first: int
+    passes: int
+    data: bytes
+    offset: int
+
+
+class Reconstruction:
+    """Decodes segments when a picture asks for them, in the order in which they were added.
+
+    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
+    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes
+    told is ignored.
+    """
+
+    def __init__(self, header: Header) -> None:
+        self.header = header
+        self._queue: dict[int, Coded] = {}  # what is not decoded yet, by number
+        self._added = self._taken = self._forgotten = 0
+        self._begun: tuple[int, list[Callable[[], None]]] = 0, []  # the batch on its way: what it ends before, its work
+        self._lock = Lock()
+        self._pieces: dict[int, tuple[bytes, int]] = {}
+        self._tiles: list[Tiles] = []
+
+    @property
+    def length(self) -> int:
+        """Segments added so far."""
+        return self._added
+
+    def add(self, segment: Coded) -> None:
+        """Take a segment; nothing is decoded yet."""
+        self._queue[self._added] = segment
+        self._added += 1
+
+    def correct(self, number: int, data: bytes, offset: int) -> None:
+        """Take a piece of the exactness section, which stands at ``offset``."""
+        if data:
+            self._pieces[number] = data, offset
+
+    def blocks(
+        self,
+        length: int,
+        state: NDArray[np.int8],
+        level: int,
+        corrected: bool = False,
+        chosen: NDArray[np.bool_] | None = None,
+    ) -> list[Values]:
+        """The grids of ``level`` when the first ``length`` segments are known, one for each block.
+
+        Channels that are not ``chosen`` mean nothing.
+
+        Raises
+        ------
+        CorruptStreamError
+            When ``corrected`` is asked for and a piece of the exactness section does not fit.
+        """
+        header = self.header
+        blocks = self._whole(length, state, level, chosen)
+        if corrected:
+            self._correct(blocks, chosen)
+        masks = level_masks(header.parts, header.layout, level, header.masks)
+        for block, mask, kept in zip(blocks, masks, header.kept_masks, strict=True):
+            if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
+                block.clear(~(mask | kept) if corrected and kept is not None else ~mask, header.hole)
+        return blocks
+
+    def _whole(
+        self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
+    ) -> list[Values]:
+        """The values of all blocks before exactness and holes."""
+        return to_values(self.header, self.pictures(length, state, level, chosen), level)
+
+    def pictures(
+        self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
+    ) -> list[Picture]:
+        """The grids of ``level`` of each channel, in lattice coordinates, see `blocks`."""
+        pictures: list[Picture] = []
+        with self._lock:
+            self._decode(length)
+            for channel, tiles in enumerate(self._tiles):
+                if chosen is None or chosen[channel]:
+                    pictures.append(channel_picture(self.header, channel, tiles, state[:, channel], level))
+                else:
+                    pictures.append(pictures[0])  # of the right shapes
+        return pictures
+
+    def picture(self, length: int, state: NDArray[np.int8], level: int, channel: int) -> Picture:
+        """One channel of the grids of ``level``, see `pictures`."""
+        with self._lock:
+            self._decode(length)
+            return channel_picture(self.header, channel, self._tiles[channel], state[:, channel], level)
+
+    def window(
+        self,
+        length: int,
+        state: NDArray[np.int8],
+        region: Region,
+        corrected: bool,
+        chosen: NDArray[np.bool_],
+    ) -> Values:
+        """A window of the surface, of one grid, when the first ``length`` segments are known.
+
+        Takes memory for what the window is made of, not for the surface. See `blocks`.
+        """
+        header = self.header
+        values = self._part(length, state, region, chosen)
+        if corrected:
+            self._correct([values], chosen, region)
+        if (mask := header.masks[0]) is not None:
+            if corrected and (kept := header.kept_masks[0]) is not None:
+                mask = mask | kept
+            values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
+        return values
+
+    def _part(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
+        """The values of a window before exactness and holes."""
+        header = self.header
+        with self._lock:
+            self._decode(length)
+            pictures = [
+                window_picture(header, channel, tiles, state[:, channel], region) if chosen[channel] else None
+                for channel, tiles in enumerate(self._tiles)
+            ]
+        shape = region[0][1] - region[0][0], region[1][1] - region[1][0]
+        arrays, channel = [], 0
+        for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
+            array = np.zeros((*shape, count), header.dtypes[channel])
+            for component in range(count):
+                if (picture := pictures[channel]) is not None:
+                    store_values(header.lattices[channel], picture, array, component)
+                channel += 1
+            arrays.append(array)
+        return Values(arrays)
+
+    def _correct(self, blocks: list[Values], chosen: NDArray[np.bool_] | None, region: Region | None = None) -> None:
+        """Restore all windows of exactness that there are, or of a region of the only block those inside."""
+        top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
+        for number, window in enumerate(windows(self.header)):
+            inside = region is None or all(
+                a <= start and stop <= b
+                for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
+            )
+            if number in self._pieces and inside and (chosen is None or chosen[window.channel]):
+                values = blocks[window.block].window(window, top, left)
+                masks = self.header.kept_masks if window.kept else self.header.masks
+                mask, (data, offset) = masks[window.block], self._pieces[number]
+                valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
+                places = slice(None) if valid is None else valid
+                known = values[places]
+                values[places] = self._restored(known.ravel(), data, offset).reshape(known.shape)
+
+    def _restored(self, known: NDArray[Any], piece: bytes, offset: int) -> NDArray[Any]:
+        """The values of a piece of the exactness section."""
+        return chunk_coder.decode_piece(known, piece, offset)
+
+    def _prepare(self) -> list[Tiles]:
+        if not self._tiles:
+            header = self.header
+            table = TileTable.of(header.layout)
+            other = TileTable.of(header.layout, False) if header.layout.shared else table
+            self._tiles = [
+                Tiles(table, header.quantiser, header.large)
+                if channel < header.geometric
+                else Tiles(other, None, header.large)
+                for channel in range(header.channels)
+            ]
+        return self._tiles
+
+    def _decode(self, length: int) -> None:
+        """Decode the first ``length`` segments. After an interruption at any place the next call goes on from there."""
+        every = self._prepare()
+        while self._taken < length:
+            if self._begun[0] <= self._taken:
+                end = min(self._taken + _BATCH, length)
+                runs: list[list[tuple[int, int, int, bytes]]] = [[] for _ in every]
+                for number in range(self._taken, end):
+                    segment = self._queue[number]
+                    last = segment.first - segment.passes + 1
+                    runs[segment.channel].append((segment.tile, segment.first, last, segment.data))
+                self._begun = end, [tiles.reading(own) for tiles, own in zip(every, runs, strict=True) if own]
+            end, work = self._begun
+            for read in work:
+                read()
+            self._taken = end
+            self._forget(end)
+
+    def _forget(self, end: int) -> None:
+        """Drop the segments before number ``end``, and any that an interruption has left."""
+        while self._forgotten < end:
+            self._queue.pop(self._forgotten, None)
+            self._forgotten += 1
+
+
+class Progress:
+    """Which passes of each tile have been announced so far, and whether a segment continues them."""
+
+    def __init__(self, header: Header) -> None:
+        shape = len(header.layout.tiles), header.channels
+        self.top = np.zeros(shape, np.int8)
+        self.state = initial_state(header)
+
+    def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
+        """Note a segment; returns the first of its passes.
+
+        Parameters
+        ----------
+        top : int
+            Bit-planes of the tile, told with its first segment; 0 with the others.
+
+        Raises
+        ------
+        CorruptStreamError
+            When the tile was not announced, was announced already, or has not so many passes left.
+        """
+        known = int(self.top[tile, channel])
+        if not known and self.state[tile, channel] == 0:
+            raise CorruptStreamError(f"expected no segment of tile {tile}, whose level has zeros only", offset)
+        if bool(top) == bool(known):
+            problem = "told again" if known else "not told"
+            raise CorruptStreamError(
+                f"expected the planes of tile {tile} once, at its first segment: {problem}", offset
+            )
+        if top > COEFFICIENT_BITS:
+            raise CorruptStreamError(
+                f"expected at most {COEFFICIENT_BITS} bit-planes of tile {tile}, got {top}", offset
+            )
+        if top:
+            self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
+        below = int(self.state[tile, channel])
+        if passes > below:
+            raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
+        self.state[tile, channel] = below - passes
+        return below - 1
+
+    def snapshot(self, whole: bool) -> NDArray[np.int8]:
+        """The present state; once ``whole``, a tile that no layer has announced is known to have nothing but zeros."""
+        return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
+
+
+def initial_state(header: Header) -> NDArray[np.int8]:
+    """The state before the first layer: what has no coefficient, or none other than 0 in its whole level, is known."""
+    tiles = header.layout.tiles
+    levels = np.array([tile.level for tile in tiles])
+    known = ((np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1).astype(bool)
+    known[:, : header.geometric] |= np.array([not tile.bands for tile in tiles])[:, None]
+    known[:, header.geometric :] |= np.array([not tile.whole for tile in tiles])[:, None]
+    return np.where(known, 0, UNANNOUNCED).astype(np.int8)
+
+
+def channel_picture(
+    header: Header,
+    channel: int,
+    tiles: Tiles,
+    state: NDArray[np.int8],
+    level: int,
+    canvases: list[NDArray[np.int32]] | None = None,
+) -> Picture:
+    """One channel of the grids of ``level`` in a state.
+
+    Parameters
+    ----------
+    canvases : list of int32 arrays, optional
+        Of the shapes of the level, one for each grid, where the picture is made; new ones otherwise.
+
+    Returns
+    -------
+    (list of int32 arrays, shape (row, column), int)
+        Lattice coordinates of each grid, curves first, over two to the power of the second.
+    """
+    layout = header.layout
+    whole = 0
+    while whole < level and not state[layout.tiles_of(whole + 1)].any():
+        whole += 1
+    for canvas in canvases or ():
+        canvas.fill(0)
+    coefficients = canvases or [allocate(layout.shape(number, level)) for number in range(len(layout.grids))]
+    tiles.spread_levels(level, state, coefficients, whole)
+    inverse(coefficients, layout, header.predictors[channel], level, whole, channel < header.geometric)
+    return coefficients, FRACTION_BITS if whole < level else 0
+
+
+@dataclass
+class Values:
+    """A block's points, shape (row, column, channel), and those of its attributes."""
+
+    arrays: list[NDArray[Any]]
+
+    def window(self, window: Window, top: int = 0, left: int = 0) -> NDArray[Any]:
+        """One channel in a window, a view; the arrays begin at row ``top`` and column ``left`` of the block."""
+        channel = window.channel
+        rows, columns = (
+            slice(start - first, stop - first)
+            for (start, stop), first in zip((window.rows, window.columns), (top, left), strict=True)
+        )
+        for array in self.arrays:
+            if channel < array.shape[2]:
+                return array[rows, columns, channel]
+            channel -= array.shape[2]
+        raise IndexError(window.channel)
+
+    def clear(self, holes: NDArray[np.bool_], hole: int) -> None:
+        """Give holes the value that says so: NaN in floats, ``hole`` in integer points, 0 in integer attributes."""
+        for number, array in enumerate(self.arrays):
+            array[holes] = np.nan if array.dtype.kind == "f" else 0 if number else array.dtype.type(hole)
+
+
+def to_values(header: Header, pictures: Sequence[Picture], level: int) -> list[Values]:
+    """Values of each channel's picture, block by block."""
+    layout, parts = header.layout, header.parts
+    curves = len(layout.grids) - len(parts)
+    components = [header.point_channels, *(kind.channels for kind in header.attributes)]
+    grids: list[list[NDArray[Any]]] = []  # of each array, of each part
+    channel = 0
+    for count in components:
+        arrays = [
+            np.empty((*layout.shape(curves + k, level), count), header.dtypes[channel]) for k in range(len(parts))
+        ]
+        for component in range(count):
+            coordinates, fraction = pictures[channel]
+            for k, array in enumerate(arrays):
+                store_values(header.lattices[channel], (coordinates[curves + k], fraction), array, component)
+            channel += 1
+        grids.append(arrays)
+    return [
+        Values([np.ascontiguousarray(assemble(own, layout, level, shape, arrays)) for arrays in grids])
+        for own, (shape, _) in zip(numbered_by_block(parts, len(header.blocks)), header.blocks, strict=True)
+    ]

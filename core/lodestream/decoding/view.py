@@ -1,0 +1,236 @@
+"""Views: the states of a surface while its container is being received."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.digest import DIGEST, values_digest
+from ..container.model import Header
+from ..coordinates.height_fields import level_metadata, to_xyz
+from ..errors import CorruptStreamError, InputError, OptionError
+from ..grid.patches import level_masks, level_positions, numbered_by_block
+from ..joints import Nodes
+from ..planning.selection import Wish, restored
+from ..surface import Block, Closed, Surface
+from ..target import Region
+from .reconstruction import Reconstruction, Values
+from .window_metadata import window_closed, window_grid, window_metadata
+
+__all__ = ["View"]
+
+
+@dataclass(frozen=True)
+class View:
+    """One state of a surface. Its points are computed on request, even if more data have arrived since.
+
+    Attributes
+    ----------
+    number : int
+        Number of the layer, or of the level in level order. The exact end has the next number.
+    level : int
+        Finest level of which there are decoded data.
+    bytes : int
+        Bytes received of header, layers and exactness.
+    rms, max_error : float
+        Measured errors at full resolution, in the surface's unit.
+    complete : bool
+        Whether this is the last state.
+    """
+
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+    complete: bool
+    _reconstruction: Reconstruction = field(repr=False, compare=False)
+    _length: int = field(repr=False, compare=False)
+    _state: NDArray[np.int8] = field(repr=False, compare=False)
+    _corrected: bool = field(repr=False, compare=False)
+    _metadata: dict[str, Any] = field(repr=False, compare=False)
+    _digest: dict[str, Any] = field(repr=False, compare=False)
+    _wish: Wish = field(repr=False, compare=False)
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """The points of the only block at full resolution, with the dtype and axes of the original.
+
+        Raises
+        ------
+        InputError
+            If there are several blocks; use `surface`.
+        """
+        return self.surface().points
+
+    def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
+        """The grid of a coarser level, an array with that level's shape.
+
+        Parameters
+        ----------
+        level : int
+        block : int, optional
+            Number of the block; needed if there are several.
+
+        Raises
+        ------
+        OptionError
+            If there is no such level or block.
+        InputError
+            If there are several blocks and none was given.
+        """
+        surface = self.surface(level)
+        if block is None:
+            return surface.points
+        if not 0 <= block < len(surface.blocks):
+            raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
+        return surface.blocks[block].points
+
+    def window(self, region: Region) -> Surface:
+        """The points of a window at full resolution; costs time and memory for the window only.
+
+        Heights whose values lie on a lattice (integers, decimals) are exact in the window as soon as the data that it
+        needs have arrived. `points` is exact only when everything has arrived.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int))
+            Rows and columns, half-open, in full-resolution indices.
+
+        Raises
+        ------
+        OptionError
+            If the region is outside the surface, the surface has several blocks, or the view holds another region only.
+        """
+        header, shown = self._reconstruction.header, self._wish.region
+        wish = Wish(region, self._wish.attributes)
+        wish.check(header)
+        if shown is not None and not all(
+            a <= start and stop <= b for (start, stop), (a, b) in zip(region, shown, strict=True)
+        ):
+            raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
+        state = self._state.copy()
+        state[~wish.tiles(header)] = 0
+        return replace(self, _wish=wish, _state=state).surface()
+
+    def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
+        """The state as a `Surface`, at full resolution or at a coarser level.
+
+        Parameters
+        ----------
+        level : int, optional
+            A level; None: full resolution. The geotransform of a coarser level spans the same area.
+        metadata : mapping, optional
+            Used instead of the container's metadata, which may not have arrived yet.
+
+        Raises
+        ------
+        OptionError
+            If there is no such level.
+        CorruptStreamError
+            If the SHA-256 of the complete surface is wrong, or no value is finite.
+        """
+        header = self._reconstruction.header
+        asked, finest = level is not None, level is None or level == header.levels
+        level = header.levels if level is None else level
+        if not 0 <= level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
+        values = dict(self._metadata if metadata is None else metadata)
+        if asked:  # the grid of that level, without what a seam repeats
+            values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
+        digest = self._digest.get(DIGEST)
+        region = self._wish.region
+        if not finest and region is not None:
+            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
+        chosen = self._wish.channels(header)
+        if region is None:
+            grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
+            masks = level_masks(header.parts, header.layout, level, header.masks)
+            closures: tuple[Closed, ...] = tuple(closed for _, closed in header.blocks)
+        else:
+            grids, masks = [self._window(region, chosen)], [header.masks[0]]
+            if masks[0] is not None:
+                masks = [masks[0][slice(*region[0]), slice(*region[1])]]
+            closures = (window_closed(header.closed, header.shape, region),)
+        blocks = []
+        for grid, mask, closed in zip(grids, masks, closures, strict=True):
+            points, *attributes = grid.arrays
+            named = {
+                kind.name: array if kind.components else array[..., 0]
+                for kind, array in zip(header.attributes, attributes, strict=True)
+                if self._wish.attributes is None or kind.name in self._wish.attributes
+            }
+            if mask is not None and region is None and not mask.any():
+                mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
+            points = points[..., 0] if header.flat else points
+            try:
+                blocks.append(Block(points, closed, mask=mask, attributes=named))
+            except InputError as error:
+                if region is not None:
+                    raise  # nothing of this window is valid
+                raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
+        surface = Surface(blocks=blocks)
+        if not finest and len(blocks) == 1 and header.point_channels == 1:
+            coarse = level_metadata(
+                {**values, **_plane(header)}, header.shape, surface.shape, header.closed, header.levels - level
+            )
+            if header.plane is not None:
+                surface.metadata.update({key: coarse.pop(key) for key in ("grid", "nodes") if key in coarse})
+            values = coarse
+        else:
+            surface.metadata.update(_plane(header))
+            if header.plane is not None and region is not None:
+                surface.metadata.update(window_grid(header.plane["grid"], header.shape, region))
+        if header.plane is not None:
+            try:
+                surface = to_xyz(surface, self._kept(finest))
+            except InputError as error:
+                raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
+        if region is not None:
+            values = window_metadata(values, header.shape, region)
+        elif self.complete and finest and header.exact and digest is not None and chosen.all():
+            found = values_digest(surface.blocks)
+            if digest != found:
+                raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
+        surface.metadata = values
+        surface.joints = header.joints.at(self._nodes(level))
+        return surface
+
+    def _nodes(self, level: int) -> list[Nodes]:
+        """Which rows and columns of each block are shown at a level, or in the window."""
+        header, region = self._reconstruction.header, self._wish.region
+        if region is not None:
+            return [(np.arange(*region[0]), np.arange(*region[1]))]
+        owned = zip(numbered_by_block(header.parts, len(header.blocks)), header.blocks, strict=True)
+        return [level_positions(own, len(header.parts), header.layout, level, shape) for own, (shape, _) in owned]
+
+    def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
+        """Which holes of the only block have values."""
+        kept = self._reconstruction.header.kept_masks[0]
+        if kept is None or not (finest and self._corrected):
+            return None
+        region = self._wish.region
+        return kept if region is None else kept[slice(*region[0]), slice(*region[1])]
+
+    def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
+        """Points and attributes of a window of the only block."""
+        header, known = self._reconstruction.header, (self._length, self._state)
+        if header.arrangement is not None:
+            # A block that meets itself: what its sides share may lie anywhere in it.
+            whole = self._reconstruction.blocks(*known, header.levels, self._corrected, chosen)[0]
+            first = 0, 0
+        else:
+            taken = restored(header, region)
+            whole = self._reconstruction.window(*known, taken, self._corrected, chosen)
+            first = taken[0][0], taken[1][0]
+        rows, columns = (slice(a - at, b - at) for (a, b), at in zip(region, first, strict=True))
+        return Values([array[rows, columns] for array in whole.arrays])
+
+
+def _plane(header: Header) -> dict[str, Any]:
+    """The metadata by which heights that came with x and y get them back, see `height_fields`."""
+    return {} if header.plane is None else {"grid": header.plane["grid"]}

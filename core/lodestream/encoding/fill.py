@@ -1,0 +1,141 @@
+"""Values under the holes of a surface, such that they cost few bytes.
+
+`fill_holes` lays a thin plate through what is around them. Averages of 2 x 2 points are taken until there are no
+holes left; on the way back each hole takes what the coarser grid has there, in a straight line between its points, and
+some sweeps bring it to where a plate would lie. Coarser grids are swept more often, so the work is in proportion to the
+number of points.
+
+`settle_holes` then makes small coefficients vanish, in turns: transform, drop what is below a threshold, transform
+back, put the valid points back where they were; each time with a lower threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from ..grid.layout import Layout
+from ..surface import Closed
+from ..transform.lifting import forward_step
+from ..transform.predictors import predictor
+from ..transform.pyramid import allocate, forward, inverse
+
+__all__ = ["fill_holes", "settle_holes"]
+
+#: Sweeps, there and back, of the finest grid; each coarser one has so many more.
+_SWEEPS = 4
+_MORE = 10
+#: The first threshold, in medians of the coefficients' magnitudes; each further one is half of the one before.
+_FIRST_THRESHOLD = 4
+#: Points in one call of a kernel.
+_AT_ONCE = 1 << 20
+
+
+def fill_holes(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed) -> NDArray[Any]:
+    """Fill holes smoothly.
+
+    Parameters
+    ----------
+    values : integers or floats, shape (row, column) or (row, column, channel)
+        What stands under a hole, NaN too, does not matter. Not changed.
+    mask : bool, shape (row, column)
+        True where a point is valid.
+    closed : (bool, bool)
+        Whether the rows and the columns wrap.
+
+    Returns
+    -------
+    array
+        A new one of the same shape and dtype: valid points as they were, holes within the range of their channel's
+        valid points; 0 where there are none.
+    """
+    filled = values.copy()
+    if mask.all():
+        return filled
+    if not mask.any():
+        filled[...] = 0
+        return filled
+    channels = filled[..., np.newaxis] if filled.ndim == 2 else filled
+    known = np.ascontiguousarray(mask)
+    for channel in range(channels.shape[2]):
+        own = channels[..., channel]
+        low, high = own[known].min(), own[known].max()
+        heights = np.where(known, own, 0).astype(np.float64, order="C")
+        _fill(heights, known, closed, _SWEEPS)
+        if values.dtype.kind in "iu":
+            np.rint(heights, out=heights)
+        inside = np.clip(heights[~known], float(low), float(high)).astype(values.dtype)
+        own[~known] = np.clip(inside, low, high)
+    return filled
+
+
+def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout: Layout) -> NDArray[np.int32]:
+    """Move what is under holes so that the transform has fewer coefficients to code.
+
+    Parameters
+    ----------
+    coordinates : int32, shape (row, column)
+        Lattice coordinates of one channel, holes filled (`fill_holes`). Not changed.
+    mask : bool, shape (row, column)
+        True where a point is valid.
+    layout : Layout
+        As the channel will be coded, of one grid.
+
+    Returns
+    -------
+    int32, shape (row, column)
+        The same at valid points; holes within the range of the valid points.
+    """
+    settled = coordinates.copy()
+    if mask.all() or not mask.any():
+        return settled
+    low, high = coordinates[mask].min(), coordinates[mask].max()
+    work = allocate(layout.grids[0].shape)
+    rows, columns = layout.shape(0, 0)
+    work[...] = settled
+    predictors = forward([work], layout)
+    threshold = _FIRST_THRESHOLD * max(2, int(np.median(np.abs(work[::3, ::3]))))
+    while threshold:
+        coarsest = work[:rows, :columns].copy()
+        work[np.abs(work) <= threshold] = 0
+        work[:rows, :columns] = coarsest
+        inverse([work], layout, predictors, layout.levels)
+        np.copyto(settled, np.clip(work, low, high), where=~mask)
+        threshold >>= 1
+        if threshold:
+            work[...] = settled
+            _forward_again(work, layout, predictors)
+    return settled
+
+
+def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8]) -> None:
+    """The forward transform with predictors that are known."""
+    for level in range(layout.levels, 0, -1):
+        rows, columns = layout.shape(0, level)
+        for axis, step in enumerate(layout.steps(0, level)):
+            if step.midpoints:
+                rule = predictor(predictors, layout.grids[0], step, level, axis)
+                forward_step(values[:rows, :columns], axis, step, rule)
+
+
+def _fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: Closed, sweeps: int) -> None:
+    """Fill one grid by way of coarser ones, in place."""
+    shape = ((values.shape[0] + 1) // 2, (values.shape[1] + 1) // 2)
+    coarser, found = np.empty(shape, np.float64), np.empty(shape, np.bool_)
+    for first, last in _runs(coarser.size):
+        kernels.pull(values, known, *values.shape, first, last, coarser, found)
+    if not found.all():
+        _fill(coarser, found, closed, sweeps + _MORE)
+    for first, last in _runs(values.size):
+        kernels.push(values, known, *values.shape, first, last, *closed, coarser)
+    for first, last in _runs(2 * sweeps * values.size):
+        kernels.relax(values, known, *values.shape, first, last, *closed)
+
+
+def _runs(count: int) -> Iterator[tuple[int, int]]:
+    """So many points cut into what one call of a kernel does."""
+    return ((first, min(first + _AT_ONCE, count)) for first in range(0, count, _AT_ONCE))

@@ -1,0 +1,118 @@
+"""The writing end of the exactness section: what each window needs for its values to come back as they were given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ..container.chunks import Window, windows
+from ..container.model import Header
+from ..decoding.reconstruction import Values
+from ..residual import chunk_coder
+from ..surface import Block, Surface
+from .preparation import Preparation, given_channel
+
+__all__ = ["as_returned", "encode_pieces", "piece_size"]
+
+#: Bytes of tables for each piece, and what small pieces may cost: a share of all bytes.
+_TABLES, _WORTH = 8, 0.01
+
+
+def encode_pieces(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+    """The section's pieces; and of each channel whether it is exact then.
+
+    A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
+    NaN and infinities, and all values of holes that are kept.
+
+    Parameters
+    ----------
+    prepared : Preparation
+    header : Header
+    restored : list of Values, one for each block
+        What comes back without these pieces.
+    """
+    coder = _PieceCoder(prepared, header, restored)
+    pieces = [coder.code(window) for window in windows(header)]
+    return pieces, coder.exact
+
+
+def piece_size(prepared: Preparation, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
+    """The smallest pieces that do not cost much, as exponents of two of their rows and columns.
+
+    Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
+    middle of the surface.
+
+    Parameters
+    ----------
+    prepared, header, restored
+        As in `encode_pieces`.
+    coefficients : float
+        Bytes that the coefficients take.
+    """
+    if len(prepared.pieces) == 1:
+        return prepared.pieces[0]
+    shape, largest = header.shape, prepared.pieces[-1]
+    starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, largest, strict=True)]
+    stops = [min(start + (1 << e), length) for start, length, e in zip(starts, shape, largest, strict=True)]
+    share = math.prod(stop - start for start, stop in zip(starts, stops, strict=True)) / math.prod(shape)
+    costs = []
+    for piece in prepared.pieces:
+        tried = replace(header, piece=piece)
+        coder = _PieceCoder(prepared, tried, restored)
+        inside = (
+            window
+            for window in windows(tried)
+            if starts[0] <= window.rows[0] < stops[0] and starts[1] <= window.columns[0] < stops[1]
+        )
+        costs.append(sum(len(coder.code(window)) + _TABLES for window in inside) / share)
+    most = min(costs) + _WORTH * (min(costs) + coefficients)
+    return next(piece for piece, cost in zip(prepared.pieces, costs, strict=True) if cost <= most)
+
+
+class _PieceCoder:
+    """Makes pieces; ``exact`` says of each channel whether it is exact with those so far."""
+
+    def __init__(self, prepared: Preparation, header: Header, restored: list[Values]) -> None:
+        self._prepared, self._header, self._restored = prepared, header, restored
+        rough = [prepared.precision is not None or prepared.rms is not None] * prepared.geometric
+        rough += [False] * (prepared.point_channels - prepared.geometric)
+        for kind in prepared.kinds:
+            rough += [kind.name in prepared.attribute_precisions] * kind.channels
+        self._rough = rough
+        self.exact = [True] * header.channels
+
+    def code(self, window: Window) -> bytes:
+        """One piece."""
+        prepared, channel = self._prepared, window.channel
+        block = prepared.surface.blocks[window.block]
+        mask = prepared.kept[window.block] if window.kept else block.mask
+        mask = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
+        wanted = given_channel(block, channel)[slice(*window.rows), slice(*window.columns)]
+        known = self._restored[window.block].window(window)
+        chosen = slice(None) if mask is None else mask
+        wanted, known = (np.ascontiguousarray(v[chosen]).ravel() for v in (wanted, known))
+        if self._rough[channel] and not window.kept:
+            if wanted.dtype.kind == "f":
+                given, wanted = wanted, np.where(np.isfinite(wanted), known, wanted)
+            else:
+                given, wanted = wanted, known
+            self.exact[channel] &= chunk_coder.agree(given, wanted)
+        step = self._header.lattices[channel].step if wanted.dtype == np.float32 else None
+        return chunk_coder.encode_piece(wanted, known, step)
+
+
+def as_returned(surface: Surface, hole: int) -> Iterator[Block]:
+    """The blocks as they come out of a container: holes have the value that says so."""
+    for block in surface.blocks:
+        if block.mask is None:
+            yield block
+            continue
+        arrays = [np.array(array) for array in (block.points, *block.attributes.values())]
+        values = Values([array.reshape(*block.shape, -1) for array in arrays])
+        values.clear(~block.mask if block.kept is None else ~(block.mask | block.kept), hole)
+        points, *attributes = (v.reshape(a.shape) for v, a in zip(values.arrays, arrays, strict=True))
+        named = dict(zip(block.attributes, attributes, strict=True))
+        yield Block(points, block.closed, mask=block.mask, attributes=named)

@@ -1,0 +1,66 @@
+"""Coefficients from what is known of their bits: of tiles, into the arrays that the inverse transform takes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from .band_fields import COLUMNS, ROWS
+
+__all__ = ["UNANNOUNCED", "spread_bands"]
+
+#: Passes that remain of a tile that was not announced: more than any tile has.
+UNANNOUNCED = 57
+#: Coefficients in one call of the kernel, but for a band that has more.
+_AT_ONCE = 1 << 22
+
+
+def spread_bands(
+    known: NDArray[np.int32],
+    sign: NDArray[np.int8],
+    early: NDArray[np.uint8],
+    bands: NDArray[np.int64],
+    windows: NDArray[np.int64],
+    steps: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    state: NDArray[np.int8],
+    finer: int,
+    out: NDArray[np.int32],
+    origin: tuple[int, int],
+) -> None:
+    """Put what is known of some bands into an array of coefficients.
+
+    Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
+
+    Parameters
+    ----------
+    known, sign, early : flat, see `bitplanes.code_passes`
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
+    windows : int64, shape (band, 3)
+        Of each band: its tile, and its first row and column among all coefficients.
+    steps : int64, shape (band,)
+        Lattice steps; 0 where ``known`` are no indices.
+    numbers : int64, flat
+        Of the bands.
+    state : int8, shape (tile,)
+        Passes that remain of each tile, or `UNANNOUNCED`.
+    finer : int
+        Coefficients of the tiles from this one on are multiplied by 2**`lifting.FRACTION_BITS` and kept within their
+        bounds.
+    out : int32, shape (row, column)
+        Coefficients from the row and column ``origin`` on; updated.
+
+    Raises
+    ------
+    ValueError
+        Where a band does not lie inside the arrays.
+    """
+    sizes = np.cumsum(bands[numbers, ROWS] * bands[numbers, COLUMNS])
+    start = 0
+    while start < numbers.size:
+        reached = sizes[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(sizes, reached + _AT_ONCE, side="right")))
+        part = numbers[start:stop]
+        kernels.spread(known, sign, early, bands, windows, steps, part, state, finer, out, *origin)
+        start = stop

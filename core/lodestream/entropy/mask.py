@@ -1,0 +1,82 @@
+"""The mask of a surface with holes, without loss: each point in the context of those before it.
+
+Points are coded in raster order, each in the context of the ten nearest points before it. Where all that surrounds a
+group of sixteen points in a row is equal, one bit says whether they are equal to that too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from ..errors import CorruptStreamError, StreamError
+from ..library import why_missing
+
+__all__ = ["decode_mask", "encode_mask"]
+
+#: Points outside the mask that contexts see: above, and at either side.
+_ABOVE = 2
+_BESIDE = 2
+#: Groups of points in one call of the kernel.
+_AT_ONCE = 1 << 16
+
+
+def encode_mask(mask: NDArray[np.bool_]) -> bytes:
+    """Code a mask.
+
+    Parameters
+    ----------
+    mask : bool, shape (row, column)
+        True where a point is valid.
+
+    Returns
+    -------
+    bytes
+        At least one.
+    """
+    rows, columns = mask.shape
+    field = _field(rows, columns)
+    field[_ABOVE:, _BESIDE : _BESIDE + columns] = mask
+    # A point takes at most 11 bits (a probability of 32 / 2**16), and a group of them one bit before.
+    data = np.empty(64 + 2 * mask.size, np.uint8)
+    length = _code(False, rows, columns, field, data)
+    return data[:length].tobytes()
+
+
+def decode_mask(data: bytes, shape: tuple[int, int], offset: int) -> NDArray[np.bool_]:
+    """Undo `encode_mask`; takes a byte of memory for each point of ``shape`` whatever the data.
+
+    Raises
+    ------
+    CorruptStreamError
+        When bytes are left over; the data stand at ``offset`` of the container. Bytes missing count as 0.
+    """
+    rows, columns = shape
+    if why_missing() is not None:
+        from .. import reference
+
+        try:
+            return reference.decode_mask(data, rows, columns)
+        except StreamError as error:
+            raise CorruptStreamError(str(error), offset) from None
+    field = _field(rows, columns)
+    read = _code(True, rows, columns, field, np.frombuffer(data, np.uint8).copy())
+    if len(data) > read:
+        raise CorruptStreamError(f"expected a mask of at most {read} bytes, got {len(data)}", offset + read)
+    return field[_ABOVE:, _BESIDE : _BESIDE + columns].astype(np.bool_)
+
+
+def _field(rows: int, columns: int) -> NDArray[np.uint8]:
+    return np.zeros((rows + _ABOVE, columns + 2 * _BESIDE), np.uint8)
+
+
+def _code(reading: bool, rows: int, columns: int, field: NDArray[np.uint8], data: NDArray[np.uint8]) -> int:
+    """Code all points of the field; returns the bytes written, or those looked at."""
+    model, state = np.empty(kernels.MASK_MODEL, np.int32), np.zeros(4, np.int64)
+    groups = rows * -(-columns // kernels.MASK_GROUP)
+    length = 0
+    for first in range(0, groups, _AT_ONCE):
+        last = min(first + _AT_ONCE, groups)
+        length = kernels.mask(reading, rows, columns, first, last, field, model, data, state)
+    return length

@@ -1,0 +1,229 @@
+"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, zeros around each band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..grid.layout import REMEMBERED, Band, Layout
+from ..kernels import PASSES_STATE
+from ..quantization.band_steps import Quantiser, step_of
+from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
+from .bitplanes import PADDING, code_passes, new_models
+from .dequantize import UNANNOUNCED, spread_bands
+
+__all__ = ["TileTable", "Tiles", "gather"]
+
+#: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
+_NO_PARENT = (1, 0, 31, 31)
+
+#: Where reading: no coefficients that would be written, and no costs.
+_NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
+
+#: By grid and kind, a tile's bands, where they begin in the flat arrays, and their strides there.
+_Places = dict[tuple[int, int], tuple[Band, int, int]]
+
+
+@dataclass(frozen=True)
+class TileTable:
+    """Places of all bands in the flat arrays.
+
+    Attributes
+    ----------
+    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
+        Of all tiles in order.
+    first : list of int
+        Number of each tile's first band, and the number of bands at the end.
+    size, blocks : int
+        Lengths of the flat arrays of coefficients and of block flags.
+    windows : int64, shape (band, 3)
+        Of each band: its tile, and its first row and column in the array of coefficients.
+    of_grid : list of int64 arrays
+        For each grid the numbers of its bands, coarsest level first.
+    """
+
+    layout: Layout
+    members: list[tuple[Band, ...]]
+    bands: NDArray[np.int64]
+    first: list[int]
+    size: int
+    blocks: int
+    windows: NDArray[np.int64]
+    of_grid: list[NDArray[np.int64]]
+
+    @staticmethod
+    @lru_cache(maxsize=REMEMBERED)
+    def of(layout: Layout, coordinate: bool = True) -> TileTable:
+        """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
+        rows: list[tuple[int, ...]] = []
+        windows: list[tuple[int, int, int]] = []
+        of_grid: list[list[int]] = [[] for _ in layout.grids]
+        first = [0]
+        size, blocks = 3, 0
+        members = [tile.bands if coordinate else tile.whole for tile in layout.tiles]
+        known: list[_Places] = []  # of every tile so far; parents come before their children
+        for number, (tile, bands) in enumerate(zip(layout.tiles, members, strict=True)):
+            above, own = known[tile.parent] if tile.parent >= 0 else {}, {}
+            for band in bands:
+                of_grid[band.grid].append(len(rows))
+                height, width = band.shape
+                stride, across = width + 2, (width + 7) // 8
+                place = size + 2 * stride + 2
+                flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
+                own[band.grid, kind] = band, place, stride
+                parent = above.get((band.grid, kind))
+                joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
+                rows.append((place, stride, height, width, flags, *joined, kind))
+                windows.append((number, band.rows[0], band.columns[0]))
+                size += (height + 4) * stride + 2
+                blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
+            first.append(len(rows))
+            known.append(own)
+        places = np.array(windows, np.int64).reshape(-1, 3)
+        of = [np.array(numbers, np.int64) for numbers in of_grid]
+        described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
+        return TileTable(layout, members, described, first, size + PADDING, blocks, places, of)
+
+    def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
+        """The step of each band, in lattice steps; int64, shape (band,)."""
+        found: dict[tuple[int, int, tuple[bool, bool]], int] = {}  # many tiles have bands of the same kind
+        for tile, bands in zip(self.layout.tiles, self.members, strict=True):
+            for band in bands:
+                key = tile.level, band.grid, band.kind
+                if key not in found:
+                    found[key] = step_of(band, tile.level, self.layout, quantiser)
+        return np.array(
+            [
+                found[tile.level, band.grid, band.kind]
+                for tile, bands in zip(self.layout.tiles, self.members, strict=True)
+                for band in bands
+            ],
+            np.int64,
+        )
+
+    def of_tile(self, tile: int) -> NDArray[np.int64]:
+        """The rows of one tile's bands, a view."""
+        return self.bands[self.first[tile] : self.first[tile + 1]]
+
+
+class Tiles:
+    """Magnitudes, signs, block flags, marks of first passes and models of one channel, see `bitplanes.code_passes`.
+
+    Where there is a quantiser, they are those of indices; otherwise the units of level ``large`` and finer ones are
+    large, none if it is 0. The attribute ``large`` is the first such tile.
+    """
+
+    def __init__(self, table: TileTable, quantiser: Quantiser | None = None, large: int = 0) -> None:
+        self.table = table
+        self.steps = np.zeros(len(table.bands), np.int64) if quantiser is None else table.steps(quantiser)
+        self.known = np.zeros(table.size, np.int32)
+        self.sign = np.zeros(table.size, np.int8)
+        self.flags = np.zeros(table.blocks, np.uint8)
+        self.early = np.zeros(table.size, np.uint8)
+        self.trellis = quantiser is not None
+        self.large = len(table.members) if self.trellis else table.layout.tiles_from(large)
+        self.models = new_models(len(table.members), self.trellis, self.large)
+
+    def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
+        """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
+        self.reading(runs)()
+
+    def reading(self, runs: Sequence[tuple[int, int, int, bytes]]) -> Callable[[], None]:
+        """What does `read` when it is called. If an interruption ends the call, another one goes on where it was."""
+        tile, first, last, length = np.array([(*run[:3], len(run[3])) for run in runs], np.int64).reshape(-1, 4).T
+        bands = np.array(self.table.first)
+        count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
+        data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
+        table = np.stack([bands[tile], count, tile, first, last, start, length, tile >= self.large], 1)
+        return partial(self.code, True, table, _NOTHING, data, _FREE, np.zeros(PASSES_STATE, np.int64))
+
+    def code(
+        self,
+        reading: bool,
+        runs: NDArray[np.int64],
+        true: NDArray[np.int32],
+        data: NDArray[np.uint8],
+        costs: NDArray[np.float64],
+        state: NDArray[np.int64] | None = None,
+        symbols: NDArray[np.uint16] | None = None,
+    ) -> None:
+        """Read or write runs of passes, see `bitplanes.code_passes`."""
+        arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
+        code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state, symbols)
+
+    def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
+        """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
+
+        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
+        """
+        state = np.full(len(self.table.layout.tiles), remaining, np.int8)
+        first, last = self.table.first[tile : tile + 2]
+        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
+            self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, len(state))
+
+    def spread_levels(
+        self, level: int, state: NDArray[np.int8], coefficients: Sequence[NDArray[np.int32]], whole: int
+    ) -> None:
+        """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
+
+        ``coefficients`` are arrays of the grids, zeros so far: tiles that were not announced are passed over. Those of
+        levels above ``whole`` are multiplied by 2**`FRACTION_BITS`.
+        """
+        tiles_of = self.table.layout.tiles_of
+        last = self.table.first[tiles_of(level).stop]
+        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
+            chosen = numbers[numbers < last]
+            chosen = chosen[state[self.table.windows[chosen, 0]] < UNANNOUNCED]
+            self._spread(chosen, state, array, tiles_of(whole).stop)
+
+    def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
+        """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column).
+
+        ``finer``: its coefficients are multiplied by 2**`FRACTION_BITS`.
+        """
+        height, width = (int(n) for n in self.table.bands[number, [ROWS, COLUMNS]])
+        array = np.zeros((height, width), np.int32)
+        tile, top, left = (int(n) for n in self.table.windows[number])
+        self._spread(np.array([number]), state, array, tile if finer else tile + 1, (top, left))
+        return array
+
+    def _spread(
+        self,
+        numbers: NDArray[np.int64],
+        state: NDArray[np.int8],
+        array: NDArray[np.int32],
+        finer: int,
+        origin: tuple[int, int] = (0, 0),
+    ) -> None:
+        arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
+        spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
+
+
+def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
+    """What a band of this level says of its parent, see `bitplanes.code_passes`."""
+    finer, coarser = layout.shape(band.grid, level - 1), layout.shape(band.grid, level - 2)
+    down, right = int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
+    # Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
+    row = ((band.origin[0] + down) >> down) - parent.origin[0]
+    column = ((band.origin[1] + right) >> right) - parent.origin[1]
+    return place + row * stride + column, stride, down, right
+
+
+def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
+    return coefficients[slice(*band.rows), slice(*band.columns)]
+
+
+def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
+    """The flat array of the coefficients (with their signs) of all tiles, from the arrays of the grids."""
+    flat = np.zeros(table.size, np.int32)
+    for number, bands in enumerate(table.members):
+        for band, row in zip(bands, table.of_tile(number), strict=True):
+            place, stride, height = (int(x) for x in row[[OFFSET, STRIDE, ROWS]])
+            start = place - stride - 1
+            frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
+            frame[1:-1, 1:-1] = _window(coefficients[band.grid], band)
+    return flat

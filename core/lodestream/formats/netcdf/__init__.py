@@ -1,0 +1,1 @@
+"""NetCDF and HDF5 files, among them VMEC's."""

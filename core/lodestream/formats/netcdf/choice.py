@@ -1,0 +1,283 @@
+"""Which variable of a NetCDF is the surface, over which coordinates, and at which time or depth."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from ...errors import FormatError, OptionError
+from ..source import Source
+
+__all__ = ["Choice", "Found", "choose", "others"]
+
+_REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
+_EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
+_NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n", "degreesn", "degreen")
+_MOST_NAMES = 12
+
+
+@dataclass(frozen=True)
+class Found:
+    """A variable that is a coordinate.
+
+    Attributes
+    ----------
+    name : str
+    axis : {0, 1, None}
+        The axis of the surface that it runs along; None for both.
+    degrees : bool
+        It is a longitude.
+    """
+
+    name: str
+    axis: int | None
+    degrees: bool
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is read.
+
+    Attributes
+    ----------
+    heights : str or None
+        Name of the variable; None for planar points.
+    dims : (str, str)
+        The dimensions of rows and columns.
+    shape : (int, int)
+    index : mapping of str to int
+        Places along the other dimensions.
+    x, y : Found or None
+    attributes : tuple of str
+        Names of further variables.
+    nbytes : int
+        Of all that is read.
+    """
+
+    heights: str | None
+    dims: tuple[str, str]
+    shape: tuple[int, int]
+    index: Mapping[str, int]
+    x: Found | None
+    y: Found | None
+    attributes: tuple[str, ...]
+    nbytes: int
+
+
+def choose(source: Source, dataset: Any) -> Choice:
+    """Choose by the options, else by the conventions.
+
+    Raises
+    ------
+    FormatError, OptionError
+        When there is nothing to read or more than one way to read it; the message names what there is.
+    """
+    variables: Mapping[Hashable, Any] = dataset.variables
+    given = {key: _named(source, variables, key) for key in ("variable", "x", "y") if key in source.options}
+    planar = "variable" not in given and {"x", "y"} <= set(given)
+    main = given["x"] if planar else given.get("variable") or _only(dataset, set(given.values()))
+    index = _index(source, dataset, variables[main].dims)
+    dims = _surface_dims(dataset, main, index)
+    shape = (int(dataset.sizes[dims[0]]), int(dataset.sizes[dims[1]]))
+    index |= {dim: 0 for dim in variables[main].dims if dim not in dims and dim not in index}
+    x, y = (_found(dataset, given[key], dims, index) if key in given else None for key in ("x", "y"))
+    if x is None and y is None:
+        x, y = _conventional(dataset, main, dims, index)
+    attributes = []
+    for name in filter(None, str(source.options.get("attributes", "")).split(",")):
+        if name not in variables or _left(variables[name].dims, index) != dims or not _numeric(variables[name]):
+            raise OptionError(f"expected attributes= of variables over {dims[0]} and {dims[1]}, got {name!r}")
+        attributes.append(name)
+    names = {main, *attributes, *(found.name for found in (x, y) if found)}
+    nbytes = sum(
+        variables[name].dtype.itemsize * prod(dataset.sizes[dim] for dim in variables[name].dims if dim not in index)
+        for name in names
+    )
+    return Choice(None if planar else main, dims, shape, index, x, y, tuple(attributes), nbytes)
+
+
+def others(dataset: Any, choice: Choice) -> list[str]:
+    """Variables over the same two dimensions that are not taken, nor belong to those that are."""
+    variables = dataset.variables
+    taken = {choice.heights, *choice.attributes, *(found.name for found in (choice.x, choice.y) if found)}
+    for variable in variables.values():
+        taken |= _referred(variable)
+    return [
+        str(name)
+        for name, variable in variables.items()
+        if str(name) not in taken
+        and _numeric(variable)
+        and set(choice.dims) <= set(map(str, variable.dims))
+        and _letter(str(name), variable.attrs) is None
+    ]
+
+
+def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
+    name = str(source.options[key])
+    if name not in variables or not _numeric(variables[name]):
+        raise OptionError(f"expected {key}= one of {_listing(variables)}, got {name!r}")
+    return name
+
+
+def _numeric(variable: Any) -> bool:
+    return variable.dtype.kind in "iuf"
+
+
+def _listing(variables: Mapping[Hashable, Any]) -> str:
+    names = [str(name) for name, variable in variables.items() if _numeric(variable) and variable.size > 1]
+    return ", ".join(names[:_MOST_NAMES] + ["..."] * (len(names) > _MOST_NAMES)) or "nothing"
+
+
+def _only(dataset: Any, coordinates: set[str]) -> str:
+    """The only variable over a surface that is no coordinate of another."""
+    variables = dataset.variables
+    beside = {str(name) for name in dataset.sizes} | coordinates
+    for variable in variables.values():
+        beside |= _referred(variable)
+    wide = [
+        str(name)
+        for name, variable in variables.items()
+        if _numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
+    ]
+    chosen = [name for name in wide if name not in beside and _letter(name, variables[name].attrs) is None]
+    if len(chosen) == 1:
+        return chosen[0]
+    if not wide:
+        raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
+    listing = _listing({name: variables[name] for name in chosen or wide})
+    raise FormatError(f"expected one variable over a surface, got {listing}: choose with variable=")
+
+
+def _referred(variable: Any) -> set[str]:
+    """Names of variables that belong to one."""
+    return {name for key in _REFERENCES for name in str(variable.attrs.get(key, "")).split()}
+
+
+def _letter(name: str, attributes: Mapping[str, Any]) -> str | None:
+    """Whether the conventions, or a plain name, make a variable x or y."""
+    standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
+    axis = str(attributes.get("axis", "")).upper()
+    plain = name.lower()
+    if standard in ("longitude", "projection_x_coordinate", "grid_longitude") or units in _EAST or axis == "X":
+        return "x"
+    if standard in ("latitude", "projection_y_coordinate", "grid_latitude") or units in _NORTH or axis == "Y":
+        return "y"
+    if plain in ("x", "lon", "longitude", "easting"):
+        return "x"
+    return "y" if plain in ("y", "lat", "latitude", "northing") else None
+
+
+def _is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:
+    standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
+    if units in _EAST:
+        return True
+    return units.startswith("degree") and (standard == "longitude" or name.lower() in ("lon", "longitude"))
+
+
+def _left(dims: tuple[Hashable, ...], index: Mapping[str, int]) -> tuple[str, ...]:
+    return tuple(str(dim) for dim in dims if dim not in index)
+
+
+def _index(source: Source, dataset: Any, dims: tuple[Hashable, ...]) -> dict[str, int]:
+    """Places along dimensions that options name."""
+    index: dict[str, int] = {}
+    if "time" in source.options:
+        times = [str(dim) for dim in dims if _is_time(dataset, str(dim))]
+        if not times:
+            raise OptionError(f"expected no time=, got one: the dimensions are {', '.join(map(str, dims))}")
+        index[times[0]] = _moment(dataset, times[0], str(source.options["time"]))
+    for part in filter(None, str(source.options.get("at", "")).split(",")):
+        name, _, place = part.partition(":")
+        if name not in dims:
+            raise OptionError(f"expected at= with one of {', '.join(map(str, dims))}, got {name!r}")
+        index[name] = _number(dataset, name, place, "at")
+    return index
+
+
+def _number(dataset: Any, dim: str, text: str, option: str) -> int:
+    length = int(dataset.sizes[dim])
+    if not text.removeprefix("-").isdecimal() or not -length <= int(text) < length:
+        raise OptionError(f"expected {option}= with a number of 0 to {length - 1} for {dim}, got {text!r}")
+    return int(text) % length
+
+
+def _is_time(dataset: Any, dim: str) -> bool:
+    attributes = dataset.variables[dim].attrs if dim in dataset.variables else {}
+    units = str(attributes.get("units", ""))
+    return " since " in units or str(attributes.get("axis", "")).upper() == "T" or dim.lower().startswith("time")
+
+
+def _moment(dataset: Any, dim: str, text: str) -> int:
+    """The number of a time, or that of the only date that begins so."""
+    if text.removeprefix("-").isdecimal() and (len(text) < 4 or dim not in dataset.variables):
+        return _number(dataset, dim, text, "time")
+    import xarray
+
+    try:
+        times = xarray.decode_cf(dataset[[dim]])[dim].values
+        dates = [str(np.datetime_as_string(time)) if isinstance(time, np.datetime64) else str(time) for time in times]
+    except Exception as error:  # of dates in any calendar and unit that a file may claim
+        raise OptionError(f"expected time= with a number, got {text!r}: the dates are not readable ({error})") from None
+    found = [place for place, date in enumerate(dates) if date.replace(" ", "T").startswith(text.replace(" ", "T"))]
+    if len(found) != 1:
+        raise OptionError(f"expected time= with one date of {dates[0]} to {dates[-1]}, got {text!r}: {len(found)} fit")
+    return found[0]
+
+
+def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[str, str]:
+    """The two dimensions that are left; those of length 1 are left out first."""
+    left = _left(dataset.variables[name].dims, index)
+    long = [dim for dim in left if dataset.sizes[dim] > 1]
+    if len(long) > 2:
+        ways = [
+            f"{dim} ({dataset.sizes[dim]}) with {'time=' if _is_time(dataset, dim) else f'at={dim}:'}0 to "
+            f"{dataset.sizes[dim] - 1}"
+            for dim in long[:-2]
+        ]
+        raise FormatError(f"expected two dimensions of {name}, got {len(long)}: choose {' and '.join(ways)}")
+    if len(long) < 2:
+        long = list(left[-2:])
+    if len(long) < 2:
+        raise FormatError(f"expected two dimensions of {name}, got {', '.join(left) or 'none'}")
+    return long[0], long[1]
+
+
+def _found(dataset: Any, name: str, dims: tuple[str, str], index: Mapping[str, int]) -> Found:
+    variable = dataset.variables[name]
+    left = _left(variable.dims, index)
+    if left not in (dims, dims[:1], dims[1:]):
+        raise FormatError(
+            f"expected {name} over {dims[0]} and {dims[1]} or one of them, got {', '.join(left) or 'none'}"
+        )
+    axis = None if left == dims else dims.index(left[0])
+    return Found(name, axis, _is_longitude(name, variable.attrs))
+
+
+def _conventional(
+    dataset: Any, main: str, dims: tuple[str, str], index: Mapping[str, int]
+) -> tuple[Found | None, Found | None]:
+    """The coordinates that the conventions give a variable: vectors that they know, arrays, then any vectors."""
+    variables = dataset.variables
+    named = [name for name in str(variables[main].attrs.get("coordinates", "")).split() if name in variables]
+    others = [str(name) for name, variable in variables.items() if _letter(str(name), variable.attrs) and name != main]
+    ways: list[dict[str, Found]] = [{}, {}]
+    for name in (*dims, *named, *others):
+        if name not in variables or not _numeric(variables[name]):
+            continue
+        left, letter = _left(variables[name].dims, index), _letter(name, variables[name].attrs)
+        if letter and left in (dims, dims[:1], dims[1:]):
+            ways[left == dims].setdefault(letter, _found(dataset, name, dims, index))
+    for way in ways:
+        if len(way) == 2:
+            return way["x"], way["y"]
+    plain = [
+        _found(dataset, dim, dims, index)
+        if dim in variables and _numeric(variables[dim]) and variables[dim].dims == (dim,)
+        else None
+        for dim in dims
+    ]
+    return plain[1], plain[0]

@@ -1,0 +1,221 @@
+"""NetCDF classic, 64-bit offset and 4: one variable as heights, over the coordinates that the file has for it."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...coordinates.seams import merge
+from ...errors import FormatError, InputError, OptionError, TooLargeError, UnavailableError
+from ...surface import Closed, Surface
+from ..notes import listing, warn
+from ..placed import Coordinate, place
+from ..source import Source, check_allowed
+from . import hdf5_guard, vmec
+from .choice import Choice, choose, others
+
+__all__ = ["KINDS", "READ_OPTIONS", "read", "sniff"]
+
+#: What is read by other rules than a NetCDF of heights.
+KINDS = ("vmec",)
+
+READ_OPTIONS = {
+    "variable": "name of the variable with the heights (default: the only one)",
+    "x": "name of the variable of x (default: by the CF conventions)",
+    "y": "name of the variable of y; with x but without variable, the surface is planar",
+    "time": "index of a time, from 0, or the beginning of its date, such as 2001-02",
+    "at": "indices along other dimensions, such as depth:0 or depth:3,member:1",
+    "attributes": "names of variables of the same shape that become attributes, separated by commas",
+    "resolution": "VMEC: number of points the short and the long way around, such as 64x256",
+}
+
+#: Attributes that say how values are stored, or which variables belong to them.
+_READ = (
+    *("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned"),
+    *("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms"),
+)
+
+#: What h5py says where HDF5 has told it nothing, as happens where memory is short.
+_UNSAID = re.compile(r"unspecified error|failed to walk error stack", re.IGNORECASE)
+
+_CLASSIC = (b"CDF\x01", b"CDF\x02")
+_CDF5 = b"CDF\x05"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Whether a file begins like NetCDF, or like HDF5 and is not named .cgns."""
+    return head.startswith((*_CLASSIC, _CDF5)) or (head.startswith(_HDF5) and suffix != ".cgns")
+
+
+def read(source: Source) -> Surface:
+    """Read one variable, its coordinates, and those that options make attributes."""
+    with _opened(source) as dataset:
+        if vmec.is_vmec(dataset) and not {"variable", "x", "y"} & set(source.options):
+            check_allowed(("vmec",), source.allowed)
+            return vmec.read(source, dataset)
+        check_allowed(("netcdf",), source.allowed)
+        if "resolution" in source.options:
+            raise OptionError("expected resolution= for a VMEC file only, got another NetCDF")
+        choice = choose(source, dataset)
+        source.check_array(choice.shape, np.dtype(np.float64))
+        source.check_expansion(choice.nbytes)
+        left_out = others(dataset, choice)
+        surface = _surface(source, dataset, choice)
+    if left_out:  # said here, for the libraries' own warnings are not shown while the file is open
+        warn(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
+    return surface
+
+
+@contextmanager
+def _opened(source: Source) -> Iterator[Any]:
+    """The file as an xarray dataset, with values as they are stored; nothing but its header is in memory."""
+    with source.path.open("rb") as file:
+        head = file.read(8)
+    if head.startswith(_CDF5):
+        raise FormatError("expected NetCDF classic, 64-bit offset or 4, got CDF-5 (64-bit data), which is not read")
+    try:
+        import h5netcdf  # noqa: F401 - for a better message than xarray's
+        import scipy  # noqa: F401
+        import xarray
+    except ImportError:
+        raise UnavailableError(
+            "expected xarray, h5netcdf, h5py and scipy for NetCDF, which are not all installed: install "
+            "lodestream[formats]"
+        ) from None
+    hdf5 = head == _HDF5
+    path = os.path.realpath(source.path)  # absolute, so that no library takes it for an address
+    try:
+        if hdf5:
+            hdf5_guard.check(source.path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            options: dict[str, Any] = {"engine": "h5netcdf", "phony_dims": "access"} if hdf5 else {"engine": "scipy"}
+            with xarray.open_dataset(
+                path, decode_cf=False, create_default_indexes=False, cache=False, **options
+            ) as dataset:
+                yield dataset
+    except (InputError, UnavailableError):
+        raise
+    except MemoryError:
+        raise TooLargeError("expected a NetCDF that fits into memory, got one that promises more") from None
+    except Exception as error:  # none of these libraries says what it may raise
+        reason = " ".join(str(error).replace(path, "the file").split())
+        if not reason or isinstance(error, SystemError) or _UNSAID.search(reason):
+            raise UnavailableError(
+                f"expected the libraries of NetCDF to read the file or to say why not, got {type(error).__name__}: "
+                "they may have had too little memory"
+            ) from None
+        raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None
+
+
+def _surface(source: Source, dataset: Any, choice: Choice) -> Surface:
+    metadata = source.metadata("netcdf") | _tags(dataset, choice)
+    mask = np.ones(choice.shape, np.bool_)
+    axes: list[Coordinate | None] = []
+    for found in (choice.x, choice.y):
+        if found is None:
+            axes.append(None)
+            continue
+        values, valid = _values(dataset.variables[found.name], choice.index)
+        if found.axis is None:
+            mask &= valid
+        axes.append(Coordinate(values, found.axis, found.degrees))
+    x, y = (axis or Coordinate(np.arange(choice.shape[1 - number]), 1 - number) for number, axis in enumerate(axes))
+    attributes = {name: _raw(dataset.variables[name], choice.index) for name in choice.attributes}
+    if choice.heights is None:
+        points = np.stack(np.broadcast_arrays(x.values, y.values), axis=-1)
+        surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
+        return _closed_fields(source, dataset, choice, merge(surface, source.closed))
+    variable = dataset.variables[choice.heights]
+    heights, valid = _values(variable, choice.index)
+    metadata |= {"variable": choice.heights} | _metadata(dataset, variable)
+    if choice.x is None and choice.y is None:
+        return Surface(heights, mask=mask & valid, attributes=attributes, metadata=metadata)
+    surface = place(heights, x, y, closed=source.closed, mask=mask & valid, attributes=attributes, metadata=metadata)
+    return _closed_fields(source, dataset, choice, surface)
+
+
+def _raw(variable: Any, index: Mapping[str, int]) -> NDArray[Any]:
+    values = np.asarray(variable.isel({dim: at for dim, at in index.items() if dim in variable.dims}).values)
+    if str(variable.attrs.get("_Unsigned", "")).lower() == "true" and values.dtype.kind == "i":
+        values = values.view(values.dtype.str.replace("i", "u"))
+    return values
+
+
+def _values(variable: Any, index: Mapping[str, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Values by the conventions' rules for packed ones, and where they are none of those that stand for missing."""
+    raw = _raw(variable, index)
+    valid = np.ones(raw.shape, np.bool_)
+    for key in ("_FillValue", "missing_value"):
+        for missing in np.atleast_1d(variable.attrs.get(key, [])):
+            if isinstance(missing, np.number | int | float):
+                valid &= raw != missing
+                if np.isinf(missing) and raw.dtype.kind == "f":
+                    raw = np.where(valid, raw, raw.dtype.type(np.nan))
+    scale, offset = (variable.attrs.get(key) for key in ("scale_factor", "add_offset"))
+    if scale is None and offset is None:
+        return raw, valid
+    factor, added = (float(np.ravel(number)[0]) for number in (1.0 if scale is None else scale, offset or 0.0))
+    single = all(getattr(number, "dtype", None) == np.float32 for number in (scale, offset) if number is not None)
+    return (raw * factor + added).astype(np.float32 if single else np.float64), valid
+
+
+def _metadata(dataset: Any, variable: Any) -> dict[str, Any]:
+    metadata: dict[str, Any] = {}
+    if isinstance(unit := variable.attrs.get("units"), str) and unit.strip():
+        metadata["unit"] = unit
+    mapping = variable.attrs.get("grid_mapping")
+    attributes = dataset.variables[mapping].attrs if mapping in dataset.variables else {}
+    crs = attributes.get("crs_wkt", attributes.get("spatial_ref"))
+    if isinstance(crs, str) and crs.strip():
+        metadata["crs"] = crs
+    return metadata
+
+
+def _tags(dataset: Any, choice: Choice) -> dict[str, Any]:
+    """What the file says of itself and of the variables that are read, under the names that GDAL has for it."""
+    tags: dict[str, str] = {}
+    names = [*([choice.heights] if choice.heights else []), *choice.attributes]
+    said = {"NC_GLOBAL": dataset.attrs, **{name: dataset.variables[name].attrs for name in names}}
+    for name, attributes in said.items():
+        for key, value in attributes.items():
+            if key in _READ or (key == "units" and name == choice.heights):
+                continue
+            if isinstance(value, np.ndarray):
+                text = "{" + ",".join(map(str, value.ravel().tolist())) + "}" if value.size != 1 else str(value.item())
+            else:
+                text = str(value)
+            tags[f"{name}#{key}"] = text
+    return {"tags": {"": tags}} if tags else {}
+
+
+def _closed_fields(source: Source, dataset: Any, choice: Choice, surface: Surface) -> Surface:
+    """Close the poloidal axis of a tokamak's core, which files of BOUT++ describe by their own numbers."""
+    names = ("nx", "ny", "ixseps1", "ixseps2", "jyseps1_1", "jyseps2_2")
+    variables = dataset.variables
+    if (
+        source.closed is not None
+        or "y" not in choice.dims
+        or not all(name in variables and variables[name].size == 1 for name in names)
+    ):
+        return surface
+    nx, ny, one, two, first, last = (int(np.ravel(variables[name].values)[0]) for name in names)
+    closed = [*surface.closed]
+    closed[choice.dims.index("y")] |= min(one, two) >= nx and first < 0 and last >= ny - 1
+    return _with_closed(surface, closed)
+
+
+def _with_closed(surface: Surface, closed: Sequence[bool]) -> Surface:
+    pair: Closed = (bool(closed[0]), bool(closed[1]))
+    if pair == surface.closed:
+        return surface
+    mask, attributes = surface.mask, surface.attributes
+    return Surface(surface.points, pair, mask=mask, attributes=attributes, metadata=surface.metadata)

@@ -1,0 +1,47 @@
+"""OBJ: points, faces and lines, read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...errors import FormatError
+from ...surface import Surface
+from ..connectivity import find_curve
+from ..meshes import surface_of
+from ..notes import warn
+from ..source import Source, number
+from .mesh import IGNORED, READ, ObjFile
+
+__all__ = ["read", "sniff"]
+
+#: Bytes of text in any encoding that extends ASCII, for names and comments.
+_TEXT = bytes((*b"\t\n\f\r", *range(0x20, 0x7F), *range(0x80, 0x100)))
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Whether a file is text named .obj, or text that begins with an OBJ statement and is not named otherwise."""
+    if head.translate(None, _TEXT):
+        return False
+    if suffix == ".obj":
+        return True
+    statements = (words for line in head.splitlines() if (words := line.split()) and not words[0].startswith(b"#"))
+    return not suffix and next(statements, [b""])[0] in READ | IGNORED
+
+
+def read(source: Source) -> Surface:
+    """Read a mesh that is a structured surface, or lines that join points one after another to a curve, (N, 1, 3).
+
+    Colours behind the coordinates of points, normals and places in a texture are attributes.
+    """
+    file = ObjFile(source)
+    if file.face_count:
+        return surface_of(source, file.mesh(), "obj", file.words)
+    points, attributes = file.points()
+    if not file.segments:
+        raise FormatError(f"expected faces that join points to a grid, got {number(len(points))} points and no face")
+    closed = find_curve(len(points), np.array(file.segments, np.int64), file.segment_lines)
+    for text in file.notes():
+        warn(text)
+    columns_of = {name: values[:, None] for name, values in attributes.items()}
+    metadata = source.metadata("obj") | file.words
+    return Surface(points[:, None], (closed, False), attributes=columns_of, metadata=metadata)

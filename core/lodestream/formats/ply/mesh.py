@@ -1,0 +1,143 @@
+"""Meshes and curves in PLY: vertices joined by faces of three or four corners, or by edges."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import FormatError
+from ...mesh import CornerAttribute, Mesh
+from ...surface import Surface
+from ..attributes import TEXTURE, group
+from ..connectivity import find_curve
+from ..meshes import check_faces, surface_of
+from ..notes import keep_words, warn
+from ..source import Source, number
+from .elements import Lists, Table, read_elements
+from .header import Header
+
+__all__ = ["CURVE", "ELEMENT", "lists_left_out", "read", "read_curve", "words_of"]
+
+ELEMENT, CURVE = "face", "edge"
+
+_INDICES = ("vertex_indices", "vertex_index")
+
+#: Two numbers for each corner of a face.
+_TEXTURE = "texcoord"
+
+
+def read(source: Source, header: Header) -> Surface:
+    """Read a mesh that is a structured surface.
+
+    Properties of the vertices beside x, y and z are attributes, and so are places in a texture that faces have for
+    their corners. Other properties of faces, and other elements, are left out, which ``recognised`` says.
+    """
+    rows = {element.name: element.rows for element in header.elements}
+    source.check_vertices(rows.get("vertex", 0), f"{number(rows.get('vertex', 0))} vertices")
+    check_faces(source, rows[ELEMENT])
+    tables = read_elements(source.path, header)
+    points, attributes = _vertices(tables)
+    faces = tables[ELEMENT]
+    lists = next((column for name in _INDICES if isinstance(column := faces.get(name), Lists)), None)
+    if lists is None:
+        raise FormatError(f"expected faces with a list {_INDICES[0]}, got {', '.join(faces) or 'no property'}")
+    name = _Names(header)
+    corners = _corners(lists, len(points), name.face)
+    texture = faces.get(_TEXTURE)
+    of_corners = {}
+    left_out = [key for key in faces if key not in _INDICES]
+    if isinstance(texture, Lists) and (texture.counts == 2 * lists.counts).all():
+        of_corners[TEXTURE] = _of_corners(texture, corners)
+        left_out.remove(_TEXTURE)
+    notes = [f"{' and '.join(left_out)} of faces left out"] * bool(left_out)
+    others = [key for key in tables if key not in ("vertex", ELEMENT) and rows[key]]
+    notes += [f"element {' and '.join(others)} left out"] * bool(others)
+    notes += lists_left_out(header)
+    mesh = Mesh(points, corners, attributes, of_corners, name.face, tuple(notes))
+    return surface_of(source, mesh, "ply", words_of(header))
+
+
+def read_curve(source: Source, header: Header) -> Surface:
+    """Read points that edges join one after another, as a curve of shape (N, 1, 3)."""
+    tables = read_elements(source.path, header)
+    points, attributes = _vertices(tables)
+    source.check_vertices(len(points), f"{number(len(points))} vertices")
+    edges = tables[CURVE]
+    if not {"vertex1", "vertex2"} <= edges.keys():
+        raise FormatError(f"expected edges with vertex1 and vertex2, got {', '.join(edges) or 'no property'}")
+    segments = np.stack([np.asarray(edges[end], np.int64) for end in ("vertex1", "vertex2")], axis=-1)
+    closed = find_curve(len(points), segments, range(1, len(segments) + 1), "edge")
+    columns = {name: values[:, None] for name, values in attributes.items()}
+    left_out = [f"{name} of edges" for name in edges if name not in ("vertex1", "vertex2")]
+    left_out += [f"element {element.name}" for element in header.elements if element.rows]
+    left_out = [name for name in left_out if name not in ("element vertex", f"element {CURVE}")]
+    for text in [*lists_left_out(header), *(f"{name} left out" for name in left_out)]:
+        warn(text)
+    metadata = source.metadata("ply") | words_of(header)
+    return Surface(points[:, None], (closed, False), attributes=columns, metadata=metadata)
+
+
+def words_of(header: Header) -> dict[str, str]:
+    """What comments say of unit and CRS."""
+    words: dict[str, str] = {}
+    for line in header.info:
+        keep_words(words, *line.partition(" ")[::2])
+    return words
+
+
+def lists_left_out(header: Header) -> list[str]:
+    """What vertices have that is no number, in words."""
+    return [
+        f"list {it.name} of vertices left out"
+        for element in header.elements
+        if element.name == "vertex"
+        for it in element.properties
+        if it.count
+    ]
+
+
+class _Names:
+    """Names of faces, with their lines where the file is text."""
+
+    def __init__(self, header: Header) -> None:
+        self.line: int | None = None
+        if not header.order:
+            before = [element.name for element in header.elements].index(ELEMENT)
+            self.line = header.lines + 1 + sum(element.rows for element in header.elements[:before])
+
+    def face(self, face: int) -> str:
+        return f"face {face + 1}" if self.line is None else f"face {face + 1} (line {self.line + face})"
+
+
+def _vertices(tables: dict[str, Table]) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
+    columns = {name: column for name, column in tables.get("vertex", {}).items() if not isinstance(column, Lists)}
+    if not {"x", "y", "z"} <= columns.keys():
+        raise FormatError(f"expected vertices with x, y and z, got {', '.join(columns) or 'none'}")
+    points = np.stack([columns.pop(axis) for axis in "xyz"], axis=-1)
+    if not len(points):
+        raise FormatError("expected at least one vertex, got none")
+    return points, group(columns)
+
+
+def _corners(lists: Lists, vertices: int, name: Any) -> NDArray[np.int32]:
+    wrong = (lists.counts != 3) & (lists.counts != 4)
+    if wrong.any():
+        face = int(wrong.argmax())
+        raise FormatError(f"expected faces of 3 or 4 corners, got {lists.counts[face]} in {name(face)}")
+    values = lists.values.astype(np.int64)
+    outside = (values < 0) | (values >= vertices)
+    if outside.any():
+        place = int(outside.argmax())
+        face = int(np.searchsorted(np.cumsum(lists.counts), place, "right"))
+        raise FormatError(f"expected vertices from 0 to {number(vertices - 1)}, got {values[place]} in {name(face)}")
+    corners = np.full((len(lists.counts), 4), -1, np.int32)
+    corners[np.arange(4) < lists.counts[:, None]] = values
+    return corners
+
+
+def _of_corners(texture: Lists, corners: NDArray[np.int32]) -> CornerAttribute:
+    rows = np.full(corners.shape, -1, np.int32)
+    rows[corners >= 0] = np.arange(len(texture.values) // 2)
+    return CornerAttribute(texture.values.reshape(-1, 2), rows)

@@ -1,0 +1,1 @@
+"""Rasters, most of them read by GDAL."""

@@ -1,0 +1,276 @@
+"""PNG: heights as shades of grey, or as colours in one of the two codes that map tiles use.
+
+Pillow reads and writes the pixels; the header is read before, so that a size is refused before anything is expanded.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import warnings
+import zlib
+from collections.abc import Mapping
+from io import BytesIO
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import FormatError, OptionError, UnavailableError
+from ...quantization.lattice import Lattice, find_lattice, to_dtype
+from ...surface import Surface
+from ..notes import listing, metadata_left_out, warn
+from ..source import Source, number
+from .flat import even_heights
+
+__all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
+
+READ_OPTIONS = {
+    "encoding": "meaning of the pixels: grey, terrain-rgb or terrarium (default: grey for grey levels; for colours "
+    "as the file's name says)"
+}
+
+_MAGIC = b"\x89PNG\r\n\x1a\n"
+_GREY, _RGB, _PALETTE, _GREY_ALPHA, _RGBA = 0, 2, 3, 4, 6
+_CHANNELS = {_GREY: 1, _RGB: 3, _GREY_ALPHA: 2, _RGBA: 4}
+_KINDS = {
+    _GREY: "grey",
+    _RGB: "colours",
+    _PALETTE: "a palette",
+    _GREY_ALPHA: "grey with alpha",
+    _RGBA: "colours with alpha",
+}
+_ENCODINGS = ("grey", "terrain-rgb", "terrarium")
+_WHITE = 65535
+
+#: Left, top, and steps to the right and down of the passes of an interlaced image.
+_INTERLACED = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_PIECE = 1 << 20
+
+#: Key of a text in the file: JSON with first, origin, step and scale, where heights are
+#: (origin + step (first + shade)) / scale, in dtype; or with encoding, what its colours stand for.
+_TEXT = "lodestream"
+
+#: Texts that are read, or say nothing but by what the file was written.
+_KNOWN_TEXTS = (_TEXT, "Software")
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Whether a file begins like PNG."""
+    return head.startswith(_MAGIC)
+
+
+def named(name: str) -> Mapping[str, str]:
+    """The code of colours that a file's name speaks of."""
+    words = name.lower().replace("_", "-")
+    for encoding, clues in (("terrarium", ("terrarium",)), ("terrain-rgb", ("terrain-rgb", "terrainrgb"))):
+        if any(clue in words for clue in clues):
+            return {"encoding": encoding}
+    return {}
+
+
+def require_pillow() -> Any:
+    """Pillow's module for PNG, imported now."""
+    try:
+        from PIL import PngImagePlugin
+    except ImportError:
+        raise UnavailableError("expected Pillow for PNG, which is not installed: install lodestream[formats]") from None
+    return PngImagePlugin
+
+
+def read(source: Source) -> Surface:
+    """Read heights: the shades themselves, or what the colours stand for; transparent pixels are holes."""
+    depth, kind = _header(source)
+    pillow = require_pillow()
+    _check_pixels(source)
+    try:
+        # The plugin itself: Image.open would try others, and has a limit of its own.
+        with warnings.catch_warnings(), source.path.open("rb") as file:
+            warnings.simplefilter("ignore")
+            image = pillow.PngImageFile(file)
+            image.load()
+            pixels = np.asarray(image)
+            text = _text(image.text.get(_TEXT))
+            clear = image.info.get("transparency")
+            words = [key for key in image.text if key not in _KNOWN_TEXTS]
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+        raise FormatError(f"expected a whole PNG, got one that Pillow cannot read: {error}") from None
+    if words:
+        warn(f"left out texts of the PNG: {listing(words)}")
+    _warn_of_transparency(pixels, kind)
+    encoding = _encoding(source, kind, text)
+    if encoding == "grey":
+        return _grey(source, pixels, depth, clear, text)
+    mask = pixels[..., 3] > 0 if kind == _RGBA else None
+    if mask is None and isinstance(clear, tuple):
+        mask = (pixels[..., :3] != np.array(clear)).any(axis=2)
+    code = np.zeros(pixels.shape[:2], np.float64)
+    for channel in range(3):
+        code = code * 256 + pixels[..., channel]
+    heights = (code / 256 - 32768).astype(np.float32) if encoding == "terrarium" else -10000 + 0.1 * code
+    return Surface(heights, mask=mask, metadata=source.metadata("png") | {"encoding": encoding})
+
+
+def _warn_of_transparency(pixels: NDArray[Any], kind: int) -> None:
+    if kind in (_GREY_ALPHA, _RGBA) and not np.isin(pixels[..., -1], (0, 255)).all():
+        warn("left out partial transparency; only fully transparent points are holes")
+
+
+def _header(source: Source) -> tuple[int, int]:
+    """Bits a channel and the kind of colour, after size and kind have been found to be allowed."""
+    with source.path.open("rb") as file:
+        head = file.read(33)
+    if len(head) < 33 or head[8:16] != b"\0\0\0\rIHDR":
+        raise FormatError(f"expected a PNG that begins with its header of 33 bytes, got {len(head)} other bytes")
+    width, height, depth, kind = struct.unpack(">IIBB", head[16:26])
+    source.check_array((height, width), np.dtype(np.uint8))
+    if kind not in _CHANNELS or (depth != 8 and (kind, depth) != (_GREY, 16)):
+        found = f"{_KINDS.get(kind, f'kind {kind}')} of {depth} bits"
+        raise FormatError(f"expected grey of 8 or 16 bits, or grey with alpha or colours of 8, got {found}")
+    source.check_expansion(height * width * depth // 8 * _CHANNELS[kind])
+    return depth, kind
+
+
+def _check_pixels(source: Source) -> None:
+    """Count what the pixels expand to, because Pillow takes those that are missing for black."""
+    with source.path.open("rb") as file:
+        file.seek(16)
+        width, height, depth, kind, _, _, interlaced = struct.unpack(">IIBBBBB", file.read(13))
+        bits = depth * _CHANNELS[kind]
+        passes = _INTERLACED if interlaced else ((0, 0, 1, 1),)
+        sizes = ((-(-(width - left) // right), -(-(height - top) // down)) for left, top, right, down in passes)
+        wanted = sum(rows * (1 + (columns * bits + 7) // 8) for columns, rows in sizes if columns > 0 and rows > 0)
+        file.seek(8)
+        found, expander = 0, zlib.decompressobj()
+        while found < wanted and len(head := file.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            if name != b"IDAT":
+                file.seek(length + 4, 1)
+                continue
+            while length > 0 and (data := file.read(min(length, _PIECE))):
+                length -= len(data)
+                try:
+                    while data and found < wanted:
+                        found += len(expander.decompress(data, _PIECE))
+                        data = expander.unconsumed_tail
+                except zlib.error as error:
+                    raise FormatError(f"expected a whole PNG, got one with damaged pixels: {error}") from None
+            file.seek(length + 4, 1)
+    if found < wanted:
+        raise FormatError(f"expected a whole PNG of {number(wanted)} bytes of pixels, got {number(found)}")
+
+
+def _encoding(source: Source, kind: int, text: Mapping[str, Any]) -> str:
+    chosen = source.options.get("encoding", text.get("encoding"))
+    if chosen is not None and chosen not in _ENCODINGS:
+        raise OptionError(f"expected encoding= one of {', '.join(_ENCODINGS)}, got {str(chosen)!r}")
+    grey = kind in (_GREY, _GREY_ALPHA)
+    if grey:
+        if chosen not in (None, "grey") and "encoding" in source.options:
+            raise OptionError(f"expected encoding=grey for grey levels, got {chosen!r}")
+        return "grey"
+    if chosen is None:
+        raise FormatError(
+            "expected grey levels, got colours: give their meaning with encoding=terrain-rgb or encoding=terrarium"
+        )
+    if chosen == "grey":
+        raise OptionError("expected encoding=terrain-rgb or encoding=terrarium for colours, got 'grey'")
+    return str(chosen)
+
+
+def _grey(source: Source, pixels: NDArray[Any], depth: int, clear: Any, text: Mapping[str, Any]) -> Surface:
+    mask = None
+    if pixels.ndim == 3:
+        pixels, mask = pixels[..., 0], pixels[..., 1] > 0
+    elif isinstance(clear, int):
+        mask = pixels != clear
+    shades = pixels.astype(np.uint16 if depth == 16 else np.uint8)
+    heights = _heights(shades, text) if "dtype" in text else shades
+    return Surface(heights, mask=mask, metadata=source.metadata("png"))
+
+
+def _text(content: Any) -> dict[str, Any]:
+    try:
+        found = json.loads(str(content))
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _heights(shades: NDArray[Any], rule: Mapping[str, Any]) -> NDArray[Any]:
+    """Heights of shades by the rule in the file's text."""
+    try:
+        first, origin, step, scale = (float(rule[key]) for key in ("first", "origin", "step", "scale"))
+        dtype = np.dtype(str(rule["dtype"]))
+        values = ((shades + first) * step + origin) / scale
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise FormatError(f"expected a rule of heights in the text of the PNG, got another one: {error!r}") from None
+    if (
+        not np.isfinite([first, origin, step, scale]).all()
+        or dtype.kind not in "iuf"
+        or dtype.itemsize not in (1, 2, 4, 8)
+    ):
+        raise FormatError(f"expected a rule of heights in the text of the PNG, got {str(dict(rule))[:80]}")
+    return to_dtype(values, dtype)
+
+
+def write(surface: Surface, file: BinaryIO) -> None:
+    """Write heights as shades of grey of 16 bits; a shade that no height has is transparent and stands for holes.
+
+    Whole numbers from 0 to 65,535 are the shades. Others, of at most that many different steps, are shifted and scaled
+    without loss, and rounded where there are more steps; the rule that undoes it is a text in the file.
+    """
+    pillow = require_pillow()
+    surface = even_heights(surface, "PNG")
+    left_out = [*metadata_left_out(surface, ()), *["closure"] * any(surface.closed), *surface.attributes]
+    if left_out:
+        warn(f"PNG holds heights only: {listing(left_out)} left out")
+    shades, rule, clear = _shades(surface)
+    info = pillow.PngInfo()
+    if rule:
+        info.add_text(_TEXT, json.dumps(rule))
+    from PIL import Image
+
+    whole = BytesIO()  # Pillow asks for the position, which a pipe has not
+    Image.fromarray(shades).save(whole, "PNG", pnginfo=info, **({} if clear is None else {"transparency": clear}))
+    file.write(whole.getbuffer())
+
+
+def _shades(surface: Surface) -> tuple[NDArray[np.uint16], dict[str, Any], int | None]:
+    """Shades, the rule that gives heights back (none is needed for plain shades), and the shade of holes."""
+    points, mask = surface.points, surface.mask
+    valid = points if mask is None else points[mask]
+    low, high = valid.min(), valid.max()
+    rule: dict[str, Any] = {"first": 0, "origin": 0, "step": 1, "scale": 1, "dtype": points.dtype.name}
+    holes = int(mask is not None)
+    if points.dtype.kind in "iu" and low >= 0 and high <= _WHITE and not (holes and len(np.unique(valid)) > _WHITE):
+        shades = points.astype(np.uint16)
+        rule = {} if points.dtype == np.uint16 else rule
+    else:
+        lattice = find_lattice(valid)
+        filled = points if mask is None else np.where(mask, points, low)
+        if lattice is not None:
+            rule |= {"origin": lattice.origin}
+            rule |= {"scale": lattice.step} if lattice.rule == "decimal" else {"step": lattice.step}
+            whole = lattice.coordinates(filled)
+            rule["first"] = int(whole.min())
+            steps = int(whole.max()) - rule["first"]
+        if lattice is None or steps + holes > _WHITE:
+            step = (float(high) - float(low)) / (_WHITE - holes)
+            lattice = Lattice("affine", float(low), step)
+            rule |= {"first": 0, "origin": float(low), "step": step, "scale": 1}
+            whole = lattice.coordinates(filled)
+            warn(f"PNG has 65,536 grey levels: heights are rounded to steps of {step:.6g}")
+        else:
+            warn(
+                "PNG has grey levels from 0 to 65,535: heights are shifted and scaled to them; a text chunk has the "
+                "rule"
+            )
+        shades = (whole - rule["first"]).astype(np.uint16)
+    if mask is None:
+        return shades, rule, None
+    used = np.bincount(shades[mask], minlength=_WHITE + 1)
+    nodata = surface.metadata.get("nodata")
+    wanted = [int(nodata)] if isinstance(nodata, int) and 0 <= nodata <= _WHITE else []
+    clear = next(shade for shade in (*wanted, *np.flatnonzero(used == 0).tolist()) if not used[shade])
+    return np.where(mask, shades, np.uint16(clear)), rule, clear

@@ -1,0 +1,1 @@
+"""Files that VTK reads, and structured grids of VTK written."""

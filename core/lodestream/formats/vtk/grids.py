@@ -1,0 +1,258 @@
+"""Grids that VTK reads, as surfaces: points, attributes, and what is blanked as holes.
+
+VTK runs in a process of its own (see `vtk_process`), so that no file can bring down this one, take its memory, or make
+it open another file.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...coordinates.seams import merge
+from ...errors import FormatError, TooLargeError, UnavailableError
+from ...mesh.cells import pack_cells
+from ...surface import Block, Surface
+from ..attributes import COLOR, NORMAL, TEXTURE
+from ..notes import keep_words, listing, warn
+from ..planes import Cut, Dims, cuts
+from ..source import Source, number
+from .ghosts import HIDDEN_CELL, HIDDEN_POINT
+
+__all__ = ["Reading", "check_arrays", "read_grids"]
+
+#: What VTK may take for a small file, beside what it takes for itself.
+_MEMORY = 128 << 20
+
+#: VTK looks through all arrays of a grid to add one.
+_MOST_ARRAYS = 1_000
+
+#: A processor's seconds that VTK may take: for a file of any size, and bytes for each more. It reads text of ten times
+#: as many in a second; what takes longer is made of very many parts that it looks through again and again.
+_SECONDS, _BYTES_A_SECOND = 20, 1 << 20
+
+_LAST_SECONDS = 10.0  # for a process that says nothing any more
+_SCRIPT = Path(__file__).with_name("vtk_process.py")
+_ROLES = {"normals": (NORMAL, (3,), "f"), "texture": (TEXTURE, (2,), "f")}
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One file to read.
+
+    Attributes
+    ----------
+    kind : str
+        The reader, as `vtk_process` names them.
+    path : Path
+    promised : int
+        Bytes of its arrays, or what they can be.
+    dims : (int, int, int) or None
+        Points along i, j and k, where that is known.
+    """
+
+    kind: str
+    path: Path
+    promised: int
+    dims: Dims | None = None
+
+
+def check_arrays(count: int) -> None:
+    """Refuse a file of so many arrays that VTK would take too long to add them to its grids.
+
+    Raises
+    ------
+    TooLargeError
+    """
+    if count > _MOST_ARRAYS:
+        raise TooLargeError(
+            f"expected at most {number(_MOST_ARRAYS)} arrays in a file of VTK, got {number(count)} or more"
+        )
+
+
+def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Surface:
+    """Read all grids of some files as the blocks of a surface, each cut to a plane where it is a volume.
+
+    Points and cells that are blanked (``vtkGhostType``) are holes; a hidden cell between valid points is named in the
+    metadata's ``faces``. Normals, texture coordinates and colours become "normal", "uv" and "color", other data of the
+    points keep their name. Unit and CRS may be strings of field data; other field data, and data of cells, are left
+    out, with a note.
+
+    Raises
+    ------
+    UnavailableError
+        When VTK is not installed, or the process in which it runs ended before it had answered: somebody ended it, or
+        it had not enough memory or time here. It says nothing of the bytes.
+    FormatError
+        When VTK refuses a file; with its reason.
+    """
+    if importlib.util.find_spec("vtkmodules") is None:
+        raise UnavailableError(f"expected VTK for {format_name}, which is not installed: install lodestream[vtk]")
+    known = [file.dims for file in files if file.dims is not None]
+    taken, metadata = cuts(source, known) if len(known) == len(files) else ([], {})
+    blocks: list[Block] = []
+    faces: list[dict[str, Any]] = []
+    left_out: list[str] = []
+    words: dict[str, str] = {}
+    for file in files:
+        with _started(file) as (grids, output):
+            if not known:
+                taken, metadata = cuts(source, [tuple(grid["dims"]) for grid in grids])
+            for grid in grids:
+                cut = taken[len(blocks)] if len(blocks) < len(taken) else None
+                if cut is None or tuple(grid["dims"]) != cut.dims:
+                    raise FormatError(f"expected one grid for each header, got others in {file.path.name}")
+                block, face = _block(grid, cut, output)
+                blocks.append(block)
+                faces.append(face)
+                left_out += grid["left_out"]
+                for key, text in grid["words"].items():
+                    keep_words(words, key, text)
+    if left_out:
+        warn(f"left out data that do not belong to points: {listing(dict.fromkeys(left_out))}")
+    if any(faces):
+        metadata["faces"] = faces if len(faces) > 1 else faces[0]
+    metadata = source.metadata(format_name) | words | metadata
+    return merge(Surface(blocks=blocks, metadata=metadata), source.closed)
+
+
+@contextmanager
+def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
+    """Start the process that reads a file; give the description of its grids and the pipe with their arrays."""
+    budget = _MEMORY + 4 * file.promised
+    seconds = _SECONDS + file.path.stat().st_size // _BYTES_A_SECOND
+    limits = [str(budget), str(seconds)]
+    command = [sys.executable, "-P", os.fspath(_SCRIPT), file.kind, os.fspath(file.path.resolve()), *limits]
+    environment = {**os.environ, "VTK_SMP_MAX_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
+    ) as process:
+        try:
+            assert process.stdout is not None  # it was asked for
+            line = process.stdout.readline()
+            if not line.endswith(b"\n"):
+                raise _ended(process, budget, seconds)
+            answer = json.loads(line)
+            if "error" in answer:
+                raise FormatError(f"expected structured grids that VTK reads, got {_printable(answer['error'])}")
+            if not answer["grids"]:
+                raise FormatError("expected structured grids that VTK reads, got none")
+            try:
+                yield answer["grids"], process.stdout
+            except EOFError:
+                raise _ended(process, budget, seconds) from None
+        finally:
+            process.kill()
+
+
+def _ended(process: subprocess.Popen[bytes], budget: int, seconds: int) -> UnavailableError:
+    """The error of a reader that has ended before its answer did: it has refused nothing, whatever ended it."""
+    try:
+        code = process.wait(_LAST_SECONDS)
+        how = f"exit code {code}" if code >= 0 else signal.strsignal(-code) or f"signal {-code}"
+    except subprocess.TimeoutExpired:
+        how = "it says nothing any more"
+    return UnavailableError(
+        f"expected VTK to read the file, got a process that ended before it had answered ({how}); it may take "
+        f"{number(budget >> 20)} MiB and {number(seconds)} seconds of a processor"
+    )
+
+
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() else " " for character in text)[:400]
+
+
+def _block(grid: Any, cut: Cut, output: IO[bytes]) -> tuple[Block, dict[str, Any]]:
+    """Take one grid from the pipe; give it and what is to be said of its faces."""
+    points: NDArray[Any] | None = None
+    axes: list[NDArray[Any]] = []
+    attributes: dict[str, NDArray[Any]] = {}
+    mask: NDArray[np.bool_] | None = None
+    hidden: NDArray[np.bool_] | None = None
+    for array in grid["arrays"]:
+        values = _received(output, np.dtype(array["dtype"]), tuple(array["shape"]))
+        role, name = array["role"], array["name"]
+        if role == "axis":
+            axes.append(values)
+        elif role == "cell_ghost":
+            hidden = _hidden_cells(values, cut)
+            if hidden is None and (values & HIDDEN_CELL).any():
+                warn("left out which cells of a volume are hidden")
+        elif len(values) != prod(cut.dims):
+            raise FormatError(f"expected {number(prod(cut.dims))} values of {name or 'the points'}, got {len(values)}")
+        elif role == "points":
+            points = cut.of(values)
+        elif role == "point_ghost":
+            mask = cut.of(values) & HIDDEN_POINT == 0
+        else:
+            attributes[_attribute_name(role, name, values)] = cut.of(values)
+    if axes:
+        points = _rectilinear(axes, cut)
+    if points is None:
+        raise FormatError("expected a grid with points, got none")
+    face: dict[str, Any] = {}
+    if hidden is not None:
+        mask, face = _without_hidden(hidden, mask)
+    return Block(points, mask=mask, attributes=attributes), face
+
+
+def _received(output: IO[bytes], dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    values = np.empty(shape, dtype)
+    rest = values.reshape(-1).view(np.uint8).data
+    while rest:
+        got = output.read(min(len(rest), 1 << 20))
+        if not got:
+            raise EOFError
+        rest[: len(got)] = got
+        rest = rest[len(got) :]
+    return values
+
+
+def _attribute_name(role: str, name: str, values: NDArray[Any]) -> str:
+    attribute, shape, kind = _ROLES.get(role, (name, (), ""))
+    if role == "scalars" and values.dtype == np.uint8 and values.shape[1:] in ((3,), (4,)):
+        return COLOR
+    return attribute if values.shape[1:] == shape and values.dtype.kind == kind else name
+
+
+def _rectilinear(axes: Sequence[NDArray[Any]], cut: Cut) -> NDArray[Any]:
+    """The points of a grid that is the product of its axes."""
+    i, j, k = cut.dims
+    shapes = ((1, 1, i), (1, j, 1), (k, 1, 1))
+    dtype = np.result_type(*axes)
+    channels = [
+        np.broadcast_to(axis.reshape(shape), (k, j, i))[cut.key].reshape(cut.shape)
+        for axis, shape in zip(axes, shapes, strict=True)
+    ]
+    return np.stack(channels, axis=-1).astype(dtype)
+
+
+def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
+    """Which cells of a surface are hidden, (rows - 1, columns - 1); None for a volume, whose cells are not its own."""
+    rows, columns = (max(length - 1, 1) for length in cut.shape)
+    hidden = values & HIDDEN_CELL != 0
+    return hidden.reshape(rows, columns) if hidden.size == rows * columns and min(cut.shape) > 1 else None
+
+
+def _without_hidden(
+    hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.bool_], dict[str, Any]]:
+    """Make holes of the points all of whose cells are hidden; name the other hidden cells."""
+    around = np.pad(hidden, 1, constant_values=True)
+    all_hidden = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
+    valid = ~all_hidden if mask is None else mask & ~all_hidden
+    whole = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
+    return valid, {"left_out": pack_cells(hidden & whole)} if (hidden & whole).any() else {}

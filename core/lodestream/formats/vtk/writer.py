@@ -1,0 +1,204 @@
+"""VTS, the XML file of VTK for a structured grid, of any surface: grids stay grids, and holes are blanked.
+
+Source: "VTK XML Formats" of the VTK documentation; blanking as in VTK's vtkStructuredGrid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...coordinates.height_fields import coordinates
+from ...mesh.cells import unpack_cells
+from ...surface import Block, Surface
+from ..attributes import COLOR, NORMAL, TEXTURE
+from ..mesh_output import exact_float, extra_channels, words_of
+from ..notes import warn
+from .ghosts import HIDDEN_CELL, HIDDEN_POINT
+
+__all__ = ["write"]
+
+_MIN_CLOSED = 3
+_TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
+_CHUNK = 1 << 20
+
+#: The array that says what is hidden.
+_GHOSTS = "vtkGhostType"
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Arrays of shape (H, W) or (H, W, K); the cells, (H - 1, W - 1)."""
+
+    points: NDArray[Any]
+    attributes: dict[str, NDArray[Any]]
+    hidden_points: NDArray[np.bool_]
+    hidden_cells: NDArray[np.bool_]
+
+
+def write(surface: Surface, file: BinaryIO) -> None:
+    """Write points and attributes, appended as bytes.
+
+    Holes are hidden points (``vtkGhostType``) and cells without a face hidden cells. A closed axis repeats its first
+    points at the end. Several blocks are stacked in one grid, with hidden cells between them, and padded to the widest
+    with hidden points, since a file holds one grid; that is warned of. Name, unit and CRS are strings of field data.
+    """
+    grids = [_grid(surface, number) for number in range(len(surface.blocks))]
+    if len(grids) > 1:
+        warn(f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them")
+    _warn_of_faces(surface)
+    grid = grids[0] if len(grids) == 1 else _stacked(grids)
+    rows, columns = grid.points.shape[:2]
+    attributes = dict(grid.attributes)
+    if grid.hidden_points.any():
+        attributes[_GHOSTS] = grid.hidden_points.astype(np.uint8) * HIDDEN_POINT
+    cells = {}
+    if grid.hidden_cells.any():
+        cells[_GHOSTS] = grid.hidden_cells.astype(np.uint8) * HIDDEN_CELL
+    arrays = [*attributes.items(), *cells.items(), ("Points", grid.points)]
+    offsets = np.cumsum([0, *(8 + values.nbytes for _, values in arrays)]).tolist()
+    described = [_array(name, values, offset) for (name, values), offset in zip(arrays, offsets, strict=False)]
+    extent = f"0 {columns - 1} 0 {rows - 1} 0 0"
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="StructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
+        f'<StructuredGrid WholeExtent="{extent}">',
+        *_field_data(surface),
+        f'<Piece Extent="{extent}">',
+        f"<PointData{_roles(attributes)}>",
+        *described[: len(attributes)],
+        "</PointData>",
+        "<CellData>",
+        *described[len(attributes) : -1],
+        "</CellData>",
+        "<Points>",
+        described[-1],
+        "</Points>",
+        "</Piece>",
+        "</StructuredGrid>",
+        '<AppendedData encoding="raw">',
+        "_",
+    ]
+    file.write("\n".join(lines).encode())
+    for _, values in arrays:
+        file.write(values.nbytes.to_bytes(8, "little"))
+        content = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<"), copy=False)).reshape(-1)
+        raw = content.view(np.uint8).data
+        for start in range(0, len(raw), _CHUNK):
+            file.write(raw[start : start + _CHUNK])
+    file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _grid(surface: Surface, number: int) -> _Grid:
+    """One block as VTK has grids: with three coordinates, none of them NaN, and ends in place of closed axes."""
+    block = surface.blocks[number]
+    axes = [exact_float(values, axis, "VTS") for values, axis in zip(_coordinates(surface, block), "xyz", strict=True)]
+    points = np.stack(axes, axis=-1)
+    attributes = {_GHOSTS + "_" if name == _GHOSTS else name: values for name, values in block.attributes.items()}
+    for channel, name in extra_channels(block).items():
+        attributes[name] = block.points[:, :, channel]
+    hidden = np.zeros(block.shape, np.bool_) if block.mask is None else ~block.mask
+    if hidden.any():
+        points[hidden] = points[~hidden][0]  # inside the box, which VTK takes of all points
+    wraps = [closed and length >= _MIN_CLOSED for closed, length in zip(block.closed, block.shape, strict=True)]
+    ends = [(0, int(wrap)) for wrap in wraps]
+    rows, columns = (length - 1 + int(wrap) for length, wrap in zip(block.shape, wraps, strict=True))
+    faces = surface.metadata.get("faces", {})  # one map for all blocks, or a list of one for each
+    of_block = faces[number] if isinstance(faces, list) and number < len(faces) else faces
+    left_out = unpack_cells(of_block.get("left_out") if isinstance(of_block, dict) else None, (rows, columns))
+    return _Grid(
+        _padded(points, ends, "wrap"),
+        {name: _padded(values, ends, "wrap") for name, values in attributes.items()},
+        _padded(hidden, ends, "wrap"),
+        np.zeros((rows, columns), np.bool_) if left_out is None else left_out,
+    )
+
+
+def _warn_of_faces(surface: Surface) -> None:
+    """Say what a grid of quads does not tell."""
+    faces = surface.metadata.get("faces")
+    maps = [it for it in (faces if isinstance(faces, list) else [faces]) if isinstance(it, dict)]
+    if any("diagonal" in it for it in maps):
+        warn("VTS is written with quads in place of the triangles that they were joined from")
+    closed = [
+        block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < _MIN_CLOSED
+    ]
+    if closed:
+        warn(f"VTS is written with open axes in place of closed ones of fewer than {_MIN_CLOSED} points")
+    if _GHOSTS in surface.blocks[0].attributes:
+        warn(f"VTS is written with the attribute {_GHOSTS} as {_GHOSTS}_, because VTS uses that name for hidden points")
+
+
+def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
+    points = block.points
+    if points.ndim == 2:
+        return (*coordinates(surface), points)
+    x, y = points[:, :, 0], points[:, :, 1]
+    return x, y, points[:, :, 2] if points.shape[2] > 2 else np.zeros(block.shape, points.dtype)
+
+
+def _stacked(grids: Sequence[_Grid]) -> _Grid:
+    """One grid with the rows of all, the cells between two of them hidden."""
+    width = max(grid.points.shape[1] for grid in grids)
+    parts: list[_Grid] = []
+    for grid in grids:
+        more = width - grid.points.shape[1]
+        ends = [(0, 0), (0, more)]
+        cells = np.pad(grid.hidden_cells, ((0, 1), (0, more)))
+        cells[-1] = True
+        parts.append(
+            _Grid(
+                _padded(grid.points, ends, "edge"),
+                {name: _padded(values, ends, "edge") for name, values in grid.attributes.items()},
+                np.pad(grid.hidden_points, ends, constant_values=True),
+                cells,
+            )
+        )
+    return _Grid(
+        np.concatenate([part.points for part in parts]),
+        {name: np.concatenate([part.attributes[name] for part in parts]) for name in parts[0].attributes},
+        np.concatenate([part.hidden_points for part in parts]),
+        np.concatenate([part.hidden_cells for part in parts])[:-1],
+    )
+
+
+def _padded(values: NDArray[Any], ends: Sequence[tuple[int, int]], mode: Any) -> NDArray[Any]:
+    result: NDArray[Any] = np.pad(values, [*ends, (0, 0)][: values.ndim], mode=mode)
+    return result
+
+
+def _array(name: str, values: NDArray[Any], offset: int) -> str:
+    from xml.sax.saxutils import quoteattr  # it loads urllib, which writers of other formats need not wait for
+
+    kind = f"{_TYPES[values.dtype.kind]}{8 * values.dtype.itemsize}"
+    components = values.shape[2] if values.ndim == 3 else 1
+    return (
+        f'<DataArray type="{kind}" Name={quoteattr(name)} NumberOfComponents="{components}" format="appended" '
+        f'offset="{offset}"/>'
+    )
+
+
+def _roles(attributes: dict[str, NDArray[Any]]) -> str:
+    """Say which array is what."""
+    roles = (("Scalars", COLOR, (3, 4)), ("Normals", NORMAL, (3,)), ("TCoords", TEXTURE, (2,)))
+    found = [
+        f' {role}="{name}"'
+        for role, name, widths in roles
+        if name in attributes and attributes[name].shape[2:] in {(width,) for width in widths}
+    ]
+    return "".join(found)
+
+
+def _field_data(surface: Surface) -> Iterator[str]:
+    words = words_of("VTS", surface)
+    if not words:
+        return
+    yield "<FieldData>"
+    for key, text in words.items():
+        codes = " ".join(str(byte) for byte in [*text.encode(), 0])
+        yield f'<DataArray type="String" Name="{key}" NumberOfTuples="1" format="ascii">{codes}</DataArray>'
+    yield "</FieldData>"

@@ -1,0 +1,270 @@
+"""XML files of VTK with a structured grid (.vts), whose headers are checked before VTK sees them.
+
+Source: "VTK XML Formats" of the VTK documentation, and how VTK's vtkXMLDataParser.cxx reads blocks.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import prod
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from ...errors import FormatError, TooLargeError
+from ...surface import Surface
+from .. import planes
+from ..planes import Dims
+from ..source import Source, number
+from .grids import Reading, check_arrays, read_grids
+
+__all__ = ["MORE", "OPTIONS", "SUFFIXES", "read", "sniff"]
+
+SUFFIXES = (".vts",)
+OPTIONS: Mapping[str, str] = {"plane": planes.HELP}
+MORE = "one more block each"
+
+_CHUNK = 1 << 16
+_SIZES = {"Int8": 1, "UInt8": 1, "Int16": 2, "UInt16": 2, "Int32": 4, "UInt32": 4, "Int64": 8, "UInt64": 8}
+_SIZES |= {"Float32": 4, "Float64": 8}
+_SECTIONS = ("PointData", "CellData", "Points")
+
+#: VTK looks through all attributes of an element to add one.
+_MOST_ATTRIBUTES = 100
+
+#: Bytes of a tag or comment. The parser begins it anew with each chunk of the file until it is whole.
+_LONGEST_TAG = 1 << 18
+
+#: Characters of an array that are kept: those of its header in base64.
+_KEPT = 256
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Whether a file begins like an XML file of VTK."""
+    return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"<?xml", b"<VTKFile", b"<!--")) and b"<VTKFile" in head
+
+
+def read(source: Source) -> Surface:
+    """Read the grid of each file as a block; an index plane of volumes (option ``plane``)."""
+    readings = []
+    for path in (source.path, *source.more):
+        try:
+            dims, promised = _checked(path)
+        except FormatError as error:
+            raise FormatError(f"{path.name}: {error}" if source.more else str(error)) from None
+        source.check_expansion(promised)
+        readings.append(Reading("xml", path, promised, dims))
+    return read_grids(source, "vts", readings)
+
+
+@dataclass(slots=True)
+class _Array:
+    """A DataArray: its attributes, the points or cells that it is for, how its text begins and how long it is."""
+
+    attributes: dict[str, str]
+    tuples: int
+    text: str = ""
+    characters: int = 0
+
+    @property
+    def name(self) -> str:
+        return self.attributes.get("Name", "of points")[:80]
+
+    def promised(self) -> int:
+        """Bytes that the array takes in memory."""
+        kind, components = self.attributes.get("type", ""), self.attributes.get("NumberOfComponents", "1")
+        if kind not in _SIZES or not re.fullmatch(r"[1-9]\d{0,4}", components):
+            raise FormatError(
+                f"expected array {self.name!r} of a type of VTK and 1 to 99999 components, got {kind[:40]!r} and "
+                f"{components[:40]!r}"
+            )
+        return _SIZES[kind] * int(components) * self.tuples
+
+
+@dataclass(slots=True)
+class _Found:
+    """What the XML of a file says."""
+
+    root: dict[str, str] = field(default_factory=dict)
+    whole: tuple[int, ...] = ()
+    piece: tuple[int, ...] = ()
+    pieces: int = 0
+    named: int = 0  # arrays of any kind, of field data too
+    section: str = ""
+    arrays: list[_Array] = field(default_factory=list)
+    open_array: bool = False
+    appended: dict[str, str] | None = None
+    appended_at: int = -1
+
+
+def _checked(path: Path) -> tuple[Dims, int]:
+    """Check the headers of a file; give the points of its grid along i, j and k and the bytes of its arrays."""
+    found = _parsed(path)
+    kind = found.root.get("type", "none")
+    if kind == "vtkMultiBlockDataSet":
+        raise FormatError(
+            "expected the grids themselves, got a .vtm file, which only names other files, and these are never opened: "
+            "give its .vts files together, one for each block"
+        )
+    if kind != "StructuredGrid":
+        raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}")
+    if not found.whole or not found.pieces:
+        raise FormatError("expected a StructuredGrid with a WholeExtent and a Piece, got none")
+    promised = sum(array.promised() for array in found.arrays)
+    for array in found.arrays:
+        _check_array(path, found, array)
+    i, j, k = _lengths(found.whole)
+    return (i, j, k), promised
+
+
+def _parsed(path: Path) -> _Found:
+    found = _Found()
+    parser = expat.ParserCreate()
+
+    def refuse(*_: Any) -> None:
+        raise FormatError("expected XML without a DOCTYPE or entities, got one")
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        found.open_array = False
+        found.named += name in ("DataArray", "Array")
+        check_arrays(found.named)
+        if len(attributes) > _MOST_ATTRIBUTES:
+            got = number(len(attributes))
+            raise TooLargeError(f"expected at most {_MOST_ATTRIBUTES} attributes of {name[:40]!r}, got {got}")
+        match name:
+            case "VTKFile":
+                found.root = attributes
+            case "StructuredGrid":
+                found.whole = _extent(attributes.get("WholeExtent", ""))
+            case "Piece" if found.whole:
+                found.piece = _extent(attributes.get("Extent", ""))
+                found.pieces += 1
+                _check_inside(found.piece, found.whole)
+            case "DataArray" if found.piece and found.section:
+                lengths = _lengths(found.piece)
+                if found.section == "CellData":
+                    lengths = tuple(max(length - 1, 1) for length in lengths)
+                found.arrays.append(_Array(attributes, prod(lengths)))
+                found.open_array = True
+            case "AppendedData":
+                found.appended = attributes
+                found.appended_at = parser.CurrentByteIndex
+            case _ if name in _SECTIONS:
+                found.section = name
+
+    def end(name: str) -> None:
+        found.open_array = False
+        if name in _SECTIONS:
+            found.section = ""
+
+    def text(characters: str) -> None:
+        if found.open_array:
+            array = found.arrays[-1]
+            array.characters += len(characters)
+            if len(array.text) < _KEPT:
+                array.text += "".join(characters.split())[:_KEPT]
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    try:
+        with path.open("rb") as file:
+            read = 0
+            while found.appended is None and (chunk := file.read(_CHUNK)):
+                parser.Parse(chunk)
+                read += len(chunk)
+                if found.appended is None and read - parser.CurrentByteIndex > _LONGEST_TAG:
+                    raise TooLargeError(
+                        f"expected tags and comments of at most {number(_LONGEST_TAG)} bytes, got a longer one"
+                    )
+            if found.appended is None:
+                parser.Parse(b"", True)
+    except expat.ExpatError as error:
+        if found.appended is None:  # what is appended may be bytes, which are no XML
+            raise FormatError(f"expected an XML file of VTK, got {error}") from None
+    return found
+
+
+def _extent(text: str) -> tuple[int, ...]:
+    words = text.split()
+    if len(words) != 6 or not all(re.fullmatch(r"-?\d{1,9}", word) for word in words):
+        raise FormatError(f"expected an extent of six whole numbers, got {text[:80]!r}")
+    extent = tuple(map(int, words))
+    if min(_lengths(extent)) < 1:
+        raise FormatError(f"expected an extent from lower to higher numbers, got {text!r}")
+    return extent
+
+
+def _lengths(extent: Sequence[int]) -> tuple[int, ...]:
+    return tuple(extent[axis + 1] - extent[axis] + 1 for axis in (0, 2, 4))
+
+
+def _check_inside(piece: Sequence[int], whole: Sequence[int]) -> None:
+    inside = all(whole[axis] <= piece[axis] and piece[axis + 1] <= whole[axis + 1] for axis in (0, 2, 4))
+    if not inside:
+        raise FormatError(f"expected pieces inside the WholeExtent {whole}, got {piece}")
+
+
+def _check_array(path: Path, found: _Found, array: _Array) -> None:
+    """Check that what stands before the bytes of an array says as many as its type and extent do."""
+    form = array.attributes.get("format", "ascii")
+    if form == "ascii":
+        return
+    if form not in ("binary", "appended"):
+        raise FormatError(f"expected array {array.name!r} as ascii, binary or appended, got {form[:40]!r}")
+    blocks = bool(found.root.get("compressor"))
+    wide = found.root.get("header_type", "UInt32") == "UInt64"
+    code = ("<" if found.root.get("byte_order") != "BigEndian" else ">") + ("Q" if wide else "I")
+    head, room = _head(path, found, array, struct.calcsize(code) * (3 if blocks else 1))
+    if head is None:
+        raise FormatError(f"expected array {array.name!r} inside the file, got none there")
+    if blocks:
+        count, length, last = struct.unpack(f"{code[0]}3{code[1]}", head)
+        said = (count - (last > 0)) * length + last if count else 0
+        least = (3 + count) * struct.calcsize(code)
+    else:
+        said = struct.unpack(code, head)[0]
+        least = said + struct.calcsize(code)
+    if said != array.promised():
+        raise FormatError(
+            f"expected array {array.name!r} of {number(array.promised())} bytes by its extent and type, got a header "
+            f"that says {number(said)}"
+        )
+    if least > room:
+        raise FormatError(f"expected array {array.name!r} of at least {number(least)} bytes, got {number(room)}")
+
+
+def _head(path: Path, found: _Found, array: _Array, length: int) -> tuple[bytes | None, int]:
+    """The first bytes of an array, decoded, or None where the file has none; and for how many there is room."""
+    in_base64 = 4 * ((length + 2) // 3)
+    if array.attributes.get("format") == "binary":
+        return _decoded(array.text.encode("ascii", "replace")[:in_base64], length), array.characters * 3 // 4
+    offset = array.attributes.get("offset", "")
+    if found.appended is None or not re.fullmatch(r"\d{1,18}", offset):
+        return None, 0
+    raw = found.appended.get("encoding", "base64") == "raw"
+    with path.open("rb") as file:
+        file.seek(found.appended_at)
+        start = file.read(1 << 12)
+        mark = start.find(b"_", start.find(b">"))
+        place = found.appended_at + mark + 1 + int(offset)
+        room = path.stat().st_size - place
+        if mark < 0 or room <= 0:
+            return None, 0
+        file.seek(place)
+        content = file.read(length if raw else in_base64)
+    if raw:
+        return content if len(content) == length else None, room
+    return _decoded(content, length), room * 3 // 4
+
+
+def _decoded(content: bytes, length: int) -> bytes | None:
+    try:
+        decoded = base64.b64decode(content)
+    except binascii.Error:
+        return None
+    return decoded[:length] if len(decoded) >= length else None

@@ -1,0 +1,1 @@
+"""Where points, levels, subbands and tiles lie, and how blocks are connected: geometry without values."""

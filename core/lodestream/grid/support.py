@@ -1,0 +1,102 @@
+"""What a window of a surface needs: the tiles whose coefficients have a part in its points.
+
+From the finest level down, an axis is followed by the indices that are needed: of samples first, then of the nodes and
+details that give them back (`docs/mathematics.md`: an update takes ten details on either side, a third step two nodes
+to the left of a detail and three to the right).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionError
+from ..target import Region
+from .axis import AxisStep
+from .layout import Layout
+
+__all__ = ["check_region", "coefficients_needed", "needed_tiles"]
+
+#: Details that an update takes on either side of a node.
+_UPDATE = 10
+#: Nodes that a third step takes, counted from the detail.
+_PREDICT = np.arange(-2, 4)
+
+Mask = NDArray[np.bool_]
+
+
+def check_region(region: Region, shape: tuple[int, int]) -> None:
+    """Refuse a region that is not inside a surface.
+
+    Raises
+    ------
+    OptionError
+        When it has no point, or points outside.
+    """
+    for (start, stop), length, name in zip(region, shape, ("rows", "columns"), strict=True):
+        if not 0 <= start < stop <= length:
+            raise OptionError(f"expected {name} within 0:{length}, at least one, got {start}:{stop}")
+
+
+def needed_tiles(layout: Layout, region: Region) -> Mask:
+    """Which tiles of a surface of one grid the points of a region need, parents included; bool, shape (tile,).
+
+    Parents are there because the contexts of a tile's segments look at them.
+    """
+    needed = np.zeros(len(layout.tiles), np.bool_)
+    needed[0] = True
+    shape = layout.grids[0].shape
+    samples = [np.zeros(n, np.bool_) for n in shape]
+    for axis, (start, stop) in enumerate(region):
+        samples[axis][start:stop] = True
+    for level in range(layout.levels, 0, -1):
+        # Coefficients along each axis: nodes first, details after them.
+        lines = [coefficients_needed(s, step) for s, step in zip(samples, layout.steps(0, level), strict=True)]
+        for number in layout.tiles_of(level):
+            for band in layout.tiles[number].bands:
+                if lines[0][slice(*band.rows)].any() and lines[1][slice(*band.columns)].any():
+                    needed[number] = True
+        samples = [line[: step.coarse] for line, step in zip(lines, layout.steps(0, level), strict=True)]
+    for number in range(len(layout.tiles) - 1, -1, -1):
+        if needed[number] and layout.tiles[number].parent >= 0:
+            needed[layout.tiles[number].parent] = True
+    return needed
+
+
+def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
+    """Which nodes (first) and details (after them) of a step give samples of an axis back; bool, shape (length,)."""
+    if not step.midpoints:
+        return samples.copy()
+    line = np.zeros(step.length, np.bool_)
+    if step.tail:
+        line[step.coarse - 1] = samples[-1]
+        if not samples[:-1].any():
+            return line
+    run = samples[:-1] if step.tail else samples
+    inner = run[1::2]
+    nodes = np.zeros(step.run, np.bool_)
+    nodes |= run[::2]
+    nodes[: inner.size] |= inner
+    after = np.roll(inner, 1) if step.wraps else np.concatenate([[False], inner])
+    nodes |= after[: step.run]
+    details = np.zeros(step.midpoints, np.bool_)
+    details |= inner
+    around = (np.flatnonzero(nodes)[:, None] + np.arange(-_UPDATE, _UPDATE)).ravel()
+    table = step.extension(_UPDATE)
+    inside = (around >= 0) & (around < step.midpoints)
+    details[around[inside]] = True
+    beyond = np.concatenate([around[around < 0], around[around >= step.midpoints] - step.midpoints]) + _UPDATE
+    mirrored, sign = table[beyond].T
+    details[mirrored[sign != 0]] = True
+    places = (np.flatnonzero(details)[:, None] + _PREDICT).ravel()
+    if step.wraps:
+        nodes[places % step.run] = True
+    else:
+        nodes[places[(places >= 0) & (places < step.run)]] = True
+        if places.min() < 0:
+            nodes[:3] = True  # from which those beyond the end are extrapolated
+        if places.max() >= step.run:
+            nodes[-3:] = True
+    line[: step.run] |= nodes
+    line[step.coarse :] = details
+    return line

@@ -1,0 +1,82 @@
+"""The parts of a plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ..container.model import ByteRange
+
+__all__ = ["Ended", "Mark", "Plan"]
+
+#: Why a stream ends; `plan` knows the first five, the others happen on the way.
+Ended = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A state that the receiver reaches when it has received ``sent`` bytes of the plan's ranges.
+
+    ``number`` is that of the layer (quality order) or level (level order). ``bytes`` counts what is held of the
+    container.
+    """
+
+    sent: int
+    number: int
+    level: int
+    bytes: int
+    rms: float
+    max_error: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Slices of a container in sending order, without what is held.
+
+    Attributes
+    ----------
+    before : tuple of ByteRange
+        Service slices that must come first: the index, if segments are sent without the tables of their layers.
+    ranges : tuple of ByteRange
+        Slices of the surface. Together with what is held of them they are the state's ``bytes``.
+    after : tuple of ByteRange
+        The metadata.
+    marks : tuple of Mark
+        States on the way, the last one at the end; states with a ``sent`` of 0 are held already.
+    ended : str
+        Why the plan ends.
+    prefix : bool
+        Whether all ``ranges`` together are a prefix of the file, which needs no index.
+    """
+
+    before: tuple[ByteRange, ...]
+    ranges: tuple[ByteRange, ...]
+    after: tuple[ByteRange, ...]
+    marks: tuple[Mark, ...]
+    ended: Ended
+    prefix: bool = False
+
+    @property
+    def slices(self) -> tuple[ByteRange, ...]:
+        """All slices, in order."""
+        return (*self.before, *self.ranges, *self.after)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the surface's slices, sent or held."""
+        return self.marks[-1].bytes
+
+    @property
+    def level(self) -> int:
+        """Finest level with a decoded segment at the end."""
+        return self.marks[-1].level
+
+    @property
+    def rms(self) -> float:
+        """RMS error at the end."""
+        return self.marks[-1].rms
+
+    @property
+    def max_error(self) -> float:
+        """Maximum error at the end."""
+        return self.marks[-1].max_error

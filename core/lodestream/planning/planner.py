@@ -1,0 +1,234 @@
+"""What to send of a container, and in which order: one pure function for server and client.
+
+Only slices of the file are ever sent. So WebSocket streams, HTTP Range, resuming and caching share this module.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import groupby
+
+from ..container.model import ByteRange, Index
+from ..errors import OptionError
+from ..target import Target
+from .byte_ranges import RangeSet
+from .plan import Ended, Mark, Plan
+from .region_first import region_first
+from .selection import select, wish_of
+
+__all__ = ["Ended", "Mark", "Plan", "plan"]
+
+
+def plan(
+    index: Index,
+    target: Target = Target(),  # noqa: B008 - an immutable value
+    held: RangeSet | None = None,
+) -> Plan:
+    """The slices that a receiver with this target gets, if it holds these bytes of the container.
+
+    Raises
+    ------
+    OptionError
+        If there is no such level or region, or not even the first layer fits into the allowed bytes.
+    """
+    chosen = _whole(index, target)
+    if target.first is not None:
+        chosen = region_first(index, chosen, target.first)
+    return _less(chosen, held) if held else chosen
+
+
+def _whole(index: Index, target: Target) -> Plan:
+    if target.region is not None or target.attributes is not None:
+        return _selected(index, target)
+    if target.level is not None:
+        finest = index.header.levels
+        if target.level > finest:
+            raise OptionError(f"expected a level of 0 to {finest}, got {target.level}")
+        if target.level < finest:
+            if target.order == "level":
+                return _by_level(index, target, target.level)
+            return _slices_of_layers(index, target.level)
+    if target.order == "level":
+        return _by_level(index, target, index.header.levels)
+    return _prefix(index, target)
+
+
+def _prefix(index: Index, target: Target) -> Plan:
+    """Quality order: the file's own."""
+    marks = [Mark(r.end, r.number, r.level, r.end, r.rms, r.max_error) for r in index.layers]
+    if index.exactness:
+        marks.append(_exact(index, len(marks), index.surface_end))
+    marks, ended = _until(marks, target, index.header.extent)
+    return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended, prefix=True)
+
+
+def _exact(index: Index, number: int, held: int) -> Mark:
+    last = index.levels[-1]
+    return Mark(held, number, last.level, held, last.rms, last.max_error)
+
+
+def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark], Ended]:
+    """The marks up to the first limit met."""
+    rms, worst = (None if t is None else t.absolute(extent) for t in (target.until_rms, target.until_max))
+    kept: list[Mark] = []
+    for mark in marks:
+        if target.max_bytes is not None and mark.bytes > target.max_bytes:
+            if not kept:
+                raise OptionError(
+                    f"expected at least the {mark.bytes} bytes of the first layer or level, got {target.max_bytes}"
+                )
+            return kept, "bytes"
+        kept.append(mark)
+        if mark is marks[-1]:
+            break
+        if rms is not None and mark.rms <= rms:
+            return kept, "rms"
+        if worst is not None and mark.max_error <= worst:
+            return kept, "max"
+    return kept, "complete"
+
+
+def _slices_of_layers(index: Index, level: int) -> Plan:
+    """Quality order of the levels up to one: of each layer the segments that belong to them, which stand together."""
+    tiles = index.header.layout.tiles
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    for layer, segments in groupby(index.segments, key=lambda segment: segment.layer):
+        for segment in segments:
+            if tiles[segment.tile].level <= level:
+                _append(ranges, segment.range)
+                held += segment.range.length
+        record = index.layers[layer]
+        if record.level <= level:
+            marks.append(Mark(held, layer, record.level, held, record.rms, record.max_error))
+    state = index.levels[level]
+    marks = [mark for mark in marks if mark.sent < held]
+    marks.append(Mark(held, level, level, held, state.rms, state.max_error))
+    return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), "level")
+
+
+def _by_level(index: Index, target: Target, level: int) -> Plan:
+    """Level order: level by level, the segments of all layers; the complete surface also has its exactness."""
+    tiles = index.header.layout.tiles
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    of_level: list[list[ByteRange]] = [[] for _ in index.levels]
+    for segment in index.segments:
+        of_level[tiles[segment.tile].level].append(segment.range)
+    for state, places in zip(index.levels[: level + 1], of_level, strict=False):
+        for place in places:
+            _append(ranges, place)
+            held += place.length
+        if state.level == index.header.levels and index.exactness:
+            _append(ranges, index.exactness)
+            held += index.exactness.length
+        marks.append(Mark(held, state.level, state.level, held, state.rms, state.max_error))
+    if target.level is not None:
+        return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
+    marks, ended = _until(marks, target, index.header.extent)
+    return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+
+
+def _selected(index: Index, target: Target) -> Plan:
+    """A window, or some attributes only: segments in file order or level by level, then pieces of exactness."""
+    chosen = select(index, wish_of(target))
+    tiles, partial = index.header.layout.tiles, target.region is not None
+    finest = index.header.levels if target.level is None else target.level
+    if finest > index.header.levels:
+        raise OptionError(f"expected a level of 0 to {index.header.levels}, got {finest}")
+    segments = [s for s in chosen.segments if tiles[s.tile].level <= finest]
+    if target.order == "level":
+        segments.sort(key=lambda segment: tiles[segment.tile].level)
+    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    marks: list[Mark] = []
+    level = 0
+    ended: Ended
+    for number, segment in enumerate(segments):
+        _append(ranges, segment.range)
+        held += segment.range.length
+        own = tiles[segment.tile].level
+        level = max(level, own)
+        after = segments[number + 1] if number + 1 < len(segments) else None
+        if target.order == "level":
+            if after is None or tiles[after.tile].level > own:
+                state = index.levels[own]
+                marks.append(_mark(held, own, own, state.rms, state.max_error, partial))
+        elif after is None or after.layer > segment.layer:
+            # Layers of which nothing is wanted are there as well.
+            record = index.layers[-1 if after is None else after.layer - 1]
+            if target.level is None or level <= target.level:
+                marks.append(_mark(held, record.number, level, record.rms, record.max_error, partial))
+    if finest < index.header.levels:
+        state = index.levels[finest]
+        last, ended = _mark(held, finest, finest, state.rms, state.max_error, partial), "level"
+    else:
+        for piece in chosen.pieces.values():
+            _append(ranges, piece.range)
+            held += piece.range.length
+        state, number = index.levels[-1], len(index.layers) if chosen.pieces else len(index.layers) - 1
+        last, ended = Mark(held, number, finest, held, state.rms, state.max_error), "complete"
+    marks = [mark for mark in marks if mark.sent < held] + [last]
+    if target.level is None:
+        marks, ended = _until(marks, target, index.header.extent)
+    return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+
+
+def _mark(held: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
+    unknown = float("nan")
+    return Mark(held, number, level, held, *((unknown, unknown) if partial else (rms, max_error)))
+
+
+def _level_end(index: Index, level: int) -> Ended:
+    return "complete" if level == index.header.levels else "level"
+
+
+def _append(ranges: list[ByteRange], place: ByteRange) -> None:
+    if ranges and ranges[-1].end == place.offset:
+        ranges[-1] = ByteRange(ranges[-1].offset, ranges[-1].length + place.length)
+    else:
+        ranges.append(place)
+
+
+def _cut(ranges: list[ByteRange], length: int) -> tuple[ByteRange, ...]:
+    kept = []
+    for place in ranges:
+        taken = min(place.length, length)
+        if taken:
+            kept.append(ByteRange(place.offset, taken))
+        length -= taken
+    return tuple(kept)
+
+
+def _less(chosen: Plan, held: RangeSet) -> Plan:
+    """The plan without what is held; each mark stands where the last missing byte before it does."""
+    missing = [(place, _missing(place, held)) for place in chosen.ranges]
+    marks: list[Mark] = []
+    todo = iter(chosen.marks)
+    mark = next(todo, None)
+    planned = sent = 0
+    for place, gaps in missing:
+        # Marks and gaps both go forward: each gap is looked at once, however many marks there are.
+        passed = 0
+        while mark is not None and mark.sent <= planned + place.length:
+            end = place.offset + mark.sent - planned
+            while passed < len(gaps) and gaps[passed].end <= end:
+                sent += gaps[passed].length
+                passed += 1
+            begun = max(end - gaps[passed].offset, 0) if passed < len(gaps) else 0
+            marks.append(replace(mark, sent=sent + begun))
+            mark = next(todo, None)
+        planned += place.length
+        sent += sum(gap.length for gap in gaps[passed:])
+    before, after = (
+        tuple(gap for place in part for gap in _missing(place, held)) for part in (chosen.before, chosen.after)
+    )
+    ranges = tuple(gap for _, gaps in missing for gap in gaps)
+    # What is held beyond a state that has no figures of its own counts too.
+    ahead = chosen.bytes - sent
+    marks = [replace(mark, bytes=ahead + mark.sent) if math.isnan(mark.rms) else mark for mark in marks]
+    return replace(chosen, before=before, ranges=ranges, after=after, marks=tuple(marks))
+
+
+def _missing(place: ByteRange, held: RangeSet) -> list[ByteRange]:
+    return [ByteRange(*gap) for gap in held.missing(place.offset, place.length)]

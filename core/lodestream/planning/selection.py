@@ -1,0 +1,142 @@
+"""Which segments and pieces of a container are needed for a window or for some attributes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.capacity import Capacity
+from ..container.chunks import windows
+from ..container.model import Header, Index, Piece, Segment
+from ..errors import OptionError
+from ..grid.support import check_region, needed_tiles
+from ..library import why_missing
+from ..target import Region, Target
+
+__all__ = ["Selection", "Wish", "restored", "select", "wish_of"]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """The requested part of a surface: a window of its points (None: all) and attributes by name (None: all)."""
+
+    region: Region | None = None
+    attributes: tuple[str, ...] | None = None
+
+    def check(self, header: Header) -> None:
+        """Refuse a region or attributes that the surface does not have.
+
+        Raises
+        ------
+        OptionError
+            If the region is not inside the surface, or there is no such attribute.
+        """
+        if self.region is not None:
+            if len(header.blocks) > 1:
+                raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
+            check_region(self.region, header.shape)
+        names = [kind.name for kind in header.attributes]
+        for name in self.attributes or ():
+            if name not in names:
+                raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
+
+    def channels(self, header: Header) -> NDArray[np.bool_]:
+        """Which channels are wanted."""
+        chosen = [True] * header.point_channels
+        for kind in header.attributes:
+            chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
+        return np.array(chosen)
+
+    def check_size(self, header: Header, capacity: Capacity, level: int | None = None) -> None:
+        """Refuse what takes more memory than there may be.
+
+        Parameters
+        ----------
+        header : Header
+        capacity : Capacity
+        level : int or None
+            The finest level that is wanted, if not all of them.
+
+        Raises
+        ------
+        TooLargeError
+        """
+        sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
+        layout = header.layout
+        # Without the compiled kernels a window is cut out of the whole surface.
+        if self.region is not None and header.arrangement is None and why_missing() is None:
+            rows, columns = restored(header, self.region)
+            shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
+        elif level is not None and level < layout.levels:
+            shapes = [layout.shape(grid, level) for grid in range(len(layout.grids))]
+        else:
+            shapes = [shape for shape, _ in header.blocks]
+        vertices = sum(rows * columns for rows, columns in shapes)
+        masked = sum(rows * columns for (rows, columns), _ in header.blocks) if header.masked else 0
+        capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
+
+    def tiles(self, header: Header) -> NDArray[np.bool_]:
+        """Which tiles are wanted."""
+        if self.region is None:
+            return np.ones(len(header.layout.tiles), np.bool_)
+        if header.arrangement is not None:
+            # A block that meets itself: what is shared may lie on the other side.
+            return np.ones(len(header.layout.tiles), np.bool_)
+        return needed_tiles(header.layout, restored(header, self.region))
+
+
+def restored(header: Header, region: Region) -> Region:
+    """What has to be decoded for a region of the only block: a piece of exactness restores all of its own window."""
+    if not header.corrected:
+        return region
+    sizes = [1 << exponent for exponent in header.piece]
+    rows, columns = (
+        (start // size * size, min(-(-stop // size) * size, length))
+        for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
+    )
+    return rows, columns
+
+
+def wish_of(target: Target) -> Wish:
+    """The wish in a target."""
+    return Wish(target.region, target.attributes)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Segments in file order, and pieces of exactness by number, that a wish takes.
+
+    ``whole`` says that these are all of the container.
+    """
+
+    segments: tuple[Segment, ...]
+    pieces: dict[int, Piece]
+    whole: bool
+
+
+def select(index: Index, wish: Wish) -> Selection:
+    """What of a container a wish takes.
+
+    Raises
+    ------
+    OptionError
+        When the surface does not have it.
+    """
+    header = index.header
+    wish.check(header)
+    if wish.region is None and wish.attributes is None:
+        return Selection(index.segments, {k: p for k, p in enumerate(index.pieces) if p.range.length}, True)
+    tiles, channels = wish.tiles(header), wish.channels(header)
+    segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
+    pieces = {}
+    if index.pieces:
+        for number, (window, piece) in enumerate(zip(windows(header), index.pieces, strict=True)):
+            touches = wish.region is None or all(
+                start < b and a < stop
+                for (start, stop), (a, b) in zip(wish.region, (window.rows, window.columns), strict=True)
+            )
+            if piece.range.length and touches and channels[window.channel]:
+                pieces[number] = piece
+    return Selection(segments, pieces, False)

@@ -1,0 +1,206 @@
+"""Errors of windows: for each cell of a surface and each layer a bound of its errors, in an optional section.
+
+A reader that needs a window can tell from them how many layers are enough for it, before it has any of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.fields import FieldReader, FieldWriter
+from ..container.frames import whole_section
+from ..container.model import Header, Index
+from ..container.sections import check_of
+from ..errors import CorruptStreamError, OptionError
+from ..grid.support import check_region
+from ..kernels import PART_COLUMNS, PART_ROWS
+from ..target import Region
+
+__all__ = [
+    "CELL",
+    "KIND",
+    "WindowErrors",
+    "is_divided",
+    "layer_codes",
+    "no_errors",
+    "parse_window_errors",
+    "read_window_errors",
+    "serialize_window_errors",
+]
+
+#: Kind of the section.
+KIND = 128
+
+#: Rows and columns of the cells that this program writes, as exponents of two.
+CELL = 8, 8
+# A code is a step of an eighth of an octave: 2**(-k / 8) over 2**16, rounded up.
+_STEPS = 65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734
+_LARGEST = 4.0  # times the extent: code 0
+_NOTHING = 255
+_FRACTIONS = np.array([_LARGEST * _STEPS[k % 8] * 2.0 ** (-16 - k // 8) for k in range(_NOTHING)] + [0.0])
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WindowErrors:
+    """Bounds of the errors of each cell of a surface after each layer.
+
+    Attributes
+    ----------
+    header : Header
+    cell : (int, int)
+        Rows and columns of a cell, as exponents of two.
+    codes : uint8 array, shape (cell, layer, 2)
+        RMS and maximum of the distances in the cells of each block, row by row.
+    """
+
+    header: Header
+    cell: tuple[int, int]
+    codes: NDArray[np.uint8]
+
+    def bounds(self, region: Region, layer: int) -> tuple[float, float]:
+        """What RMS and maximum error of a window of the only block do not exceed after a layer.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int))
+            Rows and columns, half-open.
+        layer : int
+
+        Raises
+        ------
+        OptionError
+            If there is no such region or layer.
+        """
+        if len(self.header.blocks) > 1:
+            raise OptionError(f"expected a surface of one block for a region, got {len(self.header.blocks)} blocks")
+        check_region(region, self.header.shape)
+        if not 0 <= layer < self.codes.shape[1]:
+            raise OptionError(f"expected a layer of 0 to {self.codes.shape[1] - 1}, got {layer}")
+        mask = self.header.masks[0]
+        (rows, columns), shape = region, self.header.shape
+        window = tuple(slice(a >> e, (b - 1 >> e) + 1) for (a, b), e in zip(region, self.cell, strict=True))
+        counts = _cell_counts(shape, self.cell, mask)
+        fractions = _FRACTIONS[self.codes[:, layer].reshape(*counts.shape, 2)[window]]
+        inside = (rows[1] - rows[0]) * (columns[1] - columns[0])
+        if mask is not None:
+            inside = int(np.count_nonzero(mask[slice(*rows), slice(*columns)]))
+        if not inside:
+            return 0.0, 0.0
+        squares = float((counts[window] * fractions[..., 0] ** 2).sum())
+        # Rounding of these sums is far below the steps of the codes; a bound stays one all the same.
+        rms = math.sqrt(squares / inside) * (1 + 2.0**-40)
+        worst = float(fractions[..., 1].max())
+        return min(rms, worst) * self.header.extent, worst * self.header.extent
+
+
+def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+    """How many valid points each cell of a block has, shape (row of cells, column of cells)."""
+    edges = [np.arange(0, length, 1 << exponent) for length, exponent in zip(shape, cell, strict=True)]
+    if mask is None:
+        rows, columns = (np.diff(starts, append=length) for starts, length in zip(edges, shape, strict=True))
+        return np.multiply.outer(rows, columns)
+    across = np.add.reduceat(mask, edges[1], axis=1, dtype=np.int64)
+    counts: NDArray[np.int64] = np.add.reduceat(across, edges[0], axis=0)
+    return counts
+
+
+def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
+    """The codes of the cells of the only block after a layer, shape (cell, 2).
+
+    Parameters
+    ----------
+    figures : float64, shape (row of parts, column of parts, 2)
+        Sums and largest of the squared distances in parts of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
+    header : Header
+
+    Returns
+    -------
+    uint8 array, or None where an error is larger than codes can tell
+    """
+    together = (1 << CELL[0]) // PART_ROWS, (1 << CELL[1]) // PART_COLUMNS
+    places = [np.arange(0, count, size) for count, size in zip(figures.shape, together, strict=False)]
+
+    def gathered(combine: np.ufunc, own: Floats) -> Floats:
+        down: Floats = combine.reduceat(own, places[0], axis=0)
+        cells: Floats = combine.reduceat(down, places[1], axis=1)
+        return cells.ravel()
+
+    counts = _cell_counts(header.shape, CELL, header.masks[0]).ravel()
+    rms = np.sqrt(gathered(np.add, figures[..., 0]) / np.maximum(counts, 1))
+    errors = np.stack([rms, np.sqrt(gathered(np.maximum, figures[..., 1]))], axis=1)
+    known = header.extent * _FRACTIONS[:_NOTHING]
+    if errors.max() > known[0]:
+        return None
+    # The last of the falling bounds that is not below.
+    codes = np.searchsorted(-known, -errors, side="right") - 1
+    return np.where(errors == 0, _NOTHING, codes).astype(np.uint8)
+
+
+def is_divided(header: Header) -> bool:
+    """Whether the only block has more than one cell."""
+    return any(length > 1 << exponent for length, exponent in zip(header.shape, CELL, strict=True))
+
+
+def no_errors(header: Header) -> NDArray[np.uint8]:
+    """As `layer_codes` of a layer without errors."""
+    count = _cell_counts(header.shape, CELL, None).size
+    return np.full((count, 2), _NOTHING, np.uint8)
+
+
+def serialize_window_errors(layers: Sequence[NDArray[np.uint8]]) -> bytes:
+    """Payload of the section from the codes of each layer, see `layer_codes`."""
+    out = FieldWriter()
+    out.byte(CELL[0] | CELL[1] << 4)
+    for row in np.stack(layers, axis=1):
+        out.data += row.tobytes()
+        out.pack("H", check_of(row.tobytes()))
+    return bytes(out.data)
+
+
+def parse_window_errors(payload: memoryview, offset: int, header: Header) -> WindowErrors:
+    """Undo `serialize_window_errors`, of a section whose payload stands at ``offset``.
+
+    Raises
+    ------
+    CorruptStreamError
+        When it is not as long as the header says, or a row does not match its check.
+    """
+    fields = FieldReader(payload, offset)
+    exponents = fields.byte()
+    cell = exponents & 15, exponents >> 4
+    cells = sum((-(-rows >> cell[0])) * (-(-columns >> cell[1])) for (rows, columns), _ in header.blocks)
+    size = 2 * header.layer_count
+    if fields.left != cells * (size + 2):
+        raise CorruptStreamError(f"expected errors of {cells} cells of {size + 2} bytes, got {fields.left}", offset)
+    rows = np.frombuffer(fields.take(fields.left), np.uint8).reshape(cells, size + 2)
+    for number, row in enumerate(rows):
+        if check_of(row[:size].tobytes()) != int.from_bytes(row[size:].tobytes(), "little"):
+            raise CorruptStreamError(f"expected errors of cell {number} that match their check, got others", offset)
+    return WindowErrors(header, cell, rows[:, :size].reshape(cells, header.layer_count, 2))
+
+
+def read_window_errors(index: Index, read: Callable[[int, int], bytes]) -> WindowErrors | None:
+    """The errors of windows of a container; None: it does not tell them.
+
+    Parameters
+    ----------
+    index : Index
+    read : callable (offset, length) -> bytes
+
+    Raises
+    ------
+    CorruptStreamError
+    """
+    for optional in index.optional:
+        if optional.kind == KIND:
+            place = optional.range
+            frame = whole_section(read(place.offset, place.length), place.offset, KIND)
+            return parse_window_errors(frame.payload, frame.payload_offset, index.header)
+    return None

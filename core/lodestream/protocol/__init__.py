@@ -1,0 +1,1 @@
+"""Messages of a stream, their bytes, and the state machine of a connection. No I/O."""

@@ -1,0 +1,277 @@
+"""Messages as bytes: one MessagePack map each, with a ``type``.
+
+Keys that a receiver does not know are ignored, so that later versions can add some; everything else is checked, since
+the other side is a stranger.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import reprlib
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import msgpack
+
+from ..errors import OptionError, UnsupportedVersionError
+from ..target import Region, Target, Tolerance
+from .messages import (
+    MAX_DATA,
+    MAX_HELD,
+    MAX_MESSAGE,
+    VERSION,
+    Bye,
+    Credit,
+    End,
+    Error,
+    Event,
+    Header,
+    Layer,
+    MessageError,
+    Open,
+    Segments,
+    Stop,
+)
+
+__all__ = ["parse", "serialize"]
+
+# Integers stay exact in every language that reads them as a double.
+_MAX_INTEGER = 2**53
+
+_Read: TypeAlias = Callable[[Any], Any]
+
+
+class _MismatchError(Exception):
+    """What a field should have been."""
+
+
+def _integer(value: Any, least: int = 0) -> int:
+    # bool is an int to Python and not to anybody else.
+    if type(value) is not int or not least <= value <= _MAX_INTEGER:
+        raise _MismatchError(f"an integer from {least} to 2^53")
+    return value
+
+
+def _positive(value: Any) -> int:
+    return _integer(value, 1)
+
+
+def _number(value: Any) -> float:
+    # Other languages write 2.0 as the integer 2.
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise _MismatchError("a finite number")
+    return float(value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise _MismatchError("text")
+    return value
+
+
+def _data(value: Any) -> bytes:
+    if not isinstance(value, bytes) or not 0 < len(value) <= MAX_DATA:
+        raise _MismatchError(f"1 to {MAX_DATA} bytes")
+    return value
+
+
+def _digest(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch("[0-9a-f]{64}", value):
+        raise _MismatchError("64 hexadecimal digits")
+    return value
+
+
+def _held(value: Any) -> tuple[tuple[int, int], ...]:
+    if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
+        raise _MismatchError("a list of [offset, length]")
+    if len(value) > MAX_HELD:
+        raise MessageError("bad-held", f"expected open.held to be at most {MAX_HELD} ranges, got {len(value)}")
+    return tuple((_integer(offset), _positive(length)) for offset, length in value)
+
+
+def _place(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _MismatchError("[offset, length]")
+    return _integer(value[0]), _positive(value[1])
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _MismatchError("true or false")
+    return value
+
+
+def _tolerance(value: Any) -> Tolerance:
+    if not isinstance(value, list) or len(value) != 2 or not isinstance(value[1], bool):
+        raise _MismatchError("[number, whether it is relative]")
+    return Tolerance(_number(value[0]), value[1])
+
+
+def _region(value: Any) -> Region:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _MismatchError("[[first row, past the last], [first column, past the last]]")
+    spans = []
+    for span in value:
+        if not isinstance(span, list) or len(span) != 2:
+            raise _MismatchError("[[first row, past the last], [first column, past the last]]")
+        spans.append((_integer(span[0]), _integer(span[1])))
+    return spans[0], spans[1]
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise _MismatchError("a list of names")
+    return tuple(value)
+
+
+def _error(value: Any) -> float:
+    return math.nan if value is None else _number(value)
+
+
+_TARGET: Mapping[str, _Read] = {
+    "level": _integer,
+    "until_rms": _tolerance,
+    "until_max": _tolerance,
+    "max_bytes": _integer,
+    "order": _text,
+    "region": _region,
+    "attributes": _names,
+    "first": _region,
+}
+
+
+def _target(value: Any) -> Target:
+    if not isinstance(value, dict):
+        raise _MismatchError("a map")
+    return Target(
+        **{
+            name: _value(f"target.{name}", read, value[name])
+            for name, read in _TARGET.items()
+            if value.get(name) is not None
+        }
+    )
+
+
+_FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
+    Open: {"target": _target, "credit": _integer, "held": _held, "container": _digest, "token": _text},
+    Credit: {"bytes": _positive},
+    Stop: {},
+    Bye: {},
+    Header: {
+        "container": _digest,
+        "size": _integer,
+        "planned": _integer,
+        "extent": _number,
+        "index": _place,
+        "metadata": _place,
+        "prefix": _flag,
+    },
+    Segments: {"offset": _integer, "data": _data},
+    Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _error, "max": _error},
+    End: {"why": _text},
+    Error: {"code": _text, "title": _text, "detail": _text},
+}
+
+_TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
+
+#: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
+_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "token")}
+#: What is left out where it is not known.
+_UNKNOWN = {(Layer, "rms"), (Layer, "max")}
+
+
+def serialize(event: Event) -> bytes:
+    """The bytes of a message."""
+    fields: dict[str, Any] = {"type": event.type}
+    if isinstance(event, Open):
+        fields["version"] = VERSION
+    for name in _FIELDS[type(event)]:
+        value = _plain(getattr(event, name))
+        if value is not None:
+            fields[name] = value
+    packed: bytes = msgpack.packb(fields)
+    return packed
+
+
+def parse(message: bytes) -> Event:
+    """The event that a message stands for.
+
+    Raises
+    ------
+    MessageError
+        When it is too large, not one MessagePack map, of an unknown type, or has a field that is missing or wrong; with
+        the code ``bad-target`` when the fields of a target contradict each other.
+    UnsupportedVersionError
+        When an `Open` names another version of the protocol.
+    """
+    if len(message) > MAX_MESSAGE:
+        raise MessageError(
+            "message-too-large", f"expected a message of at most {MAX_MESSAGE} bytes, got {len(message)}"
+        )
+    fields = _unpack(message)
+    name = fields.get("type")
+    kind = _TYPES.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise MessageError("bad-message", f"expected a type out of {', '.join(_TYPES)}, got {_show(name)}")
+    if kind is Open:
+        _check_version(fields)
+    try:
+        return kind(**_values(kind, fields))
+    except OptionError as error:
+        raise MessageError("bad-target", str(error)) from None
+
+
+def _unpack(message: bytes) -> dict[str, Any]:
+    try:
+        fields = msgpack.unpackb(message, raw=False, strict_map_key=True)
+    # The decoder of MessagePack has no common base for what it raises on bytes that are not MessagePack.
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise MessageError(
+            "bad-message", f"expected one MessagePack map, got {len(message)} bytes that are not: {error}"
+        ) from None
+    if not isinstance(fields, dict):
+        raise MessageError("bad-message", f"expected a MessagePack map, got {_show(fields)}")
+    return fields
+
+
+def _check_version(fields: dict[str, Any]) -> None:
+    version = fields.get("version")
+    if type(version) is not int:
+        raise MessageError("bad-message", f"expected open.version to be an integer, got {_show(version)}")
+    if version != VERSION:
+        raise UnsupportedVersionError(f"expected version {VERSION} of the protocol, got version {version}")
+
+
+def _values(kind: type[Event], fields: dict[str, Any]) -> dict[str, Any]:
+    values = {}
+    for name, read in _FIELDS[kind].items():
+        if name in fields:
+            values[name] = _value(f"{kind.type}.{name}", read, fields[name])
+        elif (kind, name) in _UNKNOWN:
+            values[name] = math.nan
+        elif (kind, name) not in _OPTIONAL:
+            raise MessageError("bad-message", f"expected {kind.type}.{name}, got {_show(list(fields))}")
+    return values
+
+
+def _value(place: str, read: _Read, value: Any) -> Any:
+    try:
+        return read(value)
+    except _MismatchError as expected:
+        raise MessageError("bad-message", f"expected {place} to be {expected}, got {_show(value)}") from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Target):
+        chosen = {name: _plain(getattr(value, name)) for name in _TARGET}
+        return {name: item for name, item in chosen.items() if item is not None}
+    if isinstance(value, Tolerance):
+        return [value.value, value.relative]
+    # An error that is not known, of a window that is not complete.
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _show(value: Any) -> str:
+    # What a stranger sent may be long, deep or unprintable: it is shortened and escaped before it is repeated.
+    return reprlib.repr(value).encode("ascii", "backslashreplace").decode()

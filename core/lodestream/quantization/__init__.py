@@ -1,0 +1,1 @@
+"""From values to integers and back: the lattice of each channel, steps of bands, and errors measured."""

@@ -1,0 +1,230 @@
+"""Lattice coordinates into values, and their distances from the original without a picture in between."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from ..grid.connectivity import Arrangement, stored
+from ..grid.multiblock import VertexCounter
+from .lattice import Lattice
+from .measure import distances
+
+__all__ = ["Original", "coordinate_distances", "originals_of", "other_originals", "store_values"]
+
+Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
+
+#: Points in one call of a kernel, and parts of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
+_AT_ONCE = 1 << 20
+_PARTS = 16
+_EVERY = np.zeros(0, np.bool_)
+
+
+def store_values(lattice: Lattice, coordinates: Coordinates, points: NDArray[Any], channel: int) -> None:
+    """`Lattice.values` of coordinates, into a channel.
+
+    Parameters
+    ----------
+    coordinates : (int32 array of shape (row, column), int)
+        Over two to the power of the second.
+    points : C-contiguous array, shape (row, column, channel)
+    """
+    numbers, fraction = coordinates
+    for first in range(0, numbers.size, _AT_ONCE):
+        last = min(first + _AT_ONCE, numbers.size)
+        kernels.store_values(numbers, points, points.shape[2], channel, first, last, *_rule(lattice, fraction))
+
+
+def _rule(lattice: Lattice, fraction: int) -> tuple[bool, float, float, float]:
+    """What kernels take of a lattice: whether its rule is "decimal", origin, step, and the scale of coordinates."""
+    return lattice.rule == "decimal", lattice.origin, lattice.step, 2.0**-fraction
+
+
+@dataclass(frozen=True)
+class Original:
+    """The points of one part that pictures are compared with.
+
+    Attributes
+    ----------
+    points : C-contiguous array, shape (row, column, channel)
+        Finite, under holes too.
+    counted : bool, shape (row, column), or None
+        Which points errors are of; None: all.
+    """
+
+    points: NDArray[Any]
+    counted: NDArray[np.bool_] | None
+
+    @property
+    def count(self) -> int:
+        """Points that errors are of."""
+        if self.counted is None:
+            return int(self.points.shape[0] * self.points.shape[1])
+        return int(np.count_nonzero(self.counted))
+
+
+def originals_of(
+    arrangement: Arrangement | None, points: Sequence[NDArray[Any]], masks: Sequence[NDArray[np.bool_] | None]
+) -> list[Original]:
+    """What the pictures of each part are compared with; each vertex of several parts is counted in one of them.
+
+    Parameters
+    ----------
+    arrangement : Arrangement or None
+        None: there is one block, which is one part.
+    points : C-contiguous arrays, shape (row, column, channel), one for each block
+    masks : bool, shape (row, column), or None, one for each block
+        True where a point is valid.
+    """
+    if arrangement is None:
+        return [Original(points[0], masks[0])]
+    originals = []
+    counter = VertexCounter(arrangement)
+    for part in arrangement.parts:
+        mask = masks[part.block]
+        counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
+        counter.count(part, counted)
+        originals.append(Original(stored(part, points[part.block]), counted))
+    return originals
+
+
+def other_originals(
+    arrangement: Arrangement | None,
+    arrays: Sequence[Sequence[NDArray[Any]]],
+    masks: Sequence[NDArray[np.bool_] | None],
+    geometric: int,
+) -> list[tuple[list[Original], int]]:
+    """What the pictures of each channel that is no coordinate are compared with, and its number in those arrays.
+
+    Points count where they are valid and the channel is finite; those of several parts count in each of them.
+
+    Parameters
+    ----------
+    arrangement : Arrangement or None
+        None: there is one block, which is one part.
+    arrays : for each block its points, then its attributes
+        Shape (row, column, channel).
+    masks : bool, shape (row, column), or None, one for each block
+        True where a point is valid.
+    geometric : int
+        The first so many channels of the points are coordinates.
+    """
+    parts = None if arrangement is None else arrangement.parts
+    if parts is None:
+        valid = [masks[0]]
+    else:
+        own = [(part, masks[part.block]) for part in parts]
+        valid = [None if mask is None else stored(part, mask) for part, mask in own]
+    found = []
+    for number, array in enumerate(arrays[0]):
+        first = 0 if number else geometric
+        if first == array.shape[2]:
+            continue
+        points = [array] if parts is None else [stored(part, arrays[part.block][number]) for part in parts]
+        points = [np.ascontiguousarray(values) for values in points]
+        for channel in range(first, array.shape[2]):
+            every = zip(points, valid, strict=True)
+            found.append(([Original(values, _finite(values[..., channel], mask)) for values, mask in every], channel))
+    return found
+
+
+def _finite(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Where values are valid and finite; None: everywhere."""
+    if values.dtype.kind != "f":
+        return mask
+    finite: NDArray[np.bool_] = np.isfinite(values)
+    if mask is not None:
+        finite &= mask
+    return None if finite.all() else finite
+
+
+def coordinate_distances(
+    originals: Sequence[Original],
+    lattices: Sequence[Lattice],
+    coordinates: Sequence[NDArray[np.int32]],
+    fractions: Sequence[int],
+    channel: int = 0,
+    cells: list[NDArray[np.float64]] | None = None,
+) -> list[tuple[float, float]]:
+    """`distances` between points and the values of lattice coordinates.
+
+    Parameters
+    ----------
+    originals : one for each part
+    lattices : one for each channel that is compared, at most three
+    coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each part
+    fractions : int for each of these channels
+        Coordinates stand over two to this power.
+    channel : int
+        The first of the points' channels that are compared.
+    cells : list, optional
+        Is given, for each part, sums and largest of the squared distances in cells of `kernels.PART_ROWS` x
+        `kernels.PART_COLUMNS` points, float64, shape (row of cells, column of cells, 2), unless they are out of range.
+
+    Returns
+    -------
+    list of (rms, maximum)
+        Of the distances; and, where there are several channels, of each by itself.
+    """
+    dtype, count = originals[0].points.dtype, sum(original.count for original in originals)
+    if not count:
+        return [(0.0, 0.0)] * _kinds(len(lattices))
+    if dtype.kind == "f" or dtype.itemsize < 8:
+        rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
+        parts = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
+        worst = [max(float(part[..., kind, 1].max()) for part in parts) for kind in range(_kinds(len(lattices)))]
+        if 1e-250 < worst[0] < 1e250:
+            if cells is not None:
+                cells += [part[..., 0, :] for part in parts]
+            totals = [math.fsum(math.fsum(part[..., k, 0].flat) for part in parts) for k in range(len(worst))]
+            return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
+    # Integers that float64 cannot tell apart, or squares that it cannot hold.
+    compared = []
+    last = channel + len(lattices)
+    for original, place in zip(originals, coordinates, strict=True):
+        rows, columns, _ = original.points.shape
+        picture = np.empty((rows, columns, len(lattices)), original.points.dtype)
+        for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
+            store_values(lattice, (place[number, :, :columns], fraction), picture, number)
+        chosen = slice(None) if original.counted is None else original.counted
+        compared.append((original.points[..., channel:last][chosen], picture[chosen]))
+    if all(np.array_equal(*pair) for pair in compared):
+        return [(0.0, 0.0)] * _kinds(len(lattices))
+    if len(compared) == 1 and compared[0][0].ndim == 3:
+        points, picture = compared[0]
+    else:
+        points, picture = (
+            np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
+        )
+    found = [distances(points, picture, len(lattices))]
+    if len(lattices) > 1:
+        found += [distances(points[..., k], picture[..., k], 1) for k in range(len(lattices))]
+    return found
+
+
+def _kinds(channels: int) -> int:
+    return 1 + channels if channels > 1 else 1
+
+
+def _distances(
+    original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64], channel: int
+) -> NDArray[np.float64]:
+    """Sums and largest of the squared distances of one part, float64, shape (row, column, kind, 2).
+
+    See `kernels.square_distances`.
+    """
+    rows, columns, channels = original.points.shape
+    down, across = -(-rows // kernels.PART_ROWS), -(-columns // kernels.PART_COLUMNS)
+    figures = np.empty((down, across, _kinds(len(rules)), 2))
+    counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
+    arrays = original.points, coordinates, rules, counted, figures
+    shapes = rows, columns, channels, channel, *coordinates.shape[1:]
+    for first in range(0, down * across, _PARTS):
+        kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, down * across))
+    return figures

@@ -1,0 +1,135 @@
+"""Which lattice each channel of a surface gets, and what is left for the exactness section."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..target import Tolerance
+from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
+
+__all__ = ["DEFAULT_STEPS", "attribute_lattices", "channel_of", "choose_lattices"]
+
+#: Steps of the widest extent, unless something else is known to cost less.
+DEFAULT_STEPS = 2.0**20
+#: Sums and differences of pictures on their way to such values do not overflow.
+LARGEST_VALUE = 1e300
+
+
+def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
+    """One channel of an array (row, column) or (row, column, channel), a view."""
+    return points if points.ndim == 2 else points[..., channel]
+
+
+def choose_lattices(
+    points: NDArray[Any],
+    geometric: int,
+    precision: float | None,
+    bits: int | None = None,
+    *,
+    steps: float = DEFAULT_STEPS,
+) -> list[Lattice]:
+    """A lattice for each channel.
+
+    Parameters
+    ----------
+    points : array, shape (row, column) or (row, column, channel)
+    geometric : int
+        The first so many channels are coordinates, the others attributes.
+    precision : float or None
+        Largest distance allowed between a point and what comes back; None: whatever costs least, for what the lattice
+        leaves out is stored.
+    bits : int, optional
+        Keep no more of any channel than so many bits of its range.
+    steps : float
+        Into how many the widest extent is divided where there is neither a lattice nor a precision.
+
+    Returns
+    -------
+    list of Lattice
+        The channels' own lattices where found (attributes: always when found; coordinates: unless the precision
+        allows a coarser one), otherwise one step for all coordinates.
+    """
+    count = 1 if points.ndim == 2 else points.shape[2]
+    spans = []
+    for channel in range(count):
+        values = channel_of(points, channel)
+        spans.append((float(values.min()), float(values.max())))
+    if bits is not None:
+        # With no bit at all every value is nearest to the same lattice point.
+        return [precision_lattice(low, high, max(high - low, 1e-300) * 2.0 ** -(bits or -2)) for low, high in spans]
+    widest = max((high - low for low, high in spans[:geometric]), default=0.0)
+    furthest = max(max(abs(low), abs(high)) for low, high in spans)
+    if furthest > LARGEST_VALUE:
+        raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
+    wanted = widest / steps if precision is None else _step_for(points.dtype, precision, geometric, spans)
+    lattices = []
+    for channel in range(count):
+        low, high = spans[channel]
+        own = find_lattice(channel_of(points, channel))
+        if channel >= geometric:
+            lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_STEPS))
+        elif own is not None and (precision is None or own.spacing >= wanted):
+            lattices.append(own)
+        else:
+            lattices.append(precision_lattice(low, high, wanted))
+    return lattices
+
+
+def attribute_lattices(
+    values: NDArray[Any], precision: Tolerance | None = None, bits: int | None = None
+) -> list[Lattice]:
+    """A lattice for each component of an attribute.
+
+    Parameters
+    ----------
+    values : array, shape (point, component)
+    precision : Tolerance, optional
+        Largest distance allowed between the values of a point and what comes back. None: the components' own lattices
+        where found, or fine ones, for what they leave out is stored.
+    bits : int, optional
+        Keep no more of any component than so many bits of its range.
+    """
+    grid = values[:, np.newaxis]
+    count = values.shape[1]
+    if precision is not None:
+        lows, highs = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
+        extent = float(np.sqrt(((highs - lows) ** 2).sum()))
+        if extent or not precision.relative:
+            return choose_lattices(grid, count, precision.absolute(extent), bits)
+    if bits is not None:
+        return choose_lattices(grid, count, None, bits)
+    # As attributes of nothing: each component gets its own lattice, or a fine one.
+    return choose_lattices(grid, 0, None)
+
+
+def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: list[tuple[float, float]]) -> float:
+    """The widest step that keeps every point within the precision, rounding into the dtype included."""
+    if not (math.isfinite(precision) and precision > 0):
+        raise InputError(f"expected a precision above 0, got {precision}")
+    largest = max(max(abs(low), abs(high)) for low, high in spans[:geometric])
+    allowed = precision / math.sqrt(geometric)
+    if dtype.kind in "iu":
+        # Whole steps from a whole origin land on whole values, which float64 holds up to 2**53: a step of s then errs
+        # by at most floor(s / 2).
+        rounding = 4 * float(np.spacing(largest)) if largest >= 2.0**53 else 0.0
+        step = 2.0 * math.floor(allowed - rounding) + 1.0
+    else:
+        rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
+        # A container tells errors rounded up by at most one part in 2**20, and no more than was asked for.
+        step = 2.0 * (allowed * (1.0 - 2.0**-20) - rounding)
+    if step <= 0:
+        raise InputError(
+            f"expected a precision above {rounding * math.sqrt(geometric)} for {dtype} values, got {precision}"
+        )
+    widest = max(high - low for low, high in spans[:geometric])
+    if widest / step > 2.0**LATTICE_BITS - 4:
+        raise InputError(
+            f"expected a precision of at least {widest / 2**LATTICE_BITS * math.sqrt(geometric) / 2}, got {precision}; "
+            "without one, everything is exact"
+        )
+    return step

@@ -1,0 +1,271 @@
+"""The client's end of a stream, without I/O: messages in; views, credit and the last message out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..errors import RemoteError, TruncatedStreamError
+from ..protocol.connection import Connection, Side, State
+from ..protocol.flow_control import Window
+from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
+from ..target import Region, Target
+from .receiver_state import Ended, Reception
+
+if TYPE_CHECKING:
+    from ..decoding.decoder import Decoder
+    from .receiver_state import DownloadEvent
+
+__all__ = ["Download", "Ended"]
+
+
+class Download:
+    """One connection over which a surface is received.
+
+    The caller moves messages: it passes each received message to `receive`, and sends whatever `data_to_send` returns,
+    at the start and after every call. When `receive` returns an `Ended`, what `data_to_send` then returns is the last
+    message, and the server closes the connection. If the connection breaks earlier, another `Download` with the same
+    `reception` continues.
+
+    Parameters
+    ----------
+    target : Target
+        What to receive, where to stop, and in which order.
+    window : int or None
+        Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it
+        is less than what the link carries in one round trip, the link is idle at times. None: a `Window` measures the
+        link; this needs times.
+    reception : Reception or None
+        What has arrived over other connections; its target is used then.
+
+    Attributes
+    ----------
+    reception : Reception
+        What has arrived so far.
+    header : Header or None
+        The server's first message.
+    layer : Layer or None
+        The server's last `layer` message.
+    window : Window
+        The number of bytes that may be in flight.
+    opening : bytes
+        The first message, for use in the address of the handshake; see `opened`.
+    """
+
+    def __init__(
+        self, target: Target | None = None, *, window: int | None = None, reception: Reception | None = None
+    ) -> None:
+        self.reception = Reception(target) if reception is None else reception
+        self.window = Window(window)
+        self.header: Header | None = None
+        self.layer: Layer | None = None
+        self._connection = Connection(Side.CLIENT)
+        self._opened: float | None = None
+        self._turning = False  # this end has stopped in order to open again
+        # Of a container that is not known by name, nothing can be said to be held.
+        known = self.reception.container is not None
+        held = _largest(self.reception) if known else ()
+        self.opening = self._open(held, self.reception.container)
+        self._outbox = [self.opening]
+
+    @property
+    def target(self) -> Target:
+        """What to receive, where to stop, and in which order."""
+        return self.reception.target
+
+    @property
+    def decoder(self) -> Decoder:
+        """Decodes what has arrived so far."""
+        return self.reception.decoder
+
+    @property
+    def wire_bytes(self) -> int:
+        """Bytes of all received messages, including those of earlier connections."""
+        return self.reception.wire_bytes
+
+    @property
+    def ended(self) -> str | None:
+        """Why the stream ended, as in `Ended`."""
+        return self.reception.ended
+
+    @property
+    def credit(self) -> int:
+        """Bytes of the container that may still arrive without further credit."""
+        return self._connection.credit
+
+    def receive(self, message: bytes, now: float | None = None) -> list[DownloadEvent]:
+        """Take one message; returns the views that it completes, and an `Ended` if it is the last.
+
+        Data that still arrive after `stop` are decoded but give no views.
+
+        Parameters
+        ----------
+        message : bytes
+        now : float or None
+            Time in seconds, by the clock used for `tick`; without it a measured window does not change.
+
+        Raises
+        ------
+        RemoteError
+            If the server refuses, with its code and reason.
+        RemoteProtocolError, UnsupportedVersionError
+            If it is not a message, or not one that is allowed now.
+        CorruptStreamError
+            If the bytes of the container are damaged.
+        TruncatedStreamError
+            If the server ends before it has sent what it announced.
+        """
+        self.reception.wire_bytes += len(message)
+        event = self._connection.receive(message)
+        if isinstance(event, Segments):
+            return self._take(event, now)
+        if isinstance(event, Header):
+            return self._begin(event, now)
+        if isinstance(event, Layer):
+            self.layer = event
+        elif isinstance(event, End):
+            if event.why == "stopped" and self._turning:
+                self._turning = False
+                # The server knows what it has sent, and that nothing more of the last grants will come.
+                self.window.restart()
+                self._outbox.append(self._open())
+                return []
+            self._outbox.append(self._connection.send(Bye()))
+            return [self.reception.end(event.why)]
+        elif isinstance(event, Error):
+            raise RemoteError(event.code, f"{event.title}: {event.detail}")
+        return []
+
+    def data_to_send(self) -> list[bytes]:
+        """The messages to send now, in order; each is returned once."""
+        messages, self._outbox = self._outbox, []
+        return messages
+
+    def opened(self, now: float) -> None:
+        """Declare that `opening` was part of the handshake's address, so that it is not sent again.
+
+        Parameters
+        ----------
+        now : float
+            Time at which the handshake began, by the clock used for `tick`.
+        """
+        self._outbox.remove(self.opening)
+        self._opened = now
+
+    def focus(self, region: Region | None) -> None:
+        """Request the data of a region before the rest; None returns to the target's own order. Allowed at any time.
+
+        The server is asked to stop, and the stream is opened again once it has. Data in flight still arrive first.
+
+        Parameters
+        ----------
+        region : ((int, int), (int, int)) or None
+            Rows and columns, half-open, in full-resolution indices.
+
+        Raises
+        ------
+        OptionError
+            If the surface is known and has no such region; otherwise the server refuses it.
+        """
+        if region != self.reception.target.first:
+            self.reception.focus(region)
+            self.turn()
+
+    def turn(self) -> None:
+        """End the current order, and open again with the changed target of the reception."""
+        if self._connection.state in (State.OPENED, State.STREAMING):
+            self._turning = True
+            self._outbox.append(self._connection.send(Stop()))
+
+    def stop(self, why: str = "stopped") -> None:
+        """Ask the server to stop sending, at once. A second call, or one after the end, does nothing.
+
+        Parameters
+        ----------
+        why : "stopped" or "seconds"
+            Reason given by `Ended` when the server has stopped.
+        """
+        if self._turning or self._connection.state in (State.OPENED, State.STREAMING):
+            self.reception.stopped_for = why
+        if self._connection.state in (State.OPENED, State.STREAMING):
+            self._outbox.append(self._connection.send(Stop()))
+        self._turning = False
+
+    def tick(self, now: float) -> float | None:
+        """Set the time, in seconds of any clock that does not go back; stops when the target's time limit is over.
+
+        The first call starts the clock.
+
+        Returns
+        -------
+        float or None
+            Seconds until the stop; None if there is no time limit or it is over.
+        """
+        if self._opened is None:
+            self._opened = now
+        if self.reception.stopped_for is not None or self.ended is not None:
+            return None
+        left = self.reception.tick(now)
+        if left == 0:
+            self.stop("seconds")
+            return None
+        return left
+
+    def connection_lost(self, code: int | None = None, reason: str = "") -> None:
+        """Declare that the connection is closed; does nothing if the stream has ended.
+
+        Parameters
+        ----------
+        code : int or None
+            Close code of the WebSocket, if there was one.
+        reason : str
+            Reason in the close frame.
+
+        Raises
+        ------
+        RemoteError
+            If the close code stands for an error of the server.
+        TruncatedStreamError
+            If the connection broke before the end.
+        """
+        if self.ended is not None:
+            return
+        words = [word for word, meaning in CODES.items() if meaning.close == code]
+        if words:
+            # Where words share a code, the reason begins with the one that is meant.
+            word = next((word for word in words if reason.startswith(word)), words[0])
+            raise RemoteError(word, reason or CODES[word].title)
+        closed = "was lost" if code is None else f"was closed with code {code} {reason}".rstrip()
+        raise TruncatedStreamError(
+            f"expected an end message, got {self.reception.data_bytes} bytes before the connection {closed}"
+        )
+
+    def _open(self, held: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
+        self.window.grant(self.window.size)
+        return self._connection.send(Open(self.reception.target, self.window.size, held, container))
+
+    def _begin(self, event: Header, now: float | None) -> list[DownloadEvent]:
+        self.header = event
+        if now is not None and self._opened is not None:
+            self.window.heard(now - self._opened)
+        self.reception.identify(event.container, event.size)
+        return [*self.reception.expect(event.planned, event.index, event.metadata, event.prefix)]
+
+    def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
+        stopped = self._connection.state is State.STOPPING
+        shown = not stopped or self._turning
+        views = self.reception.take(event.offset, event.data)
+        self.window.arrive(len(event.data), now)
+        grant = self.window.size - self._connection.credit
+        # Four grants a window: fewer would leave the link idle between them, more would be chatter.
+        if not stopped and grant > 0 and grant * 4 >= self.window.size:
+            self._outbox.append(self._connection.send(Credit(grant)))
+            self.window.grant(grant, now)
+        return [*views] if shown else []
+
+
+def _largest(reception: Reception) -> tuple[tuple[int, int], ...]:
+    """What is held, the smallest ranges left out where there are more than a message may name."""
+    ranges = list(reception.held)
+    if len(ranges) > MAX_HELD:
+        ranges = sorted(sorted(ranges, key=lambda place: place[1], reverse=True)[:MAX_HELD])
+    return tuple(ranges)

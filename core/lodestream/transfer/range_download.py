@@ -1,0 +1,325 @@
+"""Receiving a surface over HTTP Range, without I/O.
+
+The client makes the plan that a server would follow over WebSocket. The first bytes of the file tell what it is and how
+long, the last bytes contain its index. What the target needs of the rest is requested in few requests. Layers within
+the first bytes are shown before the plan exists, if it is certain to contain them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ..errors import RemoteError, RemoteProtocolError, TruncatedStreamError
+from ..protocol.messages import MAX_CREDIT, MIN_WINDOW
+from .receiver_state import Reception
+
+if TYPE_CHECKING:
+    from .receiver_state import DownloadEvent
+
+__all__ = ["RangeDownload", "RangeRequest"]
+
+# The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
+# pictures come with them, and more where it is known that more is wanted. The last ones, some and a share of the file,
+# hold index and metadata of most. Where they do not, one more request brings the rest.
+_HEAD = 4096
+_FIRST = MIN_WINDOW
+_FIRST_MOST = MAX_CREDIT
+_TAIL_SHARE = 512
+_TAIL_LEAST = 2048
+_TAIL_MOST = 64 * 1024
+
+_CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d{1,18})-(\d{1,18})/(\d{1,18})\s*")
+_CONTAINER_TAG = re.compile(r'"([0-9a-f]{64})"')
+
+
+@dataclass(frozen=True)
+class RangeRequest:
+    """A request for a range of the file.
+
+    Attributes
+    ----------
+    offset, length : int
+        The range; the file may end before.
+    headers : mapping
+        Headers of the request.
+    """
+
+    offset: int
+    length: int
+    headers: Mapping[str, str] = field(repr=False)
+
+
+class _MissingError(Exception):
+    """Bytes that are needed to read the index."""
+
+    def __init__(self, offset: int, length: int) -> None:
+        super().__init__(offset, length)
+        self.place = offset, length
+
+
+class RangeDownload:
+    """Receiving a surface over HTTP Range: requests out, parts of the file in.
+
+    The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
+    body, in pieces of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
+    breaks, it continues with the next `request`.
+
+    Parameters
+    ----------
+    reception : Reception
+        What has arrived, over any transport.
+    etag : str or None
+        Strong entity tag of the file, if it is known.
+
+    Attributes
+    ----------
+    requests : int
+        Number of requests so far.
+    """
+
+    def __init__(self, reception: Reception, *, etag: str | None = None) -> None:
+        self.reception = reception
+        self.requests = 0
+        self._etag = etag
+        self._validator: str | None = None
+        self._needed: tuple[int, int] | None = None
+        self._gap = MIN_WINDOW
+        self._asked: RangeRequest | None = None
+        self._asked_at: float | None = None
+        self._answered_at: float | None = None
+        self._position = 0
+        reception.keep()
+
+    @property
+    def ended(self) -> str | None:
+        """Why the stream ended, as in `Ended`."""
+        return self.reception.ended
+
+    @property
+    def version(self) -> str | None:
+        """Identifies this version of the file: its entity tag, or else its date; None if it has neither."""
+        return self._validator
+
+    def request(self, now: float | None = None) -> tuple[RangeRequest | None, list[DownloadEvent]]:
+        """The next request, or None if none is needed; and the views that follow from what has arrived.
+
+        Parameters
+        ----------
+        now : float or None
+            Seconds of any clock that does not go back. The measured round-trip time and rate decide which slices are
+            requested together.
+
+        Raises
+        ------
+        CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+            If the file is not a container that can be read.
+        OptionError
+            If the container cannot meet the target.
+        """
+        events: list[DownloadEvent] = []
+        place = None
+        if self.reception.plan is None:
+            place = self._first()
+            if place is None:
+                events += self._read_index()
+                place = self._needed
+        if self.reception.plan is not None:
+            place = self._next_slices()
+            if place is None:
+                events.append(self.reception.end(self.reception.plan.ended))
+                return None, events
+        if place is None:
+            raise AssertionError("either the index is known or something of it is missing")
+        headers = {"Range": f"bytes={place[0]}-{place[0] + place[1] - 1}", "Accept-Encoding": "identity"}
+        if self._etag is not None:
+            headers["If-Range"] = self._etag
+        self._asked, self._position = RangeRequest(*place, headers), place[0]
+        self._asked_at, self._answered_at = now, None
+        self.requests += 1
+        return self._asked, events
+
+    def answer(self, status: int, headers: Mapping[str, str], now: float | None = None) -> None:
+        """Take the status and headers of an answer.
+
+        Parameters
+        ----------
+        status : int
+            200, 206 or 416; other answers say nothing about the file.
+        headers : mapping
+            By names in lower case.
+        now : float or None
+
+        Raises
+        ------
+        RemoteProtocolError
+            If the server does not support Range, or the answer does not match the request.
+        RemoteError
+            With the code ``other-container`` if the file has changed.
+        """
+        asked = self._asked
+        if asked is None:
+            raise AssertionError("there is no request to answer")
+        self._answered_at = now
+        self._check_same(headers, status)
+        if status == 416:
+            raise TruncatedStreamError(f"expected a container of at least {asked.offset + 1} bytes, got a shorter file")
+        if status != 206:
+            raise RemoteProtocolError(
+                f"expected part of the file (status 206), got all of it (status {status}): "
+                "the server does not support Range, without which no surface can be received in steps"
+            )
+        if headers.get("content-encoding", "identity") != "identity":
+            raise RemoteProtocolError(
+                f"expected bytes of the file itself, got them encoded with {headers['content-encoding']}"
+            )
+        found = _CONTENT_RANGE.fullmatch(headers.get("content-range", ""))
+        if found is None or int(found[1]) != asked.offset:
+            raise RemoteProtocolError(
+                f"expected Content-Range to be bytes {asked.offset}-..., got {headers.get('content-range')!a}"
+            )
+        size = int(found[3])
+        if int(found[2]) != min(asked.offset + asked.length, size) - 1:
+            raise RemoteProtocolError(f"expected {asked.length} bytes from {asked.offset} on, got bytes {found[0]}")
+        tag = _CONTAINER_TAG.fullmatch(self._etag or "")
+        self.reception.identify(tag[1] if tag else None, size)
+
+    def receive(self, chunk: bytes) -> list[DownloadEvent]:
+        """Take a piece of the body of an answer; returns the views that it completes.
+
+        Raises
+        ------
+        CorruptStreamError
+            If the bytes of the container are damaged.
+        RemoteProtocolError
+            If there are more bytes than requested.
+        """
+        self.reception.wire_bytes += len(chunk)
+        asked, start = self._asked, self._position
+        self._position += len(chunk)
+        if asked is None or self._position > asked.offset + asked.length:
+            raise RemoteProtocolError(f"expected {asked.length if asked else 0} bytes of the file, got more")
+        events: list[DownloadEvent] = []
+        # Until the index is known everything may be of use; then what lies between two slices is not kept.
+        places = self.reception.wanted(start, len(chunk)) if self.reception.plan else [(start, len(chunk))]
+        for offset, length in list(places):
+            events += self.reception.take(offset, chunk[offset - start : offset - start + length])
+        return events
+
+    def finish(self, now: float | None = None) -> None:
+        """Declare the end of an answer's body.
+
+        Raises
+        ------
+        TruncatedStreamError
+            If the body was shorter than announced; the next `request` asks for the rest.
+        """
+        asked, self._asked = self._asked, None
+        if asked is None:
+            return
+        expected = min(asked.length, (self.reception.size or 0) - asked.offset)
+        got = self._position - asked.offset
+        if got < expected:
+            raise TruncatedStreamError(f"expected {expected} bytes of the file from {asked.offset} on, got {got}")
+        self._measure(got, now)
+
+    @property
+    def left(self) -> int:
+        """Bytes of the current answer that are still to come."""
+        return self._asked.offset + self._asked.length - self._position if self._asked is not None else 0
+
+    def leave(self) -> None:
+        """Declare that the rest of the current answer is not read, because something else is needed first."""
+        self._asked = None
+
+    def stop(self, why: str = "stopped") -> None:
+        """Stop; the caller closes the connection.
+
+        Parameters
+        ----------
+        why : "stopped" or "seconds"
+            Reason given by `ended`.
+        """
+        if self.ended is None:
+            self.reception.stopped_for = why
+            self.reception.end("stopped")
+
+    def _measure(self, got: int, now: float | None) -> None:
+        """Bytes that come in one round trip: skipping fewer would cost more than taking them."""
+        if now is None or self._asked_at is None or self._answered_at is None:
+            return
+        round_trip, seconds = self._answered_at - self._asked_at, now - self._answered_at
+        if got >= MIN_WINDOW and round_trip > 0:
+            rate = got / max(seconds, round_trip)
+            self._gap = round(min(max(rate * round_trip, MIN_WINDOW), MAX_CREDIT))
+
+    def _check_same(self, headers: Mapping[str, str], status: int) -> None:
+        etag = headers.get("etag", "")
+        strong = etag if etag.startswith('"') else None
+        changed = strong is not None and self._etag is not None and strong != self._etag
+        # Where there is no strong tag, the date or a weak one is compared, as far as that goes.
+        validator = etag or headers.get("last-modified")
+        changed = changed or (self._validator is not None and status != 416 and validator != self._validator)
+        if changed:
+            raise RemoteError("other-container", "expected the file as it was before, got another: it has changed")
+        self._etag, self._validator = strong or self._etag, validator or self._validator
+
+    def _first(self) -> tuple[int, int] | None:
+        """What to ask for before the index can be looked for."""
+        held, size = self.reception.held, self.reception.size
+        if size is None:
+            return 0, self._beginning()
+        tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
+        for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
+            gap = next(held.missing(start, length), None)
+            if gap is not None:
+                return gap
+        return None
+
+    def _beginning(self) -> int:
+        """How many bytes to ask for first, of a file of which nothing is known."""
+        from .safe_prefix import in_file_order
+
+        target = self.reception.target
+        if not in_file_order(target) or self.reception.held.total:
+            return _HEAD
+        if target.max_bytes is not None:
+            return min(max(target.max_bytes, _HEAD), _FIRST_MOST)
+        limited = target.until_rms or target.until_max or target.seconds
+        return _FIRST if limited else _FIRST_MOST
+
+    def _read_index(self) -> list[DownloadEvent]:
+        from ..container import read_index
+        from ..container.capacity import Capacity
+
+        store, size = self.reception.keep(), self.reception.size or 0
+
+        def read(offset: int, length: int) -> bytes:
+            for gap in store.ranges.missing(offset, min(length, size - offset)):
+                raise _MissingError(*gap)
+            return store.read(offset, min(length, size - offset))
+
+        self._needed = None
+        try:
+            index = read_index(read, size, Capacity(self.reception.decoder.capacity.max_vertices))
+        except _MissingError as missing:
+            self._needed = missing.place
+            return []
+        return [*self.reception.follow(index)]
+
+    def _next_slices(self) -> tuple[int, int] | None:
+        """The next slice that is missing, with those after it that are near and nothing between that is held."""
+        held = self.reception.held
+        missing = self.reception.missing()
+        first = next(missing, None)
+        if first is None:
+            return None
+        start, end = first[0], first[0] + first[1]
+        for offset, length in missing:
+            gap = offset - end
+            if not 0 <= gap <= self._gap or (gap and sum(size for _, size in held.missing(end, gap)) < gap):
+                break
+            end = offset + length
+        return start, end - start

@@ -1,0 +1,220 @@
+"""The server's end of a stream, without I/O: messages in; slices to read and messages to send out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ..container import ByteRange, Index
+from ..errors import CorruptStreamError, OptionError
+from ..planning.byte_ranges import RangeSet
+from ..planning.plan import Mark, Plan
+from ..planning.planner import plan
+from ..protocol.connection import Connection, Side, State
+from ..protocol.messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+
+__all__ = ["Sender"]
+
+# A message takes a quarter of the most credit that there was, but not so little that its framing counts.
+_SHARES = 4
+_LEAST = 4096
+
+
+class Sender:
+    """One surface being sent.
+
+    The caller moves bytes. It passes each received message to `receive` and sends the messages that `next_message`
+    returns. When that returns None, `wanted` names the slice of the container to read and pass to `provide`. When that
+    returns None too, there is nothing to do before the next message.
+
+    Parameters
+    ----------
+    index : Index
+        Index of the container.
+    container : str
+        SHA-256 of the container, in hexadecimal digits.
+
+    Attributes
+    ----------
+    sent : int
+        Bytes of the container that were handed out.
+    layers : int
+        Layers or levels that were handed out; from the first one on the client can draw the surface.
+    held : RangeSet
+        Bytes of the container that the client already held when it last opened.
+    why : str or None
+        Why the stream ended, once it has.
+    """
+
+    def __init__(self, index: Index, container: str) -> None:
+        self.sent = 0
+        self.layers = 0
+        self.held = RangeSet()
+        self.why: str | None = None
+        self._index = index
+        self._container = container
+        self._connection = Connection(Side.SERVER)
+        self._outbox: deque[Event] = deque()
+        self._slices: deque[ByteRange] = deque()
+        self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
+        self._provided = 0
+        self._given = RangeSet()
+        self._window = 0
+        self._ended = "complete"
+
+    @property
+    def state(self) -> State:
+        """State of the stream; closed and failed are final once `next_message` returns None."""
+        return self._connection.state
+
+    @property
+    def pieces(self) -> int:
+        """Number of pieces that a plan is made of; the time to make a plan is proportional to it."""
+        return len(self._index.segments) + len(self.held) + len(self._given)
+
+    def receive(self, message: bytes) -> Event:
+        """Take one message; returns its event.
+
+        Raises
+        ------
+        MessageError
+            If it is not a message, or not one that is allowed now; pass its ``code`` to `fail`.
+        UnsupportedVersionError
+            If the client speaks another version.
+        """
+        event = self._connection.receive(message)
+        if isinstance(event, Open):
+            self._plan(event)
+        elif isinstance(event, Stop) and self.state is State.STOPPING:
+            # A header in the outbox is dropped too: a client that has stopped takes an end without one.
+            self._outbox = deque([End("stopped")])
+            self._slices.clear()
+            self._marks.clear()
+        return event
+
+    def fail(self, code: str, detail: str) -> None:
+        """End the stream with an error message."""
+        if self.state not in (State.CLOSED, State.FAILED):
+            self._outbox = deque([Error(code, CODES[code].title, detail)])
+
+    def next_message(self) -> bytes | None:
+        """The message to send now, or None.
+
+        Messages are returned one at a time, so that a `stop` takes effect before the next one.
+        """
+        if not self._outbox:
+            return None
+        event = self._outbox.popleft()
+        if isinstance(event, Segments):
+            self.sent += len(event.data)
+            self._given.add(event.offset, len(event.data))
+        elif isinstance(event, Layer):
+            self.layers += 1
+        elif isinstance(event, End):
+            self.why = event.why
+        return self._connection.send(event)
+
+    def wanted(self) -> ByteRange | None:
+        """The slice to read now, limited by the credit and the size of a message; None if there is none."""
+        if not self._ready():
+            return None
+        # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
+        until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
+        # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
+        credit = self._connection.credit
+        self._window = max(self._window, credit)
+        share = min(credit, max(self._window // _SHARES, _LEAST))
+        slice_ = self._slices[0]
+        return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
+
+    def _ready(self) -> bool:
+        """Whether something may be read now."""
+        return self.state is State.STREAMING and not self._outbox and bool(self._slices and self._connection.credit)
+
+    def provide(self, wanted: ByteRange, data: bytes) -> None:
+        """Pass the bytes of a slice that `wanted` has named; after a stop they are dropped.
+
+        Raises
+        ------
+        CorruptStreamError
+            If there are fewer bytes than requested: the file was truncated.
+        """
+        if self.state is not State.STREAMING or not self._slices:
+            return
+        slice_ = self._slices[0]
+        if slice_.offset != wanted.offset or slice_.length < wanted.length:
+            return
+        if len(data) != wanted.length:
+            raise CorruptStreamError(f"expected {wanted.length} bytes, got {len(data)}", wanted.offset)
+        self._slices.popleft()
+        if slice_.length > wanted.length:
+            self._slices.appendleft(ByteRange(wanted.end, slice_.length - wanted.length))
+        self._outbox.append(Segments(wanted.offset, data))
+        self._provided += wanted.length
+        self._mark()
+        self._end_if_done()
+
+    def _plan(self, event: Open) -> None:
+        index = self._index
+        try:
+            chosen = plan(index, event.target, self._said(event))
+        except OptionError as error:
+            raise MessageError("bad-target", str(error)) from None
+        self.why = None
+        marks = _as_held(chosen) if self._given else chosen.marks
+        self._follow(chosen.slices, marks, sum(slice_.length for slice_ in chosen.before))
+        self._ended = chosen.ended
+        self._outbox.append(
+            Header(
+                self._container,
+                index.size,
+                chosen.bytes,
+                index.header.extent,
+                (index.index.offset, index.index.length),
+                (index.metadata.offset, index.metadata.length),
+                chosen.prefix,
+            )
+        )
+        self._end_if_done()
+
+    def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:
+        self._slices = deque(slice_ for slice_ in slices if slice_.length)
+        # Of the states that what is held makes already, there is nothing to say.
+        self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
+
+    def _said(self, event: Open) -> RangeSet:
+        """What the client has: what it says that it holds, or else what it said before and what it was sent since."""
+        if not event.held and event.container is None:
+            return RangeSet((*self.held, *self._given))
+        if event.held and event.container is None:
+            raise MessageError("bad-held", "expected open.container with open.held, got none")
+        if event.container not in (None, self._container):
+            raise MessageError("other-container", f"expected container {self._container}, got {event.container}")
+        held = RangeSet(event.held)
+        if held.end > self._index.size:
+            raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {held.end}")
+        self.held = held
+        return held
+
+    def _mark(self) -> None:
+        while self._marks and self._marks[0][0] <= self._provided:
+            mark = self._marks.popleft()[1]
+            self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
+
+    def _end_if_done(self) -> None:
+        if not self._slices:
+            self._outbox.append(End(self._ended))
+
+
+def _as_held(chosen: Plan) -> list[Mark]:
+    """The marks of a plan after another one, whose slices the client has decoded as they came.
+
+    A state beyond which more is held is not shown by itself: its figures are not known.
+    """
+    ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
+    held = [ahead + mark.sent for mark in chosen.marks]
+    return [
+        mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown)
+        for mark, size in zip(chosen.marks, held, strict=True)
+    ]

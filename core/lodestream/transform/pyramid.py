@@ -1,0 +1,385 @@
+"""The whole hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder.
+
+A channel has an array for each grid of the layout, see `lodestream.grid.layout`. A part whose side comes from a curve
+holds that side's points at every level: level 0 copies them, and the details along the side that the inverse needs are
+made by a forward step of the curve's points. Curves are therefore stepped first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from ..grid.axis import AxisStep
+from ..grid.layout import Layout, Source
+from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
+from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
+
+__all__ = [
+    "PADDING",
+    "allocate",
+    "bare_level",
+    "copied",
+    "forward",
+    "inverse",
+    "inverse_level",
+    "synthesis_norms",
+    "take_details",
+    "take_nodes",
+    "third_step",
+]
+
+#: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
+_CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
+#: Unused columns at the end of an array of coefficients, see `allocate`.
+PADDING = 24
+_SAMPLE_LINES = 96
+#: Values in one call of a kernel that fits.
+_AT_ONCE = 1 << 22
+_NORM_LEVELS = 6
+
+
+def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
+    """An int32 array for a channel's coefficients.
+
+    It is a window of a slightly wider one: rows then never lie a power of two apart, where a column's samples would
+    compete for the same lines of the cache.
+    """
+    rows, columns = shape
+    return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
+
+
+def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A copy from `allocate`."""
+    copy = allocate(array.shape)
+    copy[...] = array
+    return copy
+
+
+def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
+    """Turn a channel's lattice coordinates into its coefficients, in place.
+
+    Parameters
+    ----------
+    arrays : int32, shape (row, column), from `allocate`, one for each grid
+        Magnitudes of at most 2**24. Sides that come from curves hold the same points as these.
+    layout : Layout
+    fit : bool
+        Choose the third step's (a, b) by size for each level and axis that is long enough; otherwise (0, 0) there.
+
+    Returns
+    -------
+    int8, shape (level, axis, 2)
+        (a, b) of the step from ``level + 1`` to ``level`` along axis 0 and 1 of the parts, and of the curves.
+    """
+    predictors = default_predictors(layout)
+    fitted = set(fitted_steps(layout))
+    for level in range(layout.levels, 0, -1):
+        for axis in range(2):
+            corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
+            for which in (axis, CURVES) if axis == 0 else (axis,):
+                if fit and (level - 1, which) in fitted:
+                    lines = [
+                        (corner if axis == 0 else corner.T, layout.steps(k, level)[axis])
+                        for k, corner in enumerate(corners)
+                        if layout.grids[k].curve == (which == CURVES)
+                    ]
+                    predictors[level - 1, which] = _fit(lines)
+            for k, grid in enumerate(layout.grids):
+                step = layout.steps(k, level)[axis]
+                if step.midpoints:
+                    forward_step(corners[k], axis, step, predictor(predictors, grid, step, level, axis))
+    return predictors
+
+
+def _corner(array: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.int32]:
+    return array[: shape[0], : shape[1]]
+
+
+def inverse(
+    arrays: Sequence[NDArray[np.int32]],
+    layout: Layout,
+    predictors: NDArray[np.int8],
+    level: int,
+    whole: int | None = None,
+    coordinate: bool = True,
+) -> None:
+    """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
+
+    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
+    lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
+    ``level``.
+    Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
+    would only add errors of its own from level to level.
+
+    Of a channel that is no ``coordinate`` no side comes from a curve, and curves mean nothing.
+    """
+    numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.curve]
+    if coordinate:
+        take_nodes(arrays, layout)
+    for finer in range(1, level + 1):
+        for k in numbers:
+            if whole is not None and finer == whole + 1:
+                corner = _corner(arrays[k], layout.shape(k, whole))
+                np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
+                corner <<= FRACTION_BITS
+            if coordinate:
+                take_details(arrays, layout, predictors, k, finer)
+            inverse_level(arrays[k], layout, predictors, k, finer)
+
+
+def inverse_level(
+    array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
+) -> None:
+    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in (1, 0):
+        if steps[axis].midpoints:
+            inverse_step(
+                corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
+            )
+
+
+def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
+    """Turn a level of a grid into nodes of the level below and details before the third step, in place."""
+    corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
+    for axis in range(2):
+        if steps[axis].midpoints:
+            forward_step(corner, axis, steps[axis], (0, 0))
+
+
+def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> NDArray[np.int32]:
+    """What the third step predicts of the details from the nodes of the coarser level: floor((v_k + 128) / 256).
+
+    Parameters
+    ----------
+    nodes : int32, shape (row, column)
+        ``step.coarse`` of them along ``axis``.
+
+    Returns
+    -------
+    int32, shape (row, column)
+        ``step.midpoints`` of them along ``axis``.
+    """
+    rows, columns = nodes.shape
+    values = allocate((step.length, columns) if axis == 0 else (rows, step.length))
+    if nodes.size and predictor != (0, 0):
+        # Undone with the third step and done without it, a step leaves of no details what that predicts.
+        values[:rows, :columns] = nodes
+        inverse_step(values, axis, step, predictor)
+        forward_step(values, axis, step, (0, 0))
+    return values[step.coarse :] if axis == 0 else values[:, step.coarse :]
+
+
+def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
+    """Level 0 of what comes from curves, in place: their common ends first, then the sides of parts."""
+    for k, grid in enumerate(layout.grids):
+        rows, columns = layout.shape(k, 0)
+        for side, source in enumerate(grid.sources):
+            if source is None:
+                continue
+            if grid.curve:
+                last = layout.shape(source.grid, 0)[0] - 1
+                arrays[k][0 if side == 0 else rows - 1, 0] = arrays[source.grid][last if source.reversed else 0, 0]
+            else:
+                place = (0, rows - 1, 0, columns - 1)[side]
+                line = arrays[k][place, :columns] if side < 2 else arrays[k][:rows, place]
+                line[:] = _points(arrays, layout, source, 0)
+
+
+def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source, level: int) -> NDArray[np.int32]:
+    """Points of a curve at a level, in the order of the side that takes them."""
+    points = arrays[source.grid][: layout.shape(source.grid, level)[0], 0]
+    return points[::-1] if source.reversed else points
+
+
+def take_details(
+    arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], part: int, level: int
+) -> None:
+    """The details along a part's sides that come from curves, in place: curves are at ``level`` already."""
+    grid, steps = layout.grids[part], layout.steps(part, level)
+    if grid.curve:
+        return
+    rows, columns = (step.coarse for step in steps)
+    for side, source in enumerate(grid.sources):
+        axis = 1 if side < 2 else 0
+        step = steps[axis]
+        if source is None or not step.midpoints:
+            continue
+        place = (0, rows - 1, 0, columns - 1)[side]
+        target = arrays[part][place, : step.length] if side < 2 else arrays[part][: step.length, place]
+        points = _points(arrays, layout, source, level)
+        if points.size == 1:
+            target[step.coarse :] = 0  # a pole
+            continue
+        line = points.reshape(1, -1).copy()
+        forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
+        target[step.coarse :] = line[0, step.coarse :]
+
+
+class _Sample(NamedTuple):
+    """Factors of a and b in v_k, and d_k, of some midpoints: int32, flat; and what no magnitude of the factors exceeds.
+
+    Details with what the third step needs around them: k from 2 to midpoints - 4.
+    """
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    details: NDArray[np.int32]
+    largest: int
+
+    def parts(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
+        """Factors and details, so many as a kernel takes at once."""
+        for start in range(0, self.details.size, _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            yield self.first[part], self.second[part], self.details[part]
+
+    def bits(self, a: int, b: int) -> float:
+        """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
+        total = np.zeros(1)
+        for part in self.parts():
+            kernels.predictor_bits(*part, self.largest, a, b, total)
+        return float(total[0])
+
+    def moments(self, a: float, b: float, weighted: bool) -> list[float]:
+        """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
+        sums = np.zeros(5)
+        for part in self.parts():
+            kernels.predictor_moments(*part, a, b, weighted, sums)
+        found: list[float] = sums.tolist()
+        return found
+
+
+def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
+    """The (a, b) that makes the details along axis 0 of some of the columns smallest, in bits."""
+    sample = _sample(grids)
+    costs: dict[tuple[int, int], float] = {}
+
+    def bits(ab: tuple[int, int]) -> float:
+        if ab not in costs:
+            costs[ab] = sample.bits(*ab)
+        return costs[ab]
+
+    best = min([*_CANDIDATES, *_least_squares(sample)], key=bits)
+    for reach in (4, 2, 1):
+        around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
+        best = min((ab for ab in around if max(map(abs, ab)) <= 127), key=bits)
+    return best
+
+
+def _sample(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> _Sample:
+    """Some of the columns, stepped without the third step."""
+    lines = sum(corner.shape[1] for corner, _ in grids)
+    samples = []
+    for corner, step in grids:
+        if step.midpoints and step.run >= FIT_NODES:
+            stride = max(1, min(lines // _SAMPLE_LINES, corner.shape[1]))
+            columns = np.array(corner[:, ::stride], order="C")
+            forward_step(columns, 0, step, (0, 0))
+            samples.append(_surroundings(columns, step.coarse, step.midpoints))
+    if len(samples) == 1:
+        return samples[0]
+    first, second, details = (np.concatenate([sample[i] for sample in samples]) for i in range(3))
+    return _Sample(first, second, details, max(sample.largest for sample in samples))
+
+
+def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sample:
+    count, width = midpoints - 5, lines.shape[1]
+    first, second, details = np.empty((3, count * width), np.int32)
+    largest, height = 0, max(1, _AT_ONCE // width)
+    for start in range(0, count, height):
+        stop = min(start + height, count)
+        part = slice(start * width, stop * width)
+        planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
+        largest = max(largest, kernels.predictor_factors(*planes, first[part], second[part], details[part]))
+    return _Sample(first, second, details, largest)
+
+
+def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
+    """Fits of 256 d = a u + b w, residuals reweighted towards small ones in turn."""
+    found = []
+    a = b = 0.0
+    for turn in range(5):
+        uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
+        determinant = uu * ww - uw * uw
+        if determinant <= 1e-9 * uu * ww:
+            break
+        a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
+        found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
+    return found
+
+
+def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
+    """Squared norms of what one unit of a coefficient of a grid adds to the surface, in the middle of the grid.
+
+    What a curve adds reaches into the parts beside it, as their nodes do.
+
+    Returns
+    -------
+    float64, shape (level, 2, 2)
+        By level of the band and its kind along either axis (node, detail); at level 0 only [0, 0, 0] has a meaning.
+    """
+    lines = _line_norms(layout, predictors, number)
+    norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
+    if layout.grids[number].curve:
+        for part, grid in enumerate(layout.grids):
+            for side, source in enumerate(grid.sources):
+                if source is not None and source.grid == number and not grid.curve:
+                    across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
+                    return norms * points * _line_norms(layout, predictors, part)[across, :, 0][:, None, None]
+    return norms
+
+
+def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> NDArray[np.float64]:
+    """Squared norms along each axis of a grid: float64, shape (axis, level, node or detail)."""
+    lines = np.ones((2, layout.levels + 1, 2))
+    for axis in range(2):
+        stepping = []
+        for level in range(1, layout.levels + 1):
+            step = layout.steps(number, level)[axis]
+            if step.midpoints:
+                stepping.append((level, *predictor(predictors, layout.grids[number], step, level, axis)))
+        for level in range(layout.levels + 1):
+            above = tuple(step for step in stepping if step[0] >= level)
+            lines[axis, level] = _line_norm(above, max(level, 1))
+    return lines
+
+
+@lru_cache(maxsize=4096)
+def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[float, float]:
+    """Squared norms along one axis of a node and of a detail of a band of level ``first``.
+
+    ``stepping``: level and (a, b) of the steps from this level on.
+    """
+    if not stepping:
+        return 1.0, 1.0
+    nodes, details = np.zeros((2, 2, 16))
+    nodes[0, 8] = 1.0
+    (details if stepping[0][0] == first else nodes)[1, 8] = 1.0
+    for _, a, b in stepping[:_NORM_LEVELS]:
+        nodes = _synthesised(nodes, details, a, b)
+        details = np.zeros_like(nodes)
+    squares = (nodes * nodes).sum(axis=1) * 2.0 ** max(0, len(stepping) - _NORM_LEVELS)
+    return float(squares[0]), float(squares[1])
+
+
+def _synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
+    """One inverse step of closed lines without rounding; float64, shape (line, sample)."""
+    count = nodes.shape[1]
+    c = np.concatenate([nodes[:, -2:], nodes, nodes[:, :3]], axis=1)
+    before, own, after = (c[:, k : k + count] for k in (1, 2, 3))
+    v = a * (own + after - c[:, 4:-1] - before) + b * (own + after - c[:, 5:] - c[:, :-5])
+    details = surplus + v / 256.0
+    d = np.concatenate([details[:, -REACH:], details, details[:, : REACH - 1]], axis=1)
+    total = np.zeros_like(nodes)
+    for j, tap in enumerate(TAPS):
+        total += tap * (d[:, REACH + j : REACH + j + count] + d[:, REACH - 1 - j : REACH - 1 - j + count])
+    line = np.empty((2, 2 * count))
+    line[:, ::2] = even = nodes - total / 2.0**24
+    line[:, 1::2] = details + (even + np.concatenate([even[:, 1:], even[:, :1]], axis=1)) / 2.0
+    return line

@@ -1,0 +1,329 @@
+"""Limits on what happens at the same time and on disk space; requests beyond them are told to come back.
+
+A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds and bytes on disk
+as it leaves free for the others: one caller alone gets half of everything, the next one half of the rest. So a caller
+that has nothing yet always finds something. The rule does not apply if nobody else can write.
+
+Everything here runs in the event loop, between two awaits, so no lock is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from starlette.types import Message, Receive
+
+from ..operation.settings import Settings
+from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
+from .access import Caller
+
+__all__ = ["Limits"]
+
+# How often the disk is looked at while an upload comes.
+_STRIDE = 16 << 20
+
+# What stays free where the settings say nothing, unless the disk is small.
+_KEPT = 1 << 30
+
+# What an upload may still take when the server is told to end.
+_LAST_SECONDS = 2.0
+
+
+class Limits:
+    """Counts what the server has accepted, and refuses what exceeds the limits.
+
+    Parameters
+    ----------
+    settings : Settings
+    folder : Path
+        A folder on the disk whose space is limited.
+    surfaces : callable
+        Returns the number of surfaces.
+    builds : callable (caller) -> (int, int)
+        Returns how many builds wait or run: all of them, and those of the caller with this key.
+    kept : callable (owner) -> int
+        Returns the bytes on disk of an owner's surfaces.
+    alone : callable
+        Returns whether there is nobody to share with.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        folder: Path,
+        surfaces: Callable[[], int],
+        builds: Callable[[str], tuple[int, int]],
+        kept: Callable[[str | None], int],
+        alone: Callable[[], bool],
+    ) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._surfaces = surfaces
+        self._builds = builds
+        self._kept = kept
+        self._alone = alone
+        self._streams: Counter[str] = Counter()
+        self._openings: Counter[str] = Counter()
+        self._uploads: dict[asyncio.Timeout, str] = {}  # and whose they are
+        self._promised: Counter[str] = Counter()  # bytes, by caller
+        self._taken: Counter[str | None] = Counter()  # bytes of uploads under way, by owner
+
+    @contextmanager
+    def stream(self, client: str) -> Iterator[None]:
+        """Count an open stream for the length of the block.
+
+        Parameters
+        ----------
+        client : str
+            Key of the client that reads it.
+
+        Raises
+        ------
+        BusyError
+            If the server has as many as allowed.
+        TooManyError
+            If this client has as many as allowed.
+        """
+        most, most_each = self._settings.max_streams, self._settings.max_client_streams
+        if self._streams.total() >= most:
+            raise BusyError(f"expected at most {most} streams at the same time; try again in a few seconds")
+        if self._streams[client] >= most_each:
+            raise TooManyError(f"expected at most {most_each} streams of one client at the same time; end one of them")
+        self._streams[client] += 1
+        try:
+            yield
+        finally:
+            _subtract(self._streams, client, 1)
+
+    @contextmanager
+    def opening(self, client: str) -> Iterator[None]:
+        """Count a connection that has not shown a token yet. The limit equals that of streams, and is separate from it.
+
+        Parameters
+        ----------
+        client : str
+            Key of the client's address.
+
+        Raises
+        ------
+        BusyError
+            If the server has as many as allowed.
+        TooManyError
+            If this client has as many as are left for the others.
+        """
+        most, there, own = self._settings.max_streams, self._openings.total(), self._openings[client]
+        if there >= most:
+            raise BusyError(
+                f"expected at most {most} connections that have not sent a token yet; try again in a few seconds"
+            )
+        if own >= most - there:
+            raise TooManyError(
+                f"expected no more connections without a token of one address than are left for others, got {own}, "
+                f"and {most - there} of {most} are left"
+            )
+        self._openings[client] += 1
+        try:
+            yield
+        finally:
+            _subtract(self._openings, client, 1)
+
+    @asynccontextmanager
+    async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
+        """Count an upload in progress; yields a request that checks the limits while its body arrives.
+
+        An upload that is not stored needs no disk space and makes no surface, so only the number of uploads limits it.
+
+        Raises
+        ------
+        BusyError
+            If the server has as many uploads or builds as allowed.
+        TooManyError
+            If the caller has as many as allowed.
+        FullError
+            If there are as many surfaces as allowed, the caller uses as much disk space as allowed, or the disk has no
+            room for the announced sizes of the caller's uploads.
+        RestartingError
+            If the server ends meanwhile.
+        """
+        self._check_share("uploads in progress", self._settings.max_uploads, self._count(caller.key), caller)
+        if stored:
+            self.check_builds(caller)
+            self._check_surfaces()
+        size = request.headers.get("content-length", "")
+        promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
+        # One that is too large anyway is refused for that.
+        room = _Room(self, caller, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
+        clock = asyncio.timeout(None)
+        self._uploads[clock] = caller.key
+        self._promised[caller.key] += room.promised
+        try:
+            async with clock:
+                if stored:
+                    await self.check_disk(caller, new=True)
+                yield Request(request.scope, _watched(request, room, self._settings))
+        except TimeoutError:
+            if clock.expired():
+                raise RestartingError("expected the whole upload before the server ended; send it again") from None
+            raise
+        finally:
+            del self._uploads[clock]
+            _subtract(self._promised, caller.key, room.promised)
+            _subtract(self._taken, caller.owner, room.taken)
+
+    def end(self) -> None:
+        """The server ends: uploads that are not complete soon are ended too."""
+        for clock in self._uploads:
+            clock.reschedule(asyncio.get_running_loop().time() + _LAST_SECONDS)
+
+    def check_builds(self, caller: Caller) -> None:
+        """Check that one more build is allowed.
+
+        Raises
+        ------
+        BusyError, TooManyError
+            If the server, or the caller, has as many as allowed.
+        """
+        self._check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
+
+    async def check_disk(self, caller: Caller, *, new: bool) -> None:
+        """Check that everything that a caller has announced fits on the disk.
+
+        Sizes that other callers have announced are not counted, because they use no space before their data arrive.
+
+        Parameters
+        ----------
+        caller : Caller
+        new : bool
+            Also check the caller's share, because the upload is new or exceeds its announced size.
+
+        Raises
+        ------
+        FullError
+            If it does not fit, or exceeds the caller's share.
+        """
+        free, kept = await self._free()
+        promised = self._promised[caller.key]
+        if free < promised:
+            raise FullError(
+                f"expected disk space for the upload beside the {kept} bytes that the server keeps free, got "
+                f"{max(free, 0)} bytes for all uploads of {caller.name}; delete surfaces or enlarge the disk"
+            )
+        if new:
+            self._check_bytes(caller.owner, free, promised)
+
+    async def check_owner(self, owner: str | None) -> None:
+        """Check that an owner uses no more disk space than allowed; raises FullError otherwise."""
+        free, _ = await self._free()
+        self._check_bytes(owner, free, 0)
+
+    async def room(self) -> int:
+        """Bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
+        return max((await self._free())[0], 0)
+
+    async def _free(self) -> tuple[int, int]:
+        """Bytes that may be taken, and bytes that stay free."""
+        disk = await asyncio.to_thread(shutil.disk_usage, self._folder)
+        kept = self._settings.keep_free
+        if kept is None:
+            kept = min(_KEPT, disk.total // 20)
+        return disk.free - kept, kept
+
+    def _check_bytes(self, owner: str | None, free: int, promised: int) -> None:
+        has = self._kept(owner) + self._taken[owner]
+        most, why = self._settings.owner_bytes, ""
+        if most is None:
+            if self._alone():
+                return
+            most, why = (has + free) // 2, ", half of what they use there plus what is free"
+        if has + promised > most:
+            whose = "those without a token" if owner is None else owner
+            raise FullError(
+                f"expected at most {most} bytes of {whose} on the server's disk{why}, got {has} bytes and {promised} "
+                "to come; delete some of their surfaces"
+            )
+
+    def took(self, room: _Room, size: int) -> None:
+        """Count bytes of an upload that have arrived; they are no longer announced but used."""
+        room.taken += size
+        self._taken[room.caller.owner] += size
+        size = min(size, room.promised)
+        room.promised -= size
+        _subtract(self._promised, room.caller.key, size)
+
+    def _count(self, caller: str) -> tuple[int, int]:
+        owners = list(self._uploads.values())
+        return len(owners), owners.count(caller)
+
+    def _check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
+        everybody, own = there
+        if everybody >= most:
+            raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
+        if own >= most - everybody and not self._alone():
+            raise TooManyError(
+                f"expected no more {what} of {caller.name} than are left for others, got {own}, and {most - everybody} "
+                f"of {most} are left; try again when some are done"
+            )
+
+    def _check_surfaces(self) -> None:
+        most = self._settings.max_surfaces
+        if self._surfaces() >= most:
+            raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
+
+
+class _Room:
+    """What an upload has said it will take and has not taken yet, and what it has."""
+
+    def __init__(self, limits: Limits, caller: Caller, promised: int, stored: bool) -> None:
+        self.caller = caller
+        self.promised = promised
+        self.taken = 0
+        self._stored = stored
+        self._limits = limits
+        self._unchecked = 0
+
+    async def take(self, size: int) -> None:
+        if not self._stored:
+            return
+        self._limits.took(self, size)
+        self._unchecked += size
+        # One that did not say how large it is, or lied, still leaves the room that is to stay free.
+        if self._unchecked >= _STRIDE:
+            self._unchecked = 0
+            await self._limits.check_disk(self.caller, new=not self.promised)
+
+
+def _subtract(counter: Counter[Any], key: object, count: int) -> None:
+    # Of strangers who are gone nothing is kept, not even a zero.
+    counter[key] -= count
+    if not counter[key]:
+        del counter[key]
+
+
+def _watched(request: Request, room: _Room, settings: Settings) -> Receive:
+    started, came = time.monotonic(), 0
+
+    async def receive() -> Message:
+        nonlocal started, came
+        message = await request.receive()
+        size = len(message.get("body", b""))
+        await room.take(size)
+        came += size
+        now = time.monotonic()
+        if now - started >= settings.idle_seconds:
+            if came < settings.upload_rate * settings.idle_seconds and message.get("more_body", False):
+                raise SlowUploadError(
+                    f"expected at least {settings.upload_rate} bytes a second of an upload, got {came} bytes in "
+                    f"{now - started:.0f} s"
+                )
+            started, came = now, 0
+        return message
+
+    return receive

@@ -1,0 +1,165 @@
+"""Uploaded containers: they are not built but checked, and kept unchanged.
+
+The upload of such a surface is its container. A stranger wrote it, so all of it is checked and decoded once, in a build
+process and under the limits of a build; see `lodestream.decoding.inspection`. If the container is lost, it is checked
+and copied again from the upload, and never encoded again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import CorruptStreamError, FormatError, OptionError, TooLargeError
+
+from ..storage.durable import NewFile
+from ..storage.records import plain
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping, Sequence
+    from pathlib import Path
+
+    from lodestream.container import Index
+    from lodestream.formats import Format
+
+    from .worker import Job
+
+__all__ = ["CHECKED", "ERRORS", "TOLD", "check_upload", "checked", "figures_of", "is_container", "keep"]
+
+#: What the server says of such a surface under the key `ERRORS`: the errors of its layers and levels were found to be
+#: those of its pictures, which only an exact container allows; or they are what whoever uploaded it says.
+ERRORS, CHECKED, TOLD = "errors", "checked", "told"
+
+# Every page of the list carries the name.
+_LONGEST_NAME = 4096
+
+_BLOCK = 1 << 20
+
+# As many are looked at while a client waits; a container of the encoder has some thirty.
+_MOST_SECTIONS = 10_000
+
+
+def is_container(path: Path) -> bool:
+    """Whether a file begins like a container, of any version."""
+    from lodestream.container.sections import SIGNATURE, is_container
+
+    with path.open("rb") as file:
+        return is_container(file.read(len(SIGNATURE)))
+
+
+def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
+    """Check an upload that includes a container, as far as its first bytes allow.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    options : collection of str
+        Names of the given options, except ``name`` and ``filename``.
+
+    Returns
+    -------
+    Format
+        A format that is not in the library's table, because containers are not read but decoded.
+
+    Raises
+    ------
+    FormatError
+        If there are other files beside the container.
+    OptionError
+        If there is any option.
+    TooLargeError
+        If its metadata are longer than allowed.
+    """
+    from lodestream.formats import Format
+
+    if len(files) > 1:
+        raise FormatError(f"expected a container by itself, got it among {len(files)} files")
+    for option in options:
+        raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
+    _check_metadata(files[0])
+    return Format("lode", (".lode",), lambda head, suffix: False)
+
+
+def _check_metadata(path: Path) -> None:
+    """Refuse metadata by the length that they announce; what else may be wrong is found when all is looked through."""
+    from lodestream.container import section_lengths
+    from lodestream.container.metadata import MAX_BYTES
+    from lodestream.container.sections import METADATA
+
+    with path.open("rb") as file:
+        for kind, length in islice(section_lengths(file), _MOST_SECTIONS):
+            if kind == METADATA and length > MAX_BYTES:
+                raise TooLargeError(f"expected at most {MAX_BYTES} bytes of metadata in a container, got {length}")
+
+
+def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, str]:
+    """Check an uploaded container, and copy it to a path; returns its SHA-256 and who vouches for its errors.
+
+    Raises
+    ------
+    StreamError
+        If it is damaged, cut short, followed by more bytes, or of a version that this server does not read; or if its
+        metadata are too long or cannot be expressed in JSON.
+    TooLargeError
+        If it has more vertices than allowed.
+    """
+    from lodestream.container import describe
+    from lodestream.decoding.inspection import inspect
+
+    digest = hashlib.sha256()
+    with job.files[0].open("rb") as source:
+        found = inspect(source, max_vertices=job.max_vertices, progress=progress)
+        checked(found.index, describe(found.index))
+        source.seek(0)
+        with NewFile(path) as target:
+            while block := source.read(_BLOCK):
+                digest.update(block)
+                target.write(block)
+    return digest.hexdigest(), CHECKED if found.errors_checked else TOLD
+
+
+def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Path]) -> dict[str, Any]:
+    """The description of a surface whose container has this index.
+
+    Parameters
+    ----------
+    index : Index
+    known : mapping or None
+        The earlier description; it alone says who vouches for the errors.
+    files : sequence of Path
+        The upload, as far as it exists. If it is a container and there is no earlier description, nobody vouches for
+        the errors.
+    """
+    from lodestream.container import describe
+
+    info: dict[str, Any] = plain(describe(index))
+    errors = (known or {}).get(ERRORS)
+    if errors in (CHECKED, TOLD):
+        info[ERRORS] = errors
+    elif any(path.is_file() and is_container(path) for path in files):
+        info[ERRORS] = TOLD
+    return info
+
+
+def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
+    """The description of a container as plain JSON values.
+
+    Raises
+    ------
+    CorruptStreamError, TooLargeError
+        If JSON cannot express it.
+    """
+    place = index.metadata
+    name = index.metadata_values.get("name", "")
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        raise CorruptStreamError(
+            f"expected a name of at most {_LONGEST_NAME} characters, got {str(name)[:80]!a}", place.offset
+        )
+    try:
+        told: dict[str, Any] = plain(info)
+        json.dumps(told, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CorruptStreamError(f"expected metadata that JSON can express: {error}"[:300], place.offset) from None
+    return told

@@ -1,0 +1,187 @@
+"""Making one level of a surface as a file; runs in a separate process."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from lodestream.errors import (
+    FormatError,
+    FormatWarning,
+    InputError,
+    LodestreamError,
+    OptionError,
+    StreamError,
+    TooLargeError,
+    UnavailableError,
+)
+from lodestream.formats import formats
+
+from .processes import reason_of
+
+if TYPE_CHECKING:
+    from lodestream import Surface
+
+__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "RefusedLevel", "make_level"]
+
+#: The formats of a level, and what they are called on the way.
+MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
+
+# What an error is told as: the first class that fits.
+_KINDS: tuple[type[LodestreamError], ...] = (
+    TooLargeError,
+    OptionError,
+    FormatError,
+    InputError,
+    UnavailableError,
+    StreamError,
+    LodestreamError,
+)
+
+
+@dataclass(frozen=True)
+class LevelJob:
+    """A level to be made.
+
+    Attributes
+    ----------
+    container : Path level : int
+    format_name : str
+        A key of `MEDIA_TYPES`.
+    folder : Path
+        Folder to write to; empty at the start.
+    most_bytes : int
+        Largest file that may be written.
+    """
+
+    container: Path
+    level: int
+    format_name: str
+    folder: Path
+    most_bytes: int
+
+    @property
+    def path(self) -> Path:
+        """Path of the file to write."""
+        return self.folder / "level"
+
+
+@dataclass(frozen=True)
+class MadeLevel:
+    """The file was made; its size in bytes."""
+
+    size: int
+
+
+@dataclass(frozen=True)
+class RefusedLevel:
+    """The file was not made.
+
+    Attributes
+    ----------
+    kind : str
+        Name of an exception class: `TooLargeError` if the file became too large; otherwise the class that was raised,
+        or a base of it.
+    reason : str
+        One line.
+    """
+
+    kind: str
+    reason: str
+
+    def error(self) -> LodestreamError:
+        """The exception, limited to known classes: the process is not trusted."""
+        kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
+        return kind(reason_of(self.reason))
+
+
+def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Decode a level and write it in a format.
+
+    Raises
+    ------
+    OSError
+        If the disk does not accept it, or the container does not exist any more.
+    """
+    # Errors come back as values: not every exception survives the way between processes.
+    try:
+        surface = _decode(job)
+        with _short_files(job):
+            path = _write(surface, job)
+    except LodestreamError as error:
+        return RefusedLevel(next(kind.__name__ for kind in _KINDS if isinstance(error, kind)), str(error))
+    return MadeLevel(path.stat().st_size)
+
+
+def _decode(job: LevelJob) -> Surface:
+    from lodestream import Decoder, Target
+    from lodestream.container import read_index
+    from lodestream.planning.planner import plan
+
+    with job.container.open("rb") as file:
+
+        def read(offset: int, length: int) -> bytes:
+            file.seek(offset)
+            return file.read(length)
+
+        index = read_index(read, os.fstat(file.fileno()).st_size)
+        chosen = plan(index, Target(level=job.level))
+        decoder = Decoder(level=job.level)
+        for place in (*chosen.before, *chosen.ranges, *chosen.after):
+            decoder.feed_at(place.offset, read(place.offset, place.length))
+    return decoder.surface(job.level)
+
+
+def _write(surface: Surface, job: LevelJob) -> Path:
+    from lodestream.formats import write_stream
+
+    path = job.path
+    with path.open("xb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # whoever asked for a format knows what it holds
+        write_stream(surface, job.format_name, _Plain(file))  # type: ignore[arg-type]  # only its `write` is used
+    return path
+
+
+class _Plain:
+    """A file that can only be written, so that a write that fails says why."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.write = file.write
+
+
+@contextmanager
+def _short_files(job: LevelJob) -> Iterator[None]:
+    """Let files become so long and no longer, those included that a library writes on the way to the format.
+
+    Raises
+    ------
+    TooLargeError
+        When one was to become longer, whatever the library makes of that.
+    """
+    exceeded: list[int] = []
+    before, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    most = job.most_bytes if hard == resource.RLIM_INFINITY else min(job.most_bytes, hard)
+    handler = signal.signal(signal.SIGXFSZ, lambda number, frame: exceeded.append(number))
+    folder, tempfile.tempdir = tempfile.tempdir, str(job.folder)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    try:
+        yield
+    except Exception as error:
+        if not exceeded:
+            raise
+        raise TooLargeError(os.strerror(errno.EFBIG)) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (before, hard))
+        tempfile.tempdir = folder
+        signal.signal(signal.SIGXFSZ, handler)
+    if exceeded:
+        raise TooLargeError(os.strerror(errno.EFBIG))

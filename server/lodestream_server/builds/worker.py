@@ -1,0 +1,306 @@
+"""The code of a build process: reads an untrusted file and encodes it.
+
+The server survives whatever happens here, and does not trust the result (`results`).
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import logging
+import os
+import re
+import time
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lodestream.container.metadata import with_notes
+from lodestream.errors import (
+    FormatWarning,
+    LodestreamError,
+    StreamError,
+    SwitchedOffError,
+    TooLargeError,
+    UnavailableError,
+    UnsupportedVersionError,
+)
+
+from ..storage.durable import NewFile
+from . import finished
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from lodestream import Surface
+
+__all__ = [
+    "ALLOWED_BY",
+    "ATTRIBUTE",
+    "CLOSED",
+    "UNNAMED",
+    "Built",
+    "Job",
+    "Refused",
+    "build",
+    "preload",
+    "read_progress",
+]
+
+_log = logging.getLogger(__name__)
+
+#: The values of ``closed``; `auto` leaves what the file says.
+CLOSED = ("auto", "none", "rows", "cols", "both")
+
+#: What stands before the name of an attribute in the key of its precision.
+ATTRIBUTE = "precision="
+
+#: What a file without a name is called in messages, which must not tell where it lies on the server.
+UNNAMED = "upload"
+
+#: What is said to whoever brings a file of a format that is switched off.
+ALLOWED_BY = "on this server; its setting LODESTREAM_FORMATS lists those that are read"
+
+# Errors of the system that say nothing of what is in a file.
+_LOCAL = {
+    errno.EACCES,
+    errno.EAGAIN,
+    errno.EBADMSG,
+    errno.EDQUOT,
+    errno.EHOSTDOWN,
+    errno.EIO,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENODEV,
+    errno.ENOENT,
+    errno.ENOMEM,
+    errno.ENOSPC,
+    errno.ENXIO,
+    errno.EPERM,
+    errno.EREMOTEIO,
+    errno.EROFS,
+    errno.ESTALE,
+    errno.ETIMEDOUT,
+    errno.EUCLEAN,
+}
+
+_SHORT_OF_MEMORY = re.compile(
+    r"memory alloc|cannot allocate|can't allocate|unable to allocate|out of memory|bad_alloc|filter returned failure",
+    re.IGNORECASE,
+)
+
+_PROGRESS = "progress"
+_CONTAINER = "container"
+_REPORT_SECONDS = 0.1
+_LONGEST_PROGRESS = 20
+
+
+@dataclass(frozen=True)
+class Job:
+    """One build.
+
+    Attributes
+    ----------
+    files : tuple of Path
+    filename : str or None
+        Original name of the first file.
+    name : str or None
+        Name for the surface.
+    precision : str or None
+        As on the command line: a number, or a number and ``d``.
+    rms : str or None
+        In the same notation; at most one of the two.
+    closed : str
+        One of `CLOSED`.
+    options : mapping of str to str
+        Options of the format, and precisions of attributes: their keys begin with `ATTRIBUTE`.
+    max_vertices : int
+    folder : Path
+        Folder to write to; empty at the start.
+    allowed : tuple of str or None
+        Names of the formats that may be read; None: all.
+    """
+
+    files: tuple[Path, ...]
+    filename: str | None
+    name: str | None
+    precision: str | None
+    rms: str | None
+    closed: str
+    options: dict[str, str]
+    max_vertices: int
+    folder: Path
+    allowed: tuple[str, ...] | None = None
+
+    @property
+    def container(self) -> Path:
+        """Path of the container to write."""
+        return self.folder / _CONTAINER
+
+
+@dataclass(frozen=True)
+class Built:
+    """A container was built; it is on disk, in the folder of its job.
+
+    Attributes
+    ----------
+    sha256 : str
+    errors : str or None
+        For an uploaded container, who vouches for its errors (`finished.ERRORS`).
+    """
+
+    sha256: str
+    errors: str | None = None
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The upload was not built.
+
+    Attributes
+    ----------
+    reason : str
+        One line.
+    final : bool
+        True if the reader rejected the file, so that a retry would end the same; False if the reason may pass.
+    """
+
+    reason: str
+    final: bool = True
+
+
+def preload() -> None:
+    """Import what builds and levels need, so that a process that is forked for one has it at once.
+
+    The libraries that read some formats are not among it: a process imports those when it comes to such a file.
+
+    Raises
+    ------
+    UnavailableError
+        When the compiled kernels cannot be loaded.
+    """
+    import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
+
+    import lodestream.decoding.decoder
+    import lodestream.decoding.inspection
+    import lodestream.encoding.encoder
+    import lodestream.formats
+    import lodestream.mesh.recognise
+    import lodestream.planning.planner  # noqa: F401
+    from lodestream.library import library
+
+    from . import levels  # noqa: F401
+
+    library()
+
+
+def build(job: Job) -> Built | Refused:
+    """Read and encode an upload."""
+    # Errors come back as values: not every exception survives the way between processes.
+    try:
+        return _build(job)
+    except SwitchedOffError as error:
+        return Refused(f"{error} {ALLOWED_BY}", final=False)
+    except LodestreamError as error:
+        return Refused(str(error), final=not _may_pass(error))
+
+
+def _may_pass(error: LodestreamError) -> bool:
+    """Whether an upload was refused for what this server lacks, or forbids, and not for its bytes."""
+    if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
+        return True
+    cause: BaseException | None = error
+    while cause is not None:  # what a reader made its own error of
+        if isinstance(cause, MemoryError) or getattr(cause, "errno", None) in _LOCAL:
+            return True
+        # HDF5 and GDAL say it in words only; a filter fails for want of memory as for damage.
+        if _SHORT_OF_MEMORY.search(str(cause)):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False
+
+
+def read_progress(folder: Path) -> float:
+    """The fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
+    try:
+        handle = os.open(folder / _PROGRESS, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return 0.0
+    try:
+        fraction = float(os.read(handle, _LONGEST_PROGRESS))
+    except (OSError, ValueError):
+        return 0.0
+    finally:
+        os.close(handle)
+    return fraction if 0.0 <= fraction <= 1.0 else 0.0
+
+
+def _build(job: Job) -> Built:
+    from lodestream import Tolerance, encode
+    from lodestream.formats import check_allowed
+
+    path = job.container
+    if finished.is_container(job.files[0]):
+        check_allowed(("lode",), job.allowed)
+        try:
+            return Built(*finished.keep(job, path, _reporter(job.folder)))
+        except (StreamError, TooLargeError) as error:
+            error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
+            raise
+    surface = _read(job)
+    precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
+    precisions = {
+        key.removeprefix(ATTRIBUTE): Tolerance.parse(value)
+        for key, value in job.options.items()
+        if key.startswith(ATTRIBUTE)
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
+        container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
+    with NewFile(path) as file:
+        file.write(container)
+    return Built(hashlib.sha256(container).hexdigest())
+
+
+def _read(job: Job) -> Surface:
+    from lodestream.encoding.losses import at_holes
+    from lodestream.formats import read
+
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always", FormatWarning)
+        surface = read(
+            *job.files,
+            closed=job.closed,
+            max_vertices=job.max_vertices,
+            filename=job.filename or UNNAMED,
+            allowed=job.allowed,
+            **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
+        )
+    said = [str(warning.message) for warning in found if warning.category is FormatWarning]
+    notes = dict.fromkeys([*said, *filter(None, [at_holes(surface)])])
+    if job.name is not None:
+        surface.metadata["name"] = job.name
+    elif job.filename is None:
+        # Nobody gave it one: the reader took it from the name that stands in for the file's.
+        surface.metadata.pop("name", None)
+    surface.metadata = with_notes(surface.metadata, list(notes))  # whoever uploaded it does not see what happens here
+    return surface
+
+
+def _reporter(folder: Path) -> Callable[[float], None]:
+    last = float("-inf")
+
+    def report(fraction: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _REPORT_SECONDS:
+            last = now
+            # Renamed, so that the server never reads half a number; not worth a sync, nor an end if the disk is full.
+            new = folder / f"{_PROGRESS}.new"
+            with suppress(OSError):
+                new.write_text(f"{min(max(fraction, 0.0), 1.0):.4f}")
+                new.replace(folder / _PROGRESS)
+
+    return report

@@ -1,0 +1,1 @@
+"""Connections with limits on waiting, reading and frames, below the framework."""

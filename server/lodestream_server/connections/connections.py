@@ -1,0 +1,337 @@
+"""HTTP connections with limits on waiting and reading.
+
+The head of a request must arrive in time, and a client must read its answer in time. Received data are processed in
+small pieces, so that other connections get their turn. If a request is answered before all of it has arrived, a bounded
+rest is read so that the client sees the answer; then the connection is cut.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from functools import partial
+from typing import Any, cast
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from ..operation.pace import Pace
+from ..operation.settings import Settings
+from .bodies import MOST_REST, CountedConnection
+from .cuts import Cuts
+from .frames import call_when_lost
+from .open_files import most_connections
+
+__all__ = ["connections"]
+
+# What is given to h11 at once where a body does not say how long it is: little where chunks are small, since each costs
+# as much as many bytes, and more from one piece to the next where they are not.
+_LEAST_PIECE = 256
+_LARGEST_PIECE = 8 * 1024
+
+# Chunks of a piece that are few, and chunks after which others have their turn.
+_FEW_CHUNKS = 4
+_CHUNKS_A_TURN = 16
+
+# How long a client has to see the answer to a request that it has not sent whole.
+_REST_SECONDS = 3.0
+
+_TITLES = {
+    "bad-request": "Not a valid request",
+    "busy": "The server is busy; try again later",
+    "idle": "The client was too slow",
+    "small-chunks": "The chunks of the body are too small",
+}
+
+
+def connections(settings: Settings, cuts: Cuts, pace: Pace) -> type[H11Protocol]:
+    """The class of a server's HTTP connections; uvicorn creates one instance for each."""
+
+    class Chosen(_Connection):
+        head_seconds = settings.head_seconds
+        idle_seconds = settings.idle_seconds
+        most = most_connections(settings)
+
+    Chosen.cuts = cuts
+    Chosen.pace = pace
+    return Chosen
+
+
+class _Connection(H11Protocol):
+    """uvicorn's connection, with the limits that it does not have.
+
+    Attributes
+    ----------
+    head_seconds : float
+        How long the head of a request may take, its first byte included.
+    idle_seconds : float
+        How long a client may take nothing of what is to be sent.
+    most : int
+        How many connections there may be.
+    cuts : Cuts
+        Where it is written down when the connection is cut.
+    pace : Pace
+        What has come and is not looked at yet waits there.
+    """
+
+    head_seconds: float
+    idle_seconds: float
+    most: int
+    cuts: Cuts
+    pace: Pace
+    conn: CountedConnection
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.conn = CountedConnection()
+        self._head_timer: asyncio.TimerHandle | None = None
+        self._rest_timer: asyncio.TimerHandle | None = None
+        self._waits = False
+        self._held = bytearray()
+        self._piece = _LEAST_PIECE
+        self._rest = 0
+        self._watch: _Watch | None = None
+        self._upgraded = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        self._socket = transport
+        self._guarded = _Transport(self, transport)
+        super().connection_made(cast(asyncio.Transport, self._guarded))
+        self._watch = _Watch(transport, self.loop, self.idle_seconds)
+        if len(self.connections) > self.most:
+            self._refuse(503, "busy", f"expected at most {self.most} connections; try again in a few seconds")
+        else:
+            self._follow_head()
+
+    def data_received(self, data: bytes) -> None:
+        if self._rest_timer is not None:
+            self._rest += len(data)
+            if self._rest > MOST_REST:
+                self._socket.pause_reading()
+        elif not self._socket.is_closing():
+            self._held += data
+            if not self._waits:
+                self._feed()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._follow_head()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        self._upgraded = True
+        if self._watch is not None:
+            self._watch.upgraded = True
+        # It costs five times as much as the rest of a connection's beginning.
+        self._socket.pause_reading()
+        self.pace.later(partial(self._upgrade, event))
+
+    def _upgrade(self, event: h11.Request) -> None:
+        if self._socket.is_closing():
+            return
+        self.transport = self._socket
+        self._guarded.let_go()
+        super().handle_websocket_upgrade(event)
+        if self._watch is not None:
+            call_when_lost(self._socket.get_protocol(), self._watch.end)
+        self._socket.resume_reading()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._forget_head()
+        if self._rest_timer is not None:
+            self._rest_timer.cancel()
+        self._held.clear()
+        if self._watch is not None:
+            self._watch.end()
+        super().connection_lost(exc)
+        self._guarded.let_go()
+
+    def resume_writing(self) -> None:
+        if self._watch is not None:
+            self._watch.moved = True
+        super().resume_writing()
+
+    def send_400_response(self, msg: str) -> None:
+        code = "bad-request" if self.conn.offence is None else "small-chunks"
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            self.cuts.note(code, self.client)
+            self._refuse(400, code, self.conn.offence or "expected a valid HTTP/1.1 request")
+        else:
+            # The answer is under way already, or was sent.
+            self._cut(code)
+
+    def resume_reading(self) -> None:
+        """Go on with what has come already; then with what comes."""
+        if self._held and not self._upgraded:
+            self._feed_later()
+        else:
+            self._socket.resume_reading()
+
+    def is_closing(self) -> bool:
+        """Whether no other request is taken."""
+        return self._rest_timer is not None or self._socket.is_closing()
+
+    def close(self) -> None:
+        """Close, but let a client that is still sending see the answer first.
+
+        A socket that is closed before everything was read from it sends a reset, which may overtake the answer.
+        """
+        unread = self._held or self.conn.their_state in (h11.SEND_BODY, h11.ERROR)
+        if self._upgraded or self.is_closing() or not unread:
+            self._socket.close()
+            return
+        self._forget_head()
+        self._leave_request()
+        self._rest = len(self._held)
+        self._held.clear()
+        self._socket.write_eof()
+        if self._rest <= MOST_REST:
+            self._socket.resume_reading()
+        self._rest_timer = self.loop.call_later(_REST_SECONDS, self._rest_is_over)
+
+    def _feed(self) -> None:
+        self._waits = False
+        before = self.conn.chunks
+        while self._may_feed() and self.conn.chunks - before < _CHUNKS_A_TURN:
+            size, chunks = max(self._piece, self.conn.remaining), self.conn.chunks
+            piece = bytes(self._held[:size])
+            del self._held[:size]
+            super().data_received(piece)
+            few = self.conn.chunks - chunks <= _FEW_CHUNKS
+            self._piece = min(2 * self._piece, _LARGEST_PIECE) if few else _LEAST_PIECE
+        if self._upgraded:
+            # A client waits for the answer to its handshake before it sends anything else.
+            self._held.clear()
+        elif not self.is_closing():
+            # While some of it waits no more is read.
+            if self._held:
+                self._socket.pause_reading()
+            elif not self.flow.read_paused:
+                self._socket.resume_reading()
+            if self._may_feed():
+                self._feed_later()
+        self._follow_head()
+
+    def _feed_later(self) -> None:
+        if not self._waits:
+            self._waits = True
+            self.pace.later(self._feed)
+
+    def _may_feed(self) -> bool:
+        return bool(self._held) and not (self._upgraded or self.flow.read_paused or self.is_closing())
+
+    def _rest_is_over(self) -> None:
+        if self._socket.get_write_buffer_size():
+            # A client that takes nothing of the answer is found out by the watch.
+            self._rest_timer = self.loop.call_later(_REST_SECONDS, self._rest_is_over)
+        elif self._rest > MOST_REST:
+            self._cut("refused-body")
+        else:
+            self._socket.abort()
+
+    def _leave_request(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+
+    def _cut(self, reason: str) -> None:
+        self.cuts.note(reason, self.client)
+        self._held.clear()
+        self._socket.abort()
+
+    def _follow_head(self) -> None:
+        # The clock is not set back by a byte: a head that comes byte by byte is late like one that does not come. The
+        # rest of a body that was answered before it was whole is read, since a client may look only after it.
+        answered = self.cycle is not None and self.cycle.response_complete
+        waiting = self.conn.their_state is h11.IDLE or (answered and self.conn.their_state is h11.SEND_BODY)
+        if self._upgraded or self.is_closing() or not waiting:
+            self._forget_head()
+        elif self._head_timer is None:
+            self._head_timer = self.loop.call_later(self.head_seconds, self._head_is_late)
+
+    def _forget_head(self) -> None:
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
+
+    def _head_is_late(self) -> None:
+        self._head_timer = None
+        if self.conn.our_state is h11.IDLE:
+            self._refuse(408, "idle", f"expected the complete head of a request within {self.head_seconds:g} s")
+        else:
+            self._cut("refused-body")
+
+    def _refuse(self, status: int, code: str, detail: str) -> None:
+        self._leave_request()
+        problem = {"type": f"urn:lodestream:{code}", "title": _TITLES[code], "status": status, "code": code}
+        body = json.dumps({**problem, "detail": detail, "instance": None}).encode()
+        headers = [
+            ("content-type", "application/problem+json"),
+            ("content-length", str(len(body))),
+            ("connection", "close"),
+        ]
+        if status != 400:
+            headers.append(("retry-after", "5"))
+        asked_for_head = self.conn.our_state is h11.SEND_RESPONSE and self.scope["method"] == "HEAD"
+        sent = h11.Data(data=b"" if asked_for_head else body)
+        for event in (h11.Response(status_code=status, headers=headers), sent, h11.EndOfMessage()):
+            self.transport.write(self.conn.send(event))
+        self.transport.close()
+
+
+class _Transport:
+    """What a connection and its requests see of their transport: closing and reading are left to the connection."""
+
+    def __init__(self, connection: _Connection, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        self.close = connection.close
+        self.is_closing = connection.is_closing
+        self.resume_reading = connection.resume_reading
+
+    def let_go(self) -> None:
+        """Forget the connection, which so needs no garbage collection."""
+        self.close = self._transport.close
+        self.is_closing = self._transport.is_closing
+        self.resume_reading = self._transport.resume_reading
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
+class _Watch:
+    """Looks from time to time whether the other side takes what is to be sent; breaks the connection if it does not.
+
+    It holds the transport and not the connection, which is gone once it has become a stream.
+
+    Attributes
+    ----------
+    moved : bool
+        Something has been taken since the last look.
+    upgraded : bool
+        The connection has become a stream.
+    """
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, seconds: float) -> None:
+        self.moved = False
+        self.upgraded = False
+        self._transport = transport
+        self._loop = loop
+        self._seconds = seconds
+        self._unsent = 0
+        self._timer = loop.call_later(seconds, self._look)
+
+    def end(self) -> None:
+        """Stop looking, so that nothing of a connection that has ended is kept until the next look."""
+        self._timer.cancel()
+
+    def _look(self) -> None:
+        # A transport that is told to close first sends what it holds, for as long as that takes: this is its end, too.
+        unsent, closing = self._transport.get_write_buffer_size(), self._transport.is_closing()
+        if closing and not unsent:
+            return
+        # In a stream the other side's credit and the stream's own clock decide, until it is being closed.
+        judged = closing or not self.upgraded
+        if judged and not self.moved and 0 < self._unsent <= unsent:
+            self._transport.abort()
+            return
+        self._unsent, self.moved = unsent, False
+        self._timer = self._loop.call_later(self._seconds, self._look)

@@ -1,0 +1,1 @@
+"""The routes of HTTP and WebSocket, and the documents that describe them."""

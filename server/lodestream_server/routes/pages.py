@@ -1,0 +1,99 @@
+"""The routes about the server itself."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, Response
+
+import lodestream
+
+from ..access.scopes import needs
+from . import examples
+from .documentation import render
+from .html_page import html_page
+from .routing import Parts, readable
+
+__all__ = ["router"]
+
+router = APIRouter(tags=["server"])
+
+_HOME = f"""<h1>Lodestream {lodestream.__version__}</h1>
+<p>This server streams structured surfaces, coarsest level first. The error is known at each step.</p>
+<pre>
+lodestream push surface.npy HOST      upload
+lodestream list HOST                  list the surfaces
+lodestream pull URL out.npy --until-rms 1e-3d
+</pre>
+<ul>
+<li><a href="v1/surfaces">Surfaces on this server</a></li>
+<li><a href="docs">The HTTP interface</a></li>
+</ul>
+"""
+
+
+@readable(router, "/", include_in_schema=False)
+@needs(None)
+async def home() -> Response:
+    """A start page for browsers."""
+    return html_page("Lodestream", _HOME)
+
+
+@readable(router, "/docs", include_in_schema=False)
+@needs(None)
+async def docs(request: Request) -> Response:
+    """The HTTP interface, for people."""
+    return html_page("Lodestream: the HTTP interface", render(request.app.openapi(), f"{_root(request)}/openapi.json"))
+
+
+@readable(router, "/openapi.json", include_in_schema=False)
+@needs(None)
+async def interface(request: Request) -> Response:
+    """The HTTP interface, for programs."""
+    root = _root(request)
+    return JSONResponse(request.app.openapi() | ({"servers": [{"url": root}]} if root else {}))
+
+
+@readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
+@needs(None)
+async def healthz() -> Response:
+    """Answer at once."""
+    return JSONResponse({"status": "ok", "version": lodestream.__version__})
+
+
+@readable(
+    router,
+    "/readyz",
+    summary="Ready",
+    responses={
+        200: examples.answer("Builds can begin", {"status": "ready", "confinement": "landlock+seccomp"}),
+        503: examples.answer("Not yet", {"status": "starting", "confinement": None}),
+    },
+)
+@needs(None)
+async def readyz(parts: Parts) -> Response:
+    """Whether the process that builds come from has loaded what they need. Before that uploads wait, all else works.
+
+    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``.
+    """
+    confinement = parts.builder.confinement
+    if parts.builder.ready:
+        return JSONResponse({"status": "ready", "confinement": confinement})
+    return JSONResponse({"status": "starting", "confinement": confinement}, 503, {"retry-after": "1"})
+
+
+@readable(
+    router,
+    "/metrics",
+    summary="Figures for Prometheus",
+    response_class=Response,
+    responses={200: {"description": "The figures", "content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+@needs("admin")
+async def metrics(parts: Parts) -> Response:
+    """All metrics of the server since it started."""
+    return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
+
+
+def _root(request: Request) -> str:
+    root: str = request.scope.get("root_path", "")
+    return root

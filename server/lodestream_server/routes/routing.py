@@ -1,0 +1,75 @@
+"""Code shared by the routes: the server's parts, and HEAD for every GET."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar
+
+from fastapi import APIRouter, Depends
+from fastapi.requests import HTTPConnection
+from fastapi.responses import Response
+
+from ..access.access import Access
+from ..access.limits import Limits
+from ..builds.jobs import Builder
+from ..builds.level_queue import LevelQueue
+from ..builds.shares import Turns
+from ..operation.metrics import Metrics
+from ..operation.pace import Pace
+from ..operation.settings import Settings
+from ..storage.containers import Containers
+from ..storage.storage import Storage
+
+__all__ = ["Parts", "State", "matches", "readable"]
+
+# For so many seconds it counts who has had plans made.
+_PLANS_REMEMBERED = 60.0
+
+_Route = TypeVar("_Route", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class State:
+    """The parts of a running server.
+
+    ``planning`` is held while a large plan is made: one at a time, because it slows down all other Python code.
+    """
+
+    settings: Settings
+    storage: Storage
+    builder: Builder
+    containers: Containers
+    access: Access
+    limits: Limits
+    metrics: Metrics
+    levels: LevelQueue
+    pace: Pace
+    planning: Turns = field(default_factory=lambda: Turns(1, _PLANS_REMEMBERED), init=False)
+
+
+def _parts(connection: HTTPConnection) -> State:
+    state: State = connection.app.state.parts
+    return state
+
+
+#: A route's parameter of this type is given the server's parts.
+Parts = Annotated[State, Depends(_parts)]
+
+
+def readable(router: APIRouter, path: str, **options: Any) -> Callable[[_Route], _Route]:
+    """Decorator for routes that answer GET, and HEAD in the same way; OpenAPI lists GET only."""
+
+    def register(route: _Route) -> _Route:
+        router.head(path, include_in_schema=False)(route)
+        return router.get(path, **options)(route)
+
+    return register
+
+
+def matches(header: str | None, etag: str) -> Response | None:
+    """A 304 answer if the client's If-None-Match names this entity tag, else None."""
+    named = [item.strip().removeprefix("W/") for item in (header or "").split(",")]
+    if etag in named or "*" in named:
+        return Response(status_code=304, headers={"etag": etag})
+    return None

@@ -1,0 +1,1 @@
+"""The data folder: records, uploads and containers that survive a power failure."""

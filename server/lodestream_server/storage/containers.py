@@ -1,0 +1,209 @@
+"""Stored containers that are open for reading, and their indexes."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, BinaryIO
+from weakref import WeakValueDictionary
+
+from lodestream.container.capacity import memory_limit
+from lodestream.errors import CorruptStreamError, StreamError
+
+from ..problems import BusyError
+from . import damage
+from .storage import Storage
+
+if TYPE_CHECKING:
+    from lodestream.container import ByteRange, Index
+
+__all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes"]
+
+# An index holds a record per segment, and whoever makes a container may make many: so many are kept when nobody has the
+# container open any more, as long as they take no more bytes than this.
+_INDEXES_KEPT = 16
+_BYTES_KEPT = 64 << 20
+
+# Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
+_NOWAIT = getattr(os, "RWF_NOWAIT", 0)
+
+
+@dataclass(frozen=True)
+class OpenContainer:
+    """A container that is open for reading; it stays readable if it is deleted meanwhile."""
+
+    sha256: str
+    index: Index
+    file: BinaryIO
+
+    def read(self, place: ByteRange) -> bytes:
+        """Read a slice; fewer bytes if the file ends. May be called from any thread."""
+        return _read_from(self.file.fileno(), place.offset, place.length)
+
+    def read_at_once(self, place: ByteRange) -> bytes | None:
+        """Read a slice if that needs no disk access; None if it would, or if the system cannot tell."""
+        if not _NOWAIT:
+            return None
+        buffer = bytearray(place.length)
+        try:
+            count = os.preadv(self.file.fileno(), [buffer], place.offset, _NOWAIT)
+        except OSError:
+            return None
+        # Fewer bytes: the rest is not in memory, or the file has been cut.
+        return bytes(buffer) if count == place.length else None
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+
+class Containers:
+    """The containers of a storage, with the indexes of open containers and the most recently used others.
+
+    Parameters
+    ----------
+    storage : Storage
+    most : int or None
+        Bytes of memory that all indexes may take; None: `most_for_indexes`.
+    """
+
+    def __init__(self, storage: Storage, most: int | None = None) -> None:
+        self._storage = storage
+        self._most = most_for_indexes() if most is None else most
+        self._coming = 0  # bytes of indexes that are being read
+        self._lock = threading.Lock()
+        self._used: OrderedDict[str, Index] = OrderedDict()
+        self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
+        self._readers: WeakValueDictionary[str, _Reader] = WeakValueDictionary()
+
+    def open(self, sha256: str) -> OpenContainer:
+        """Open a container.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none.
+        MissingError
+            If it is not on disk.
+        StreamError
+            If it is damaged.
+        BusyError
+            If the indexes of open containers leave no memory for its index, or it was deleted and stored again at this
+            moment.
+        """
+        try:
+            file = self._storage.container(sha256).open("rb")
+        except FileNotFoundError:
+            raise self._storage.gone(sha256) from None
+        try:
+            return OpenContainer(sha256, self._index(sha256, file), file)
+        except StreamError as error:
+            file.close()
+            damage.tell(self._storage, sha256, error)
+            raise
+        except BaseException:
+            file.close()
+            raise
+
+    def _index(self, sha256: str, file: BinaryIO) -> Index:
+        with self._lock:
+            known = self._known(sha256)
+            if known is not None:
+                return known
+            reader = self._readers.get(sha256)
+            if reader is None:
+                reader = self._readers[sha256] = _Reader()
+        # Of many who open one container at the same time one reads its index.
+        with reader.lock:
+            with self._lock:
+                known = self._known(sha256)
+            if known is None:
+                with self._room(index_memory(file)):
+                    known = _read_index(file)
+                    with self._lock:
+                        self._indexes[sha256] = known
+                        self._known(sha256)
+            return known
+
+    @contextmanager
+    def _room(self, size: int) -> Iterator[None]:
+        with self._lock:
+            if self._taken() + size > self._most:
+                self._used.clear()
+            taken = self._taken()
+            if taken + size > self._most:
+                raise BusyError(
+                    f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
+                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; try again soon"
+                )
+            self._coming += size
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._coming -= size
+
+    def _taken(self) -> int:
+        return self._coming + sum(map(_memory_of, self._indexes.values()))
+
+    def _known(self, sha256: str) -> Index | None:
+        index = self._indexes.get(sha256)
+        if index is not None:
+            self._used[sha256] = index
+            self._used.move_to_end(sha256)
+            while len(self._used) > _INDEXES_KEPT or sum(map(_memory_of, self._used.values())) > _BYTES_KEPT:
+                self._used.popitem(last=False)
+        return index
+
+
+class _Reader:
+    """Whoever reads an index, and those who wait for it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+
+def most_for_indexes() -> int:
+    """Bytes of memory that indexes may take: an eighth of the memory available."""
+    return memory_limit() // 8
+
+
+def index_memory(file: BinaryIO) -> int:
+    """Bytes of memory that a container's index will take, computed from the footer; 0 if there is no footer."""
+    from lodestream.container.reader import INDEX_GROWTH
+    from lodestream.container.sections import FOOTER_LENGTH, parse_footer
+
+    tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
+    try:
+        return INDEX_GROWTH * parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
+    except CorruptStreamError:
+        return 0
+
+
+def _memory_of(index: Index) -> int:
+    from lodestream.container.reader import INDEX_GROWTH
+
+    return INDEX_GROWTH * index.index.length
+
+
+def _read_index(file: BinaryIO) -> Index:
+    from lodestream.container import read_index
+
+    handle = file.fileno()
+    return read_index(partial(_read_from, handle), os.fstat(handle).st_size)
+
+
+def _read_from(handle: int, offset: int, length: int) -> bytes:
+    """Read bytes of a file, fewer if it ends; repeats reads that the system cuts short."""
+    data = bytearray()
+    while len(data) < length:
+        piece = os.pread(handle, length - len(data), offset + len(data))
+        if not piece:
+            break
+        data += piece
+    return bytes(data)

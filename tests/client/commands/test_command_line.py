@@ -1,0 +1,445 @@
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.console import Console
+
+import lodestream as ls
+from lodestream_client.commands import surfaces
+
+from ..conftest import Run
+
+Terrain = NDArray[np.float32]
+KEYS = {"bytes", "wire_bytes", "level", "rms", "max", "seconds", "ended"}
+
+# Both ways to the same surface: from a file, and from a server.
+Fetch = Callable[..., tuple[int, dict[str, Any], str]]
+
+
+@pytest.fixture(params=["decode", "pull"])
+def fetch(request: pytest.FixtureRequest, run: Run, container_file: Path, tmp_path: Path) -> Fetch:
+    source = container_file if request.param == "decode" else request.getfixturevalue("surface")
+
+    def call(*options: object, out: str = "out.npy") -> tuple[int, dict[str, Any], str]:
+        code, stdout, stderr = run(request.param, source, tmp_path / out, "--json", *options)
+        return code, json.loads(stdout) if stdout else {}, stderr
+
+    return call
+
+
+@pytest.fixture
+def info(run: Run, container_file: Path) -> dict[str, Any]:
+    code, stdout, _ = run("info", container_file, "--json")
+    assert code == 0
+    described: dict[str, Any] = json.loads(stdout)
+    return described
+
+
+def error_of(points: NDArray[Any], terrain: Terrain) -> float:
+    return float(np.sqrt(np.mean((points.astype(float) - terrain) ** 2)))
+
+
+def test_a_whole_surface_is_the_original(fetch: Fetch, terrain: Terrain, tmp_path: Path, info: dict[str, Any]) -> None:
+    code, figures, _ = fetch()
+    assert code == 0
+    assert set(figures) == KEYS
+    assert figures["ended"] == "complete"
+    assert (figures["rms"], figures["max"]) == (0, 0)
+    assert figures["bytes"] == info["levels"][-1]["bytes"]
+    assert figures["wire_bytes"] > figures["bytes"]
+    assert np.array_equal(np.load(tmp_path / "out.npy"), terrain)
+
+
+def test_a_byte_limit_is_the_last_layer_within(
+    fetch: Fetch, terrain: Terrain, tmp_path: Path, info: dict[str, Any]
+) -> None:
+    code, figures, _ = fetch("--max-bytes", "2000")
+    layer = [it for it in info["layers"] if it["bytes"] <= 2000][-1]
+    assert code == 0
+    assert figures["ended"] == "bytes"
+    assert {key: figures[key] for key in layer} == layer
+    assert error_of(np.load(tmp_path / "out.npy"), terrain) == pytest.approx(layer["rms"], rel=1e-6)
+
+
+@pytest.mark.parametrize(("option", "key", "ended"), [("--until-rms", "rms", "rms"), ("--until-max", "max", "max")])
+def test_an_error_limit_is_the_first_layer_within(
+    fetch: Fetch, info: dict[str, Any], option: str, key: str, ended: str
+) -> None:
+    code, figures, _ = fetch(option, "15")
+    layer = next(it for it in info["layers"] if it[key] <= 15)
+    assert code == 0
+    assert figures["ended"] == ended
+    assert figures["bytes"] == layer["bytes"]
+
+
+def test_a_level_is_a_grid_of_its_shape(fetch: Fetch, tmp_path: Path, info: dict[str, Any]) -> None:
+    code, figures, _ = fetch("--level", "3")
+    level = info["levels"][3]
+    assert code == 0
+    assert figures["ended"] == "level"
+    assert {key: figures[key] for key in ("bytes", "rms", "max", "level")} == {
+        key: level[key] for key in ("bytes", "rms", "max", "level")
+    }
+    assert list(np.load(tmp_path / "out.npy").shape) == level["shape"]
+
+
+def test_level_order_stops_at_the_end_of_a_level(fetch: Fetch, info: dict[str, Any]) -> None:
+    code, figures, _ = fetch("--order", "level", "--max-bytes", "3000")
+    level = [it for it in info["levels"] if it["bytes"] <= 3000][-1]
+    assert code == 0
+    assert (figures["level"], figures["bytes"], figures["rms"]) == (level["level"], level["bytes"], level["rms"])
+
+
+def test_a_coarse_level_is_drawn_as_large_as_the_surface(fetch: Fetch, terrain: Terrain, tmp_path: Path) -> None:
+    assert fetch("--level", "2", out="coarse.obj")[0] == 0
+    lines = (tmp_path / "coarse.obj").read_text().splitlines()
+    points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+    rows, columns = terrain.shape
+    # Beyond a gap the nodes are where the coarsened indices are, which is about there.
+    assert points[:, :2].min() == pytest.approx(0, abs=1)
+    assert points[:, 0].max() == pytest.approx(columns - 1, abs=1)
+    assert points[:, 1].max() == pytest.approx(rows - 1, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--level", "99"), "expected a level of 0 to"),
+        (("--max-bytes", "10"), "expected at least the"),
+    ],
+)
+def test_what_the_surface_cannot_give(fetch: Fetch, tmp_path: Path, options: tuple[str, ...], reason: str) -> None:
+    code, figures, stderr = fetch(*options)
+    assert (code, figures) == (1, {})
+    assert reason in stderr
+    assert stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("out", ["out.bmp", "out", "nowhere/out.npy"])
+def test_an_out_that_cannot_be_written(fetch: Fetch, out: str) -> None:
+    code, _, stderr = fetch(out=out)
+    assert code == 1
+    assert stderr.startswith("lodestream: ")
+    assert stderr.count("\n") == 1
+
+
+def test_a_limit_out_of_reach_is_complete_with_a_note(run: Run, terrain_file: Path, tmp_path: Path) -> None:
+    lossy = tmp_path / "lossy.lode"
+    assert run("encode", terrain_file, lossy, "--precision", "2")[0] == 0
+    code, stdout, stderr = run("decode", lossy, tmp_path / "o.npy", "--until-rms", "1e-6", "--json")
+    assert code == 0
+    assert json.loads(stdout)["ended"] == "complete"
+    assert "cannot be reached" in stderr
+
+
+def test_a_cut_container(
+    run: Run, container_file: Path, tmp_path: Path, terrain: Terrain, info: dict[str, Any]
+) -> None:
+    cut, out = tmp_path / "cut.lode", tmp_path / "out.npy"
+    cut.write_bytes(container_file.read_bytes()[:3000])
+    code, stdout, stderr = run("decode", cut, out, "--json")
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+    assert not out.exists()
+    assert stderr.startswith(f"lodestream: {cut}: expected a whole container, got ")
+    assert stderr.endswith(" in 3000 bytes: it is cut short; --partial writes the last complete layer before that\n")
+    code, stdout, stderr = run("decode", cut, out, "--json", "--partial")
+    assert stderr.startswith(f"lodestream: {cut}: expected a whole container, got ")
+    layer = [it for it in info["layers"] if it["bytes"] <= 3000][-1]
+    figures = json.loads(stdout)
+    assert code == 0
+    assert (figures["ended"], figures["bytes"], figures["rms"]) == ("truncated", layer["bytes"], layer["rms"])
+    assert error_of(np.load(out), terrain) == pytest.approx(layer["rms"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("bytes_", "options", "advice"),
+    [
+        (3000, ("--level", "2"), "order level, with --partial the last complete layer is written"),
+        (3000, ("--level", "2", "--partial"), "order level, the last complete layer is written"),
+        (
+            3000,
+            ("--order", "level"),
+            "order level, with --partial the last complete layer is written",
+        ),
+        (40, (), "it is cut short"),
+        (40, ("--partial",), "it is cut short"),
+    ],
+)
+def test_a_cut_container_says_what_can_be_had(
+    run: Run, container_file: Path, tmp_path: Path, bytes_: int, options: tuple[str, ...], advice: str
+) -> None:
+    cut = tmp_path / "cut.lode"
+    cut.write_bytes(container_file.read_bytes()[:bytes_])
+    code, stdout, stderr = run("decode", cut, tmp_path / "out.npy", *options)
+    assert (code, stdout, stderr.count("\n"), (tmp_path / "out.npy").exists()) == (1, "", 1, False)
+    assert stderr.startswith(f"lodestream: {cut}: expected ")
+    assert advice in stderr
+    code, stdout, stderr = run("info", cut)
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+    assert stderr.startswith(f"lodestream: {cut}: expected ")
+    assert stderr.endswith("; lodestream decode --partial writes its last complete layer\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "ended"),
+    [(("--until-rms", "30"), "rms"), (("--until-max", "90"), "max"), (("--max-bytes", "900"), "bytes")],
+)
+def test_a_cut_after_the_limit_does_no_harm(
+    run: Run, container_file: Path, tmp_path: Path, options: tuple[str, ...], ended: str
+) -> None:
+    cut = tmp_path / "cut.lode"
+    cut.write_bytes(container_file.read_bytes()[:3000])
+    code, stdout, _ = run("decode", cut, tmp_path / "a.npy", "--json", *options)
+    whole_code, whole, _ = run("decode", container_file, tmp_path / "b.npy", "--json", *options)
+    assert (code, whole_code) == (0, 0)
+    one, other = json.loads(stdout), json.loads(whole)
+    assert one["ended"] == other["ended"] == ended
+    for key in ("bytes", "level", "rms", "max"):
+        assert one[key] == other[key]
+    assert np.array_equal(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"))
+
+
+def test_a_damaged_container(run: Run, container_file: Path, tmp_path: Path) -> None:
+    data = bytearray(container_file.read_bytes())
+    data[2000] ^= 1
+    damaged, out = tmp_path / "damaged.lode", tmp_path / "out.npy"
+    damaged.write_bytes(data)
+    code, _, stderr = run("decode", damaged, out)
+    assert code == 1
+    assert "at byte" in stderr
+    assert stderr.startswith(f"lodestream: {damaged}: ")
+    assert stderr.endswith("; --partial writes the last complete layer before that\n")
+    code, stdout, _ = run("decode", damaged, out, "--json", "--partial")
+    assert code == 0
+    assert json.loads(stdout)["ended"] == "truncated"
+
+
+@pytest.mark.parametrize("command", ["decode", "info"])
+def test_what_is_no_container(run: Run, tmp_path: Path, command: str) -> None:
+    path = tmp_path / "x.lode"
+    for content in (b"", b"hello", b"\x93NUMPY" * 100):
+        path.write_bytes(content)
+        code, stdout, stderr = run(command, path, *([tmp_path / "o.npy"] if command == "decode" else []))
+        assert (code, stdout, stderr.count("\n")) == (1, "", 1), stderr
+        assert stderr.startswith(f"lodestream: {path}: expected ")
+
+
+def test_encode_takes_surface_options(run: Run, tmp_path: Path) -> None:
+    np.save(tmp_path / "ring.npy", np.random.default_rng(0).normal(size=(12, 9, 3)))
+    out = tmp_path / "ring.lode"
+    code, stdout, _ = run("encode", tmp_path / "ring.npy", out, "--closed", "rows", "--name", "Ring", "--json")
+    assert code == 0
+    assert json.loads(stdout)["closed"] == [True, False]
+    described = json.loads(run("info", out, "--json")[1])
+    assert described["closed"] == [True, False]
+    assert described["metadata"]["name"] == "Ring"
+    assert described["exact"] is True
+
+
+def test_encode_with_a_precision(run: Run, terrain_file: Path, terrain: Terrain, tmp_path: Path) -> None:
+    assert run("encode", terrain_file, tmp_path / "p.lode", "--precision", "0.5")[0] == 0
+    assert run("decode", tmp_path / "p.lode", tmp_path / "p.npy")[0] == 0
+    assert 0 < np.abs(np.load(tmp_path / "p.npy").astype(float) - terrain).max() <= 0.5
+    assert json.loads(run("info", tmp_path / "p.lode", "--json")[1])["exact"] is False
+
+
+def test_encode_for_a_root_mean_square_error(
+    run: Run, terrain_file: Path, terrain: Terrain, container_file: Path, tmp_path: Path
+) -> None:
+    made, out = tmp_path / "r.lode", tmp_path / "r.npy"
+    assert run("encode", terrain_file, made, "--rms", "1e-2d")[0] == 0
+    assert run("decode", made, out)[0] == 0
+    described = json.loads(run("info", made, "--json")[1])
+    assert described["exact"] is False
+    told = described["layers"][-1]["rms"]
+    assert 0 < told <= 0.01 * float(np.ptp(terrain.astype(float)))
+    assert error_of(np.load(out), terrain) == pytest.approx(told, rel=1e-6)
+    assert "no, within the error that was asked for" in run("info", made)[1]
+    assert run("encode", terrain_file, tmp_path / "zero.lode", "--rms", "0")[0] == 0
+    zero, exact = (ls.decode(path.read_bytes()).points for path in (tmp_path / "zero.lode", container_file))
+    assert np.array_equal(zero, exact)
+
+
+@pytest.mark.parametrize(
+    "options", [("-o", "nonsense=1"), ("-o", "path=x"), ("-o", "max_vertices=3"), ("--precision", "0")]
+)
+def test_encode_refuses_options(run: Run, terrain_file: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
+    code, _, stderr = run("encode", terrain_file, tmp_path / "o.lode", *options)
+    if options[0] == "-o":
+        assert (code, stderr.count("\n")) == (1, 1)
+        assert not (tmp_path / "o.lode").exists()
+    else:
+        assert (code, stderr.count("\n")) in ((0, 1), (1, 1)), "lossless or refused, and no traceback"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("fly",),
+        ("encode", "a.npy"),
+        ("encode", "a.npy", "b.npy"),
+        ("encode", "a.npy", "b.lode", "--closed", "perhaps"),
+        ("encode", "a.npy", "b.lode", "--precision", "much"),
+        ("encode", "a.npy", "b.lode", "--rms", "much"),
+        ("encode", "a.npy", "b.lode", "--rms", "1", "--precision", "1"),
+        ("encode", "a.npy", "b.lode", "-o", "key"),
+        ("encode", "a.npy", "b.lode", "-o", "k=1", "-o", "k=2"),
+        ("encode", "a.npy", "-", "--json"),
+        ("encode", "-", "-", "b.lode"),
+        ("decode", "a.lode", "b.npy", "--level", "1", "--max-bytes", "9"),
+        ("decode", "a.lode", "b.npy", "--level", "-1"),
+        ("decode", "a.lode", "b.npy", "--seconds", "0"),
+        ("decode", "a.lode", "b.npy", "--until-rms", "-1"),
+        ("decode", "a.lode", "b.npy", "--order", "random"),
+        ("decode", "a.lode", "-", "--json"),
+        ("pull", "nowhere", "b.npy"),
+        ("pull", "http://host/v1/surfaces", "b.npy"),
+        ("pull", "http://host/v1/surfaces/ab", "b.npy", "--limit-rate", "fast"),
+        ("push", "a.npy", "host:8000"),
+        ("push", "a.npy", "http://host", "--precision", "1", "--precision", "a=1", "--rms", "1"),
+        ("list", "file:///tmp"),
+        ("rm", "http://host"),
+    ],
+)
+def test_exit_code_2_is_for_the_command_line_alone(run: Run, arguments: tuple[str, ...]) -> None:
+    code, stdout, stderr = run(*arguments)
+    assert code == 2
+    assert stdout == ""
+    assert "error: " in stderr
+
+
+def test_a_file_that_is_not_there(run: Run, tmp_path: Path) -> None:
+    for arguments in (("encode", "a.npy", "a.lode"), ("decode", "a.lode", "a.npy"), ("info", "a.lode")):
+        paths = [tmp_path / name for name in arguments[1:]]
+        code, _, stderr = run(arguments[0], *paths)
+        assert code == 1
+        assert stderr == f"lodestream: {paths[0]}: No such file or directory\n"
+
+
+def test_info_for_people(run: Run, container_file: Path) -> None:
+    code, stdout, _ = run("info", container_file)
+    assert code == 0
+    assert "97 x 70" in stdout
+    assert "bit for bit" in stdout
+    assert "\x1b" not in stdout
+
+
+def test_info_of_a_server_has_the_keys_of_a_file(run: Run, surface: str, info: dict[str, Any]) -> None:
+    described = json.loads(run("info", surface, "--json")[1])
+    assert described["state"] == "ready"
+    assert {key: described[key] for key in info if key != "metadata"} == {
+        key: info[key] for key in info if key != "metadata"
+    }
+    assert "97 x 70" in run("info", surface)[1]
+
+
+def test_push_list_pull_rm(run: Run, server: str, tmp_path: Path) -> None:
+    points = np.add.outer(np.arange(20), np.arange(30)).astype(np.int16)
+    np.save(tmp_path / "slope.npy", points)
+    code, stdout, _ = run("push", tmp_path / "slope.npy", server, "--name", "Slope")
+    assert code == 0
+    url = stdout.splitlines()[-1]
+    assert url.startswith(f"{server}/v1/surfaces/")
+    assert url in run("list", server)[1]
+    listed = json.loads(run("list", server, "--json")[1])["surfaces"]
+    assert [it["name"] for it in listed if it["url"] == url] == ["Slope"]
+    assert run("pull", url, tmp_path / "back.npy")[0] == 0
+    assert np.array_equal(np.load(tmp_path / "back.npy"), points)
+    assert run("rm", url)[0] == 0
+    code, _, stderr = run("rm", url)
+    assert (code, stderr.count("\n")) == (1, 1)
+    assert url not in run("list", server)[1]
+
+
+def test_a_list_has_a_line_for_each_however_narrow_the_terminal(
+    run: Run, server: str, terrain_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, stdout, _ = run("push", terrain_file, server, "--name", "long " * 40)
+    assert code == 0
+    url = stdout.splitlines()[-1]
+    monkeypatch.setattr(surfaces, "console", lambda: Console(file=sys.stdout, width=40))
+    (line,) = [line for line in run("list", server)[1].splitlines() if "long" in line]
+    assert line.startswith(f"{url}  ready  ")
+    assert line.count("long") == 40
+    assert run("rm", url)[0] == 0
+
+
+def test_push_without_waiting_and_as_json(run: Run, server: str, terrain_file: Path) -> None:
+    code, stdout, _ = run("push", terrain_file, server, "--no-wait", "--json")
+    pushed = json.loads(stdout)
+    assert code == 0
+    assert pushed["url"] == f"{server}/v1/surfaces/{pushed['id']}"
+    assert pushed["state"] in ("queued", "building", "ready")
+
+
+def test_push_of_what_is_no_surface(run: Run, server: str, tmp_path: Path) -> None:
+    path = tmp_path / "text.tif"
+    path.write_text("hello")
+    code, stdout, stderr = run("push", path, server)
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+    assert "text.tif" in stderr
+    code, _, stderr = run("push", tmp_path / "text.tif", server, "-o", "nonsense=1")
+    assert code == 1
+
+
+def test_pull_for_some_seconds_brings_the_metadata(run: Run, surface: str, tmp_path: Path) -> None:
+    out = tmp_path / "out.npy"
+    code, stdout, stderr = run("pull", surface, out, "--seconds", "1.2", "--limit-rate", "32kbit", "--json")
+    figures = json.loads(stdout)
+    assert code == 0
+    assert figures["ended"] == "seconds"
+    assert "could not be fetched" not in stderr
+    assert np.load(out).shape == (97, 70)
+
+
+def test_the_token_comes_from_the_environment(
+    run: Run, surface: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("LODESTREAM_TOKEN", "secret")
+    assert run("info", surface, "--json")[0] == 0
+    assert run("pull", surface, tmp_path / "o.npy", "--token", "other")[0] == 0
+
+
+def test_no_server(run: Run, tmp_path: Path) -> None:
+    for arguments in (
+        ("list", "http://127.0.0.1:9"),
+        ("info", "http://127.0.0.1:9/v1/surfaces/ab"),
+        ("pull", "http://127.0.0.1:9/v1/surfaces/ab", tmp_path / "o.npy"),
+        ("rm", "http://127.0.0.1:9/v1/surfaces/ab"),
+    ):
+        code, stdout, stderr = run(*arguments)
+        assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+        assert "no connection to http://127.0.0.1:9" in stderr
+
+
+def test_out_is_written_by_rename(run: Run, container_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.npy"
+    out.write_bytes(b"before")
+    assert run("decode", container_file, out, "--level", "99")[0] == 1
+    assert out.read_bytes() == b"before"
+    assert run("decode", container_file, out)[0] == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out.npy"]
+    assert np.load(out).shape == (97, 70)
+
+
+def test_an_unknown_package_s_command(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    from importlib import metadata
+
+    broken = metadata.EntryPoint("juggle", "no_such_package.command:register", "lodestream.commands")
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [broken])
+    code, _, stderr = run("juggle")
+    assert code == 1
+    assert "juggle is not fully installed" in stderr
+
+
+def test_the_core_reads_what_the_command_wrote(container_file: Path, terrain: Terrain) -> None:
+    assert np.array_equal(ls.decode(container_file.read_bytes()).points, terrain)

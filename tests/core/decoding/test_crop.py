@@ -1,0 +1,151 @@
+"""The picture of a window is what the picture of the whole has there, in every state."""
+
+from __future__ import annotations
+
+import functools
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.decoding.crop import crop_axis, window_picture
+from lodestream.decoding.reconstruction import channel_picture
+from lodestream.entropy.dequantize import UNANNOUNCED
+from lodestream.entropy.tiles import Tiles, TileTable, gather
+from lodestream.grid.axis import axis_step
+from lodestream.grid.layout import Layout
+from lodestream.grid.support import needed_tiles
+from lodestream.planning.selection import Wish
+from lodestream.target import Region
+from lodestream.transform.pyramid import allocate, forward
+
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
+
+if TYPE_CHECKING:
+    from lodestream.container.model import Header
+
+CLOSURES = [(False, False), (True, False), (False, True), (True, True)]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_what_a_step_takes_of_an_axis_gives_what_is_wanted(closed: bool) -> None:
+    for length in range(1, 70):
+        step = axis_step(length, closed)
+        for start in range(0, length, 3):
+            for stop in range(start + 1, length + 1, 4):
+                crop = crop_axis(step, start, stop)
+                assert crop.start >= 0
+                assert crop.start + stop - start <= crop.step.length
+                assert 0 <= crop.first <= crop.first + crop.step.coarse <= step.coarse
+                assert crop.step.coarse + crop.step.midpoints == crop.step.length
+                assert crop.step.length <= max(stop - start + 60, 4) or step.wraps
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    shape=st.tuples(st.integers(1, 140), st.integers(1, 90)),
+    closed=st.sampled_from(CLOSURES),
+    corners=st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1)),
+    known=st.sampled_from(["all", "levels", "anything"]),
+    seed=st.integers(0, 2**32),
+)
+def test_a_window_of_any_state(
+    shape: tuple[int, int],
+    closed: tuple[bool, bool],
+    corners: tuple[float, float, float, float],
+    known: str,
+    seed: int,
+) -> None:
+    layout = Layout.single(shape, closed, (3, 3))
+    first, second = (
+        sorted(min(int(corner * n), n - 1) for corner in pair)
+        for *pair, n in zip(corners[:2], corners[2:], shape, strict=True)
+    )
+    region: Region = ((first[0], first[1] + 1), (second[0], second[1] + 1))
+    rng = np.random.default_rng(seed)
+    values = allocate(shape)
+    values[...] = rng.integers(-(2**20), 2**20, shape)
+    predictors = forward([values], layout)
+    tiles = Tiles(TileTable.of(layout))
+    flat = gather(tiles.table, [values])
+    tiles.known[:], tiles.sign[:] = np.abs(flat), np.sign(flat)
+    state = np.zeros(len(layout.tiles), np.int8)
+    if known == "levels":
+        state[layout.tiles_of(int(rng.integers(0, layout.levels + 1))).start :] = UNANNOUNCED
+    elif known == "anything":
+        state[:] = rng.choice([0, 1, 2, 7, 16, 31, UNANNOUNCED], state.size)
+    state[~needed_tiles(layout, region)] = 0
+    header = cast("Header", SimpleNamespace(layout=layout, predictors=[predictors], geometric=1))
+    window, fraction = window_picture(header, 0, tiles, state, region)
+    whole, expected = channel_picture(header, 0, tiles, state, layout.levels)
+    assert fraction == expected
+    np.testing.assert_array_equal(window, whole[0][slice(*region[0]), slice(*region[1])])
+
+
+@functools.cache
+def surfaces() -> dict[str, ls.Surface]:
+    rows, columns = np.mgrid[:300, :340].astype(float)
+    heights = np.rint(200 * np.sin(rows / 40) * np.cos(columns / 30) + np.random.default_rng(2).normal(size=(300, 340)))
+    across = np.linspace(0.1, 7.7, 340)  # a rule whose last number is given
+    xyz: NDArray[np.float64] = np.stack([np.broadcast_to(across, heights.shape), rows * 0.1, heights], axis=2)
+    holes = np.hypot(rows - 100, columns - 100) < 30
+    return {
+        "linspace": ls.Surface(xyz),
+        "bands": ls.Surface(
+            heights.astype(np.float32) / 3,
+            mask=~holes,
+            attributes={"rgb": rng_colours(heights), "t": heights / 7},
+            metadata={"geotransform": [5e5, 30.0, 0.0, 4e6, 0.0, -30.0]},
+        ),
+        "wide": ls.Surface((heights * 2**40).astype(np.int64)),
+        "torus": ls.Surface(np.rint(heights * 9).astype(np.int32), (True, True)),
+        "odd cylinder": ls.Surface(heights[:, :339], (False, True)),
+    }
+
+
+@functools.cache
+def contained(kind: str) -> bytes:
+    return ls.encode(surfaces()[kind])
+
+
+def rng_colours(heights: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return (np.stack([heights, heights + 9, heights * 3], axis=2) % 256).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", list(surfaces()))
+def test_every_view_of_a_window_is_cut_out_of_the_whole(kind: str) -> None:
+    surface = surfaces()[kind]
+    decoder = ls.Decoder()
+    decoder.feed(contained(kind))
+    rng = np.random.default_rng(1)
+    for view in decoder.layers[:: max(len(decoder.layers) // 5, 1)] + decoder.layers[-1:]:
+        (top, bottom), (left, right) = (sorted(rng.choice(n, 2, replace=False)) for n in surface.shape)
+        region = (int(top), int(bottom)), (int(left), int(right))
+        place = slice(top, bottom), slice(left, right)
+        window, whole = view.window(region), view.surface()
+        assert window.points.dtype == surface.dtype
+        if view.complete:
+            assert window.points.tobytes() == np.ascontiguousarray(whole.points[place]).tobytes()
+            for name, values in window.attributes.items():
+                assert values.tobytes() == np.ascontiguousarray(whole.attributes[name][place]).tobytes()
+        if surface.points.ndim == 3:  # x and y follow a rule that knows the whole
+            assert window.points[..., :2].tobytes() == np.ascontiguousarray(whole.points[place][..., :2]).tobytes()
+        valid = np.ones(window.shape, np.bool_)
+        np.testing.assert_array_equal(
+            valid if window.mask is None else window.mask, valid if whole.mask is None else whole.mask[place]
+        )
+        if "geotransform" in surface.metadata:
+            assert window.metadata["geotransform"] == [5e5 + 30 * left, 30, 0, 4e6 - 30 * top, 0, -30]
+
+
+def test_a_window_of_holes_alone_is_refused() -> None:
+    decoder = ls.Decoder(Wish(((95, 105), (95, 105))))
+    decoder.feed(contained("bands"))
+    with pytest.raises(ls.InputError):
+        decoder.surface()

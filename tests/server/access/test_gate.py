@@ -1,0 +1,338 @@
+"""Every route, with nothing behind the gate: without a token, with a wrong one, from another site, through a proxy."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from starlette.types import Receive, Scope, Send
+
+from lodestream_server import Settings, create_app
+from lodestream_server.access.access import Access
+from lodestream_server.access.gate import Gate
+from lodestream_server.access.scopes import needed_scope, routes_of, scope_of
+from lodestream_server.access.tokens import SCOPES
+from tests.server.helpers import Keys, problem
+
+#: Every route, and the scope that it needs. What is not here is not open to anybody.
+ROUTES: dict[tuple[str, str], str | None] = {
+    ("GET", "/"): None,
+    ("GET", "/docs"): None,
+    ("GET", "/openapi.json"): None,
+    ("GET", "/healthz"): None,
+    ("GET", "/readyz"): None,
+    ("GET", "/metrics"): "admin",
+    ("GET", "/v1/surfaces"): "read",
+    ("POST", "/v1/surfaces"): "write",
+    ("GET", "/v1/surfaces/{surface}"): "read",
+    ("DELETE", "/v1/surfaces/{surface}"): "write",
+    ("POST", "/v1/surfaces/{surface}/retry"): "write",
+    ("GET", "/v1/surfaces/{surface}/container"): "read",
+    ("GET", "/v1/surfaces/{surface}/levels/{level}"): "read",
+    ("GET", "/v1/containers/{sha256}.lode"): "read",
+}
+GUARDED = [(method, path) for (method, path), scope in ROUTES.items() if scope is not None]
+WRITING = [(method, path) for method, path in GUARDED if method != "GET"]
+LOCAL = "http://127.0.0.1:8000"
+
+
+def filled(path: str) -> str:
+    return re.sub(r"\{(\w+)\}", lambda name: "1" if name[1] == "level" else "0" * 20, path)
+
+
+class Door:
+    """The gate of a server with nothing behind it: whoever passes is answered 299."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.app = create_app(settings)
+        self.gate = Gate(self._behind, Access(settings))
+
+    def ask(
+        self,
+        method: str,
+        path: str,
+        headers: dict[str, str] | None = None,
+        client: str = "127.0.0.1",
+        base: str = LOCAL,
+    ) -> httpx.Response:
+        async def ask() -> httpx.Response:
+            transport = httpx.ASGITransport(self._in_front, client=(client, 5))
+            async with httpx.AsyncClient(transport=transport, base_url=base) as http:
+                return await http.request(method, filled(path), headers=headers)
+
+        return asyncio.run(ask())
+
+    async def _in_front(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope["app"] = self.app
+        await self.gate(scope, receive, send)
+
+    async def _behind(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 299, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+
+@pytest.fixture(scope="module")
+def locked(keys: Keys) -> Door:
+    return Door(Settings(data=keys.folder))
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Door:
+    return Door(Settings(data=tmp_path_factory.mktemp("alone")))
+
+
+def test_every_route_is_known_here(tmp_path: Path) -> None:
+    app: FastAPI = create_app(Settings(data=tmp_path))
+    routes = {
+        (method, getattr(route, "path", ""))
+        for route in routes_of(app)
+        for method in getattr(route, "methods", None) or ()
+        if method != "HEAD"
+    }
+    assert routes == set(ROUTES)
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+def test_a_token_opens_what_its_scope_says(locked: Door, keys: Keys, method: str, path: str) -> None:
+    needed = ROUTES[method, path]
+    nothing = locked.ask(method, path)
+    if needed is None:
+        assert nothing.status_code == 299
+        return
+    assert problem(nothing) == (401, "no-token")
+    assert nothing.headers["www-authenticate"].startswith("Bearer")
+    for name in ("wrong", "revoked", "expired"):
+        assert problem(locked.ask(method, path, keys.header(name))) == (403, "bad-token")
+    for scope in SCOPES:
+        answer = locked.ask(method, path, keys.header(scope))
+        if SCOPES.index(scope) < SCOPES.index(needed):
+            assert problem(answer) == (403, "small-scope")
+            assert needed in answer.json()["detail"]
+        else:
+            assert answer.status_code == 299
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["Bearer", "Bearer ", "Basic QTpC", "lode_x", "bearer: x", "Token x", "Bearer\tx"],
+)
+def test_what_is_no_bearer_token_is_none(locked: Door, keys: Keys, header: str) -> None:
+    assert locked.ask("GET", "/v1/surfaces", {"authorization": header}).status_code in (401, 403)
+    text = keys.tokens["read"]
+    assert locked.ask("GET", "/v1/surfaces", {"authorization": f"bEARER  {text} "}).status_code == 299
+    assert locked.ask("GET", f"/v1/surfaces?token={text}&access_token={text}").status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [("PUT", "/v1/surfaces"), ("PATCH", "/"), ("POST", "/healthz"), ("BREW", "/v1/surfaces"), ("GET", "/nowhere")],
+)
+def test_what_nobody_thought_of_is_not_open(locked: Door, method: str, path: str) -> None:
+    assert locked.ask(method, path).status_code == 401
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/healthz/",
+        "//healthz",
+        "/healthz/../v1/surfaces",
+        "/HEALTHZ",
+        "/healthz%2f..%2fv1",
+        "/v1/surfaces/../../healthz",
+    ],
+)
+def test_a_path_that_looks_like_an_open_one_is_not(locked: Door, path: str) -> None:
+    # Built by hand, since the client would tidy it up.
+    scope: Scope = {
+        "type": "http",
+        "method": "GET",
+        "path": path,
+        "headers": [(b"host", b"localhost")],
+        "client": ("127.0.0.1", 5),
+        "app": locked.app,
+    }
+    sent: list[Any] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    asyncio.run(locked.gate(scope, None, send))  # type: ignore[arg-type]
+    assert sent[0]["status"] == 401
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+def test_every_route_declares_its_scope(locked: Door, method: str, path: str) -> None:
+    found = [
+        route
+        for route in routes_of(locked.app)
+        if getattr(route, "path", "") == path and method in getattr(route, "methods", ())
+    ]
+    assert {scope_of(route) for route in found} == {ROUTES[method, path]}  # old FastAPI has each route twice
+
+
+def test_a_route_without_a_scope_needs_admin(keys: Keys) -> None:
+    door = Door(Settings(data=keys.folder, public_reads=True))
+
+    @door.app.get("/forgotten")
+    async def forgotten() -> None: ...
+
+    @door.app.websocket("/forgotten/stream")
+    async def stream() -> None: ...
+
+    assert door.ask("GET", "/forgotten").status_code == 401
+    assert problem(door.ask("GET", "/forgotten", keys.header("write"))) == (403, "small-scope")
+    assert door.ask("GET", "/forgotten", keys.header("admin")).status_code == 299
+    assert door.ask("GET", "/nowhere").status_code == 299  # where the application says that there is nothing
+    assert needed_scope({"type": "websocket", "path": "/forgotten/stream", "app": door.app}) == "admin"
+    assert needed_scope({"type": "websocket", "path": "/v1/surfaces/0/stream", "app": door.app}) == "read"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/metrics%0A",
+        "/metrics%0a",
+        "/metrics%00",
+        "/metrics%0D%0A",
+        "/metrics%7F",
+        "/metrics%C2%85",
+        "/healthz%0A",
+        "/v1/surfaces/0%00",
+        "/v1/surfaces%0A",
+        "/v1%2Fsurfaces",
+        "/v1/surfaces/0%2f..%2fmetrics",
+        "/%2Fmetrics",
+        "/metrics%2F",
+    ],
+)
+@pytest.mark.parametrize("method", ["GET", "HEAD", "POST", "DELETE"])
+def test_control_characters_and_encoded_slashes_lead_nowhere(
+    locked: Door, alone: Door, keys: Keys, method: str, path: str
+) -> None:
+    for door, headers in ((locked, {}), (locked, keys.header("read")), (locked, keys.header("admin")), (alone, {})):
+        answer = door.ask(method, path, headers)
+        assert answer.status_code == 404, (path, answer.status_code)
+        if method != "HEAD":
+            assert problem(answer) == (404, "not-found")
+    # A slash in the query is somebody's own.
+    assert alone.ask(method, "/v1/surfaces?name=a%2Fb").status_code == 299
+
+
+@pytest.mark.parametrize(("method", "path"), GUARDED)
+@pytest.mark.parametrize("base", [LOCAL, "http://localhost:8000", "http://LOCALHOST", "http://[::1]:8000"])
+def test_without_tokens_this_machine_may_do_everything(alone: Door, method: str, path: str, base: str) -> None:
+    assert alone.ask(method, path, base=base).status_code == 299
+    assert alone.ask(method, path, {"origin": base.lower()}, base=base).status_code == 299
+    # Who has a token for another server loses nothing by it.
+    assert alone.ask(method, path, {"authorization": "Bearer lode_x"}, base=base).status_code == 299
+
+
+@pytest.mark.parametrize(("method", "path"), GUARDED)
+@pytest.mark.parametrize(
+    "host",
+    [
+        "example.org",
+        "localhost.example.org",
+        "127.0.0.1.example.org",
+        "10.0.0.1",
+        "127.0.0.1@example.org",
+        "[::2]",
+        "a b",
+    ],
+)
+def test_a_forged_host_is_not_this_machine(alone: Door, method: str, path: str, host: str) -> None:
+    assert problem(alone.ask(method, path, {"host": host})) == (401, "no-token")
+
+
+@pytest.mark.parametrize(("method", "path"), GUARDED)
+@pytest.mark.parametrize(
+    "name", ["Forwarded", "X-Forwarded-For", "X-Forwarded-Host", "X-Forwarded-Anything", "X-Real-IP", "Via"]
+)
+def test_whoever_comes_through_a_proxy_is_not_at_this_machine(alone: Door, method: str, path: str, name: str) -> None:
+    answer = alone.ask(method, path, {name: "127.0.0.1"})
+    assert problem(answer) == (401, "no-token")
+    assert name.lower() in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("client", ["192.0.2.7", "10.0.0.1", "::2", "::ffff:192.0.2.7", "testclient", ""])
+def test_a_socket_from_elsewhere_is_not_this_machine(alone: Door, client: str) -> None:
+    for method, path in GUARDED:
+        assert problem(alone.ask(method, path, client=client)) == (401, "no-token")
+    assert alone.ask("GET", "/healthz", client=client).status_code == 299
+    for mine in ("127.0.0.9", "::1", "::ffff:127.0.0.1"):
+        assert alone.ask("DELETE", "/v1/surfaces/0", client=mine).status_code == 299
+
+
+@pytest.mark.parametrize(("method", "path"), WRITING)
+@pytest.mark.parametrize(
+    "origin",
+    ["https://example.org", "null", "http://127.0.0.1:9000", "http://localhost:8000", "127.0.0.1:8000", "file://", "x"],
+)
+def test_the_page_of_another_site_may_not_write(
+    alone: Door, locked: Door, keys: Keys, method: str, path: str, origin: str
+) -> None:
+    assert problem(alone.ask(method, path, {"origin": origin})) == (403, "foreign-origin")
+    assert problem(locked.ask(method, path, {"origin": origin, **keys.header("admin")})) == (403, "foreign-origin")
+
+
+def test_origins_that_the_settings_name_may_write(keys: Keys) -> None:
+    door = Door(Settings(data=keys.folder, origins=("https://maps.example.org", "http://localhost:5173")))
+    for origin in ("https://maps.example.org", "http://localhost:5173", "https://127.0.0.1:8000"):
+        assert door.ask("POST", "/v1/surfaces", {"origin": origin, **keys.header("write")}).status_code == 299
+    for origin in ("https://maps.example.org.evil", "http://maps.example.org", "https://maps.example.org:8443"):
+        assert door.ask("POST", "/v1/surfaces", {"origin": origin, **keys.header("write")}).status_code == 403
+
+
+def test_behind_a_proxy_that_ends_tls_the_own_page_is_own(keys: Keys) -> None:
+    door = Door(Settings(data=keys.folder))
+    headers = {"origin": "https://maps.example.org", "host": "maps.example.org", **keys.header("write")}
+    assert door.ask("POST", "/v1/surfaces", headers).status_code == 299
+
+
+def test_public_reads_open_reading_alone(keys: Keys, tmp_path: Path) -> None:
+    for folder in (keys.folder, tmp_path):
+        door = Door(Settings(data=folder, public_reads=True))
+        for (method, path), scope in ROUTES.items():
+            answer = door.ask(method, path, client="192.0.2.7")
+            assert answer.status_code == (299 if scope in (None, "read") else 401), path
+        if folder == keys.folder:
+            assert problem(door.ask("GET", "/v1/surfaces", keys.header("wrong"))) == (403, "bad-token")
+
+
+def test_insecure_opens_everything_while_there_is_no_token(keys: Keys, tmp_path: Path) -> None:
+    door = Door(Settings(data=tmp_path, host="0.0.0.0", insecure=True))
+    for method, path in ROUTES:
+        assert door.ask(method, path, {"x-forwarded-for": "1.2.3.4"}, "192.0.2.7", "http://x").status_code == 299
+    door = Door(Settings(data=keys.folder, host="0.0.0.0", insecure=True))
+    for method, path in GUARDED:
+        assert door.ask(method, path).status_code == 401
+
+
+def test_behind_a_trusted_proxy_nobody_is_local(tmp_path: Path) -> None:
+    door = Door(Settings(data=tmp_path, trusted_proxies=("127.0.0.1",)))
+    assert problem(door.ask("DELETE", "/v1/surfaces/0")) == (401, "no-token")
+
+
+def test_pages_of_named_origins_read_what_is_answered(keys: Keys) -> None:
+    app = create_app(Settings(data=keys.folder, origins=("https://maps.example.org",)))
+
+    async def ask() -> list[httpx.Response]:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=LOCAL) as http:
+            asked = {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
+            return [
+                await http.options("/v1/surfaces", headers={"origin": "https://maps.example.org", **asked}),
+                await http.options("/v1/surfaces", headers={"origin": "https://example.org", **asked}),
+                await http.get("/v1/surfaces", headers={"origin": "https://maps.example.org"}),
+            ]
+
+    allowed, other, refused = asyncio.run(ask())
+    assert (allowed.status_code, other.status_code, refused.status_code) == (200, 400, 401)
+    for answer in (allowed, refused):
+        assert answer.headers["access-control-allow-origin"] == "https://maps.example.org"
+    assert "access-control-allow-origin" not in other.headers

@@ -1,0 +1,272 @@
+"""Builds that misbehave, for the build processes of the tests: they are found there by their names."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+from lodestream_server.builds import jobs, level_queue, worker
+from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from lodestream_server.builds.processes import Allowed
+from lodestream_server.builds.worker import Built, Job, Refused, build
+from lodestream_server.storage import durable
+from tests.server.storage.disks import FullDisk
+
+__all__ = [
+    "allow_levels_more",
+    "allow_more",
+    "end_by",
+    "end_once",
+    "explode",
+    "explode_later",
+    "find_full",
+    "full_at_each_step",
+    "hoard",
+    "hoard_level",
+    "kill",
+    "kill_level_once",
+    "kill_once",
+    "leave",
+    "listed",
+    "make_coarsest",
+    "make_when_told",
+    "miss_when_told",
+    "nothing",
+    "number",
+    "out_of_processor_time",
+    "processor_seconds_left",
+    "raise_error",
+    "raise_full",
+    "refuse",
+    "sleep",
+    "take",
+    "use_processors",
+    "wait",
+]
+
+
+def allow_more(job: Job, *args: object) -> Allowed:
+    """What `jobs` allows a build, and the data folder, where those below leave a mark for the next attempt."""
+    return replace(_allowed(job, *args), write=job.folder.parent.parent)
+
+
+def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
+    """The same of those who make levels."""
+    return replace(_allowed_level(job, *args), write=job.folder.parent.parent, file_bytes=None)
+
+
+# The server's limits are longer, and no test leaves it at that.
+_PATIENCE = 120.0
+
+_allowed: Callable[..., Allowed] = jobs._allowed
+_allowed_level: Callable[..., Allowed] = level_queue._allowed
+
+
+def nothing() -> None:
+    """Do nothing."""
+
+
+def preload() -> None:
+    """What `worker.preload` does, where calls of the tests find imported what they are called from."""
+    import_module("tests.server.connections.hostile")
+    worker.preload()
+
+
+def number() -> int:
+    """The process that is asked."""
+    return os.getpid()
+
+
+def sleep(begun: Path) -> None:
+    """Say who sleeps, then sleep for longer than any test waits."""
+    new = begun.with_suffix(".new")
+    new.write_text(str(os.getpid()))
+    new.replace(begun)
+    time.sleep(600)
+
+
+def raise_error(kind: str, number: int | None = None) -> None:
+    """Raise an error of a built-in class."""
+    error = {"KeyError": KeyError, "OSError": OSError, "ZeroDivisionError": ZeroDivisionError}[kind]
+    raise error("secret") if number is None else error(number, "secret")
+
+
+def leave(code: int) -> None:
+    """End without an answer."""
+    os._exit(code)
+
+
+def end_by(number: int) -> None:
+    """End as a signal ends a process."""
+    os.kill(os.getpid(), number)
+
+
+def processor_seconds_left() -> float:
+    """Of the processor time that this process may use, what is left."""
+    return resource.getrlimit(resource.RLIMIT_CPU)[0] - time.process_time()
+
+
+def use_processors(seconds: float) -> float:
+    """Compute for so long."""
+    began = time.process_time()
+    while time.process_time() - began < seconds:
+        pass
+    return time.process_time()
+
+
+def out_of_processor_time(job: Job) -> Built | Refused:
+    """End as the kernel ends a process that has used up its processor time."""
+    os.kill(os.getpid(), signal.SIGXCPU)
+    return Refused("survived")
+
+
+def wait(job: Job) -> Built | Refused:
+    """Report half, then go on when a file called ``go`` appears beside the surfaces' folders."""
+    (job.folder / "progress").write_text("0.5")
+    go = job.folder.parent.parent / "go"
+    until = time.monotonic() + _PATIENCE
+    while not go.exists():
+        if time.monotonic() > until:
+            return Refused("nobody said go")
+        time.sleep(0.01)
+    return build(job)
+
+
+def listed(job: Job) -> Built | Refused:
+    """Write down in which order surfaces are built."""
+    with (job.folder.parent.parent / "order").open("a") as file:
+        file.write(job.folder.name.partition(".")[0] + "\n")
+    return wait(job)
+
+
+def kill(job: Job) -> Built | Refused:
+    """End as the kernel ends a process that takes too much memory."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return Refused("survived")
+
+
+def end_once(job: Job) -> Built | Refused:
+    """Be told to end the first time, as all processes of a service are that is stopped."""
+    marker = job.folder.parent.parent / "told"
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+    return build(job)
+
+
+def explode(job: Job) -> Built | Refused:
+    """Raise what nobody foresaw."""
+    raise ZeroDivisionError(f"with a secret: {job.folder}")
+
+
+def explode_later(job: Job) -> Built | Refused:
+    """The same, once ``go`` is there."""
+    wait(job)
+    return explode(job)
+
+
+def refuse(job: Job) -> Built | Refused:
+    """Refuse the bytes, as a reader does that has become stricter."""
+    return Refused("expected a better file")
+
+
+def kill_once(job: Job) -> Built | Refused:
+    """Be killed the first time."""
+    marker = job.folder.parent.parent / "killed"
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return build(job)
+
+
+def hoard(job: Job) -> Built | Refused:
+    """Take more memory than a process of the tests may have."""
+    return Refused(f"got {len(bytearray(2 << 30))} bytes")
+
+
+def take(count: int) -> int:
+    """Take so many bytes of memory."""
+    return len(bytearray(count))
+
+
+def full_at_each_step(job: Job) -> Built | Refused:
+    """Find the disk full at the first step of writing the container, the next time at the second, and so on."""
+    marker = job.folder.parent.parent / "fuller"
+    done = int(marker.read_text()) if marker.exists() else 0
+    marker.write_text(str(done + 1))
+    durable.disk = FullDisk(done)
+    return build(job)
+
+
+def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Say who makes a level, then make the coarsest at once and the others when ``go`` appears beside the folders."""
+    begun = job.folder.parent.parent / "begun"
+    with begun.open("a") as file:
+        file.write(f"{os.getpid()} {job.level}\n")
+    until = time.monotonic() + _PATIENCE
+    while job.level and not (begun.parent / "go").exists():
+        if time.monotonic() > until:
+            return RefusedLevel("OptionError", "nobody said go")
+        time.sleep(0.01)
+    return make_level(job)
+
+
+def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Make a level once ``go`` appears beside ``begun`` in its folder, which is all that its process may write to."""
+    begun, go = job.folder / "begun", job.folder / "go"
+    begun.touch()
+    until = time.monotonic() + _PATIENCE
+    while not go.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    begun.unlink()
+    go.unlink()
+    return make_level(job)
+
+
+def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Miss the container of the first level once it was deleted, and say so when ``go`` appears beside the folders."""
+    data, until = job.folder.parent.parent, time.monotonic() + _PATIENCE
+    first = not (data / "missed").exists()
+    while first and job.container.exists() and time.monotonic() < until:
+        (data / "begun").touch()
+        time.sleep(0.01)
+    try:
+        return make_level(job)
+    except FileNotFoundError:
+        (data / "missed").touch()
+        while not (data / "go").exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        raise
+
+
+def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Take more memory than the process may have."""
+    return RefusedLevel("OptionError", f"got {len(bytearray(2 << 30))} bytes")
+
+
+def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Be killed the first time, with half a file written."""
+    marker = job.folder.parent.parent / "killed"
+    if not marker.exists():
+        marker.touch()
+        (job.folder / "level").write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return make_level(job)
+
+
+def find_full(job: Job) -> Built | Refused:
+    """Find the disk full."""
+    raise OSError(errno.ENOSPC, "no space left", str(job.folder))
+
+
+def raise_full(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Find the disk full."""
+    raise OSError(errno.ENOSPC, "no space left", str(job.folder))

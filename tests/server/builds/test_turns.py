@@ -1,0 +1,129 @@
+"""Turns: who is next, who gives up, and who is forgotten."""
+
+from __future__ import annotations
+
+import asyncio
+from random import Random
+
+from lodestream_server.builds.shares import Turns
+from tests.server.helpers import PATIENCE
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+async def order_of(turns: Turns, clock: Clock, wants: list[str]) -> list[str]:
+    """In which order callers have their turns who come one after the other, each for a second."""
+    order: list[str] = []
+
+    async def work(caller: str) -> None:
+        async with turns.turn(caller):
+            order.append(caller)
+            await asyncio.sleep(0)
+            clock.now += 1.0
+
+    async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group:
+        for caller in wants:
+            group.create_task(work(caller))
+    return order
+
+
+def test_fifty_of_one_caller_delay_anothers_first_by_one() -> None:
+    clock = Clock()
+    order = asyncio.run(order_of(Turns(1, 600.0, clock), clock, [*["anna"] * 50, "bert"]))
+    assert order == ["anna", "bert", *["anna"] * 49]
+
+
+def test_whoever_has_used_much_lately_comes_later_and_not_for_ever() -> None:
+    async def compare(pause: float) -> list[str]:
+        clock = Clock()
+        turns = Turns(1, 600.0, clock)
+        async with turns.turn("anna"):
+            clock.now += 3600
+        clock.now += pause
+        async with turns.turn("bert"):
+            clock.now += 20
+            waiting = asyncio.create_task(order_of(turns, clock, ["anna", "bert"]))
+            await asyncio.sleep(0.01)
+        return await waiting
+
+    assert asyncio.run(compare(0.0)) == ["bert", "anna"]
+    assert asyncio.run(compare(7200.0)) == ["anna", "bert"]
+
+
+def test_two_at_a_time_are_of_two_callers() -> None:
+    async def crowd() -> None:
+        turns, running, worst = Turns(2, 600.0), list[str](), 0
+
+        async def work(caller: str) -> None:
+            nonlocal worst
+            async with turns.turn(caller):
+                running.append(caller)
+                if "bert" in waiting:
+                    worst = max(worst, running.count("anna"))
+                waiting.discard(caller)
+                await asyncio.sleep(0.001)
+                running.remove(caller)
+
+        waiting: set[str] = set()
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group:
+            for _ in range(10):
+                group.create_task(work("anna"))
+            await asyncio.sleep(0)
+            waiting.add("bert")
+            group.create_task(work("bert"))
+        assert not running
+        assert worst <= 2
+        assert (turns._free, turns._running, turns._waiting) == (2, {}, {})
+
+    asyncio.run(crowd())
+
+
+def test_a_turn_that_nobody_takes_goes_to_the_next() -> None:
+    async def crowd(seed: int) -> None:
+        random, turns = Random(seed), Turns(2, 600.0)
+        inside = most = 0
+
+        async def work(caller: str) -> None:
+            nonlocal inside, most
+            async with turns.turn(caller, random.randrange(3)):
+                inside += 1
+                most = max(most, inside)
+                try:
+                    await asyncio.sleep(0)
+                finally:
+                    inside -= 1
+
+        tasks = []
+        for _ in range(60):
+            tasks.append(asyncio.create_task(work(random.choice("abc"))))
+            for _ in range(random.randrange(3)):
+                await asyncio.sleep(0)
+            if random.random() < 0.5:
+                random.choice(tasks).cancel()
+        async with asyncio.timeout(PATIENCE):
+            await asyncio.gather(*tasks, return_exceptions=True)
+        assert (inside, most) == (0, 2)
+        async with asyncio.timeout(PATIENCE), turns.turn("a"), turns.turn("b"):
+            pass
+        assert turns._free == 2
+        assert not turns._running
+
+    for seed in range(50):
+        asyncio.run(crowd(seed))
+
+
+def test_callers_are_forgotten_in_the_end() -> None:
+    async def many() -> Turns:
+        turns = Turns(1, 600.0)
+        for number in range(1500):
+            async with turns.turn(f"address {number}"):
+                pass
+        return turns
+
+    assert len(asyncio.run(many())._used) <= 1000

@@ -1,0 +1,244 @@
+"""Clients that send, and send, what nobody wants: pings, fragments, chunks, the rest of what was refused."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import h11
+import pytest
+from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from lodestream.protocol.messages import Credit, Open
+from lodestream.protocol.wire import serialize
+from lodestream_server.connections.cuts import REASONS, Allowance, Cuts
+from lodestream_server.operation.metrics import Metrics
+from lodestream_server.operation.repeats import Repeats
+from tests.server.connections.sockets import (
+    CHUNKS,
+    CONTINUATION,
+    PING,
+    Place,
+    Reader,
+    chunked,
+    frame,
+    handshake,
+    read_stream,
+)
+from tests.server.helpers import PATIENCE, eventually, hills, npy, push
+from tests.server.programs import Server, resident, server
+from tests.torture.parts import sent as hash_of_stream
+
+# What both ends' systems may hold of what was sent and not read.
+SYSTEM = 24 << 20
+
+
+@dataclass(frozen=True)
+class Flood:
+    """What an offender sends: once, then over and over.
+
+    Attributes
+    ----------
+    reason : str
+        Why its connection is to be cut.
+    stream : bool
+        It begins with the handshake of a stream.
+    """
+
+    reason: str
+    stream: bool
+    first: bytes
+    block: bytes
+
+
+FLOODS = {
+    "pings": Flood("frames", True, frame(serialize(Open(credit=1000))), frame(bytes(125), PING) * 2000),
+    "empty fragments": Flood("frames", True, frame(b"", last=False), frame(b"", CONTINUATION, last=False) * 40_000),
+    "tiny messages": Flood("frames", True, frame(serialize(Open(credit=1))), frame(serialize(Credit(1))) * 10_000),
+    "chunks": Flood("small-chunks", False, chunked(), CHUNKS),
+    "extensions": Flood("small-chunks", False, chunked(), (b"1;" + b"x" * 4000 + b"\r\na\r\n") * 50),
+    "refused chunks": Flood("refused-body", False, chunked(b"POST /nothing"), CHUNKS),
+    "refused body": Flood(
+        "refused-body",
+        False,
+        b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000000000\r\n\r\n",
+        bytes(1 << 18),
+    ),
+}
+
+
+class Offender(threading.Thread):
+    """Sends a flood, reads nothing, and comes back when it was cut.
+
+    Attributes
+    ----------
+    cuts : int
+        How often it was.
+    most : int
+        The most bytes that went out over one connection.
+    """
+
+    def __init__(self, place: Place, flood: Flood) -> None:
+        super().__init__(daemon=True)
+        self.cuts = 0
+        self.most = 0
+        self._place = place
+        self._flood = flood
+        self._over = threading.Event()
+
+    def __enter__(self) -> Offender:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+
+    def run(self) -> None:
+        while not self._over.is_set():
+            with socket.create_connection((self._place.host, self._place.port), timeout=PATIENCE) as connection:
+                self._send(connection)
+
+    def _send(self, connection: socket.socket) -> None:
+        size, todo = 0, memoryview(self._flood.first)
+        try:
+            if self._flood.stream:
+                connection.sendall(handshake(self._place))
+                assert connection.recv(12).startswith(b"HTTP/1.1 101")
+            connection.settimeout(0.2)
+            while not self._over.is_set():
+                try:
+                    size += (went := connection.send(todo))
+                except TimeoutError:
+                    continue
+                self.most = max(self.most, size)
+                todo = todo[went:] or memoryview(self._flood.block)
+        except (ConnectionResetError, BrokenPipeError):
+            self.cuts += 1
+
+
+@dataclass(frozen=True)
+class Running:
+    """A server in a process of its own with a surface, the hash of what a stream of it carries, and since when."""
+
+    server: Server
+    place: Place
+    sha256: str
+    started: float
+
+    def kinds(self) -> dict[str, float]:
+        """What its metrics say of errors, by kind."""
+        with self.server.client() as http:
+            lines = http.get("/metrics").text.splitlines()
+        found = [line.split('"') for line in lines if line.startswith("lodestream_errors_total{")]
+        return {kind: float(number.split()[-1]) for _, kind, number in found}
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    data = tmp_path_factory.mktemp("flooded") / "data"
+    with server(data, upload_bytes=4 << 20) as program:
+        with program.client() as http:
+            surface = push(http, npy(hills(420, 400)))
+        container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
+        yield Running(program, Place.of(program.url + surface["url"]), hash_of_stream(container), time.monotonic())
+
+
+def seconds_of(work: Callable[[], object]) -> float:
+    started = time.monotonic()
+    work()
+    return time.monotonic() - started
+
+
+@pytest.mark.parametrize("name", FLOODS)
+def test_others_are_served_while_a_flood_goes_on(running: Running, name: str) -> None:
+    flood = FLOODS[name]
+    before, counted = running.server.look().resident, running.kinds().get(flood.reason, 0)
+    waits: list[float] = []
+    most = before
+    with Offender(running.place, flood) as offender, running.server.client() as http:
+        until = time.monotonic() + PATIENCE
+        while len(waits) < 6 or not offender.cuts:
+            assert time.monotonic() < until, "the server takes whatever comes"
+            waits.append(seconds_of(lambda: http.get("/healthz").raise_for_status()))
+            most = max(most, resident(running.server.pid))
+            reader = asyncio.run(read_stream(running.place, Reader()))
+            assert (reader.ended, reader.closed, reader.sha256) == ("complete", 1000, running.sha256)
+    assert offender.most < SYSTEM
+    assert most - before < 16 << 20
+    # Of what the server is busy with for as long as a flood goes on nobody would see the end.
+    assert sorted(waits)[len(waits) // 2] < 5
+    assert max(waits) < PATIENCE / 2
+    assert running.kinds()[flood.reason] - counted >= offender.cuts
+    lines = [line for line in running.server.log.read_text().splitlines() if f"connection cut: {flood.reason} " in line]
+    assert 1 <= len(lines) <= 1 + (time.monotonic() - running.started) / 60
+    assert "Traceback" not in running.server.log.read_text()
+
+
+def test_nothing_remains_of_floods(running: Running) -> None:
+    before = running.server.look()
+    for flood in FLOODS.values():
+        with Offender(running.place, flood) as offender:
+            eventually(lambda offender=offender: offender.cuts, "the connection to be cut")  # type: ignore[misc]
+
+    def gone() -> bool:
+        now = running.server.look()
+        return now.tasks <= before.tasks and now.sockets <= before.sockets
+
+    eventually(gone, "tasks and sockets to be as before")
+
+
+def test_an_allowance_grows_with_time_and_with_what_is_earned(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    allowance = Allowance(3, 2)
+    assert [allowance.take() for _ in range(5)] == [True, True, True, False, False]
+    now[0] += 2
+    assert [allowance.take() for _ in range(3)] == [True, True, False]
+    now[0] += 1000
+    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+    allowance.earn(100)
+    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+
+
+def test_very_many_cuts_are_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+    metrics = Metrics()
+    cuts = Cuts(metrics)
+    with caplog.at_level(logging.WARNING, "lodestream_server"):
+        for number in range(1000):
+            cuts.note("frames", (f"192.0.2.{number % 200}", 5))
+    told = Repeats()
+    assert [told.admit(record, 0.0) for record in caplog.records] == [True, *[False] * 999]
+    (line,) = told.due(61.0)
+    assert line.getMessage() == "connection cut: frames (999 times more)"
+    assert b'lodestream_errors_total{kind="frames"} 1000.0' in metrics.text()
+
+
+def test_every_reason_is_in_the_manual() -> None:
+    manual = Path(__file__).parents[3].joinpath("docs/operating.md").read_text()
+    for reason in REASONS:
+        assert f"`{reason}`" in manual, reason
+
+
+def test_uvicorn_still_has_the_parts_that_are_built_on() -> None:
+    # Whatever of these is gone or is called otherwise, the bounds would be without effect.
+    config = {"handle_ping", "handle_pong", "handle_text", "handle_bytes", "handle_cont", "receive", "send"}
+    for name in config | {"data_received"}:
+        assert inspect.isfunction(getattr(WebSocketsSansIOProtocol, name)), name
+    source = inspect.getsource(WebSocketsSansIOProtocol)
+    for name in ("handshake_complete", "read_paused", "self.conn.receive_data(", "self.transport.resume_reading("):
+        assert name in source, name
+    for name in ("send_400_response", "on_response_complete", "handle_websocket_upgrade", "resume_writing"):
+        assert inspect.isfunction(getattr(H11Protocol, name)), name
+    source = inspect.getsource(H11Protocol) + inspect.getsource(RequestResponseCycle)
+    for name in ("self.conn.next_event()", "self.flow.pause_reading()", "self.transport.close()", "message_event.set"):
+        assert name in source, name
+    assert {"chunk_start", "chunk_end"} <= set(h11.Data.__dataclass_fields__)

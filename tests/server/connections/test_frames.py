@@ -1,0 +1,146 @@
+"""Frames of a stream: how many may come, and which of them set no clock back."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+import lodestream as ls
+from lodestream.protocol.messages import Credit, End, Error, Open
+from lodestream.protocol.wire import serialize
+from lodestream_server import running_server
+from lodestream_server.connections import frames
+from tests.server.connections.sockets import CONTINUATION, PING, Place, frame, handshake
+from tests.server.helpers import PATIENCE, Keys, hills, npy, push, raw_stream
+
+
+@pytest.fixture(scope="module")
+def surface(http: httpx.Client) -> dict[str, Any]:
+    return push(http, npy(hills(200, 190)))
+
+
+def opened(url: str) -> socket.socket:
+    place = Place.of(url)
+    connection = socket.create_connection((place.host, place.port), timeout=PATIENCE)
+    connection.sendall(handshake(place))
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        head += connection.recv(1)
+    return connection
+
+
+def cut_by(connection: socket.socket, pieces: Iterable[bytes], pause: float = 0.0) -> bool:
+    """Whether the other side breaks the connection while these are sent and nothing is read."""
+    try:
+        for piece in pieces:
+            connection.sendall(piece)
+            time.sleep(pause)
+    except (ConnectionResetError, BrokenPipeError):
+        return True
+    return False
+
+
+def test_pongs_that_nobody_takes_are_counted_in_bytes(
+    tmp_path: Path, keys: Keys, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(frames, "_FRAMES", (1e9, 0.0))
+    monkeypatch.setattr(frames, "_OTHER_FRAMES", (1e9, 0.0))
+    pings = frame(bytes(125), PING) * 500
+    # Somebody without a token, whose open is waited for.
+    settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json"}
+    with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}") as connection:
+        assert cut_by(connection, [pings] * 2000)
+    assert "connection cut: control-data" in [record.getMessage() for record in caplog.records]
+
+
+def test_a_message_in_ever_more_fragments_is_cut(
+    server: str, surface: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    empty = frame(b"", CONTINUATION, last=False)
+    with opened(server + surface["url"]) as connection:
+        connection.sendall(frame(b"", last=False))
+        # Slower than frames may come.
+        assert cut_by(connection, [empty] * (5 * frames._MOST_FRAGMENTS), 0.012)
+    assert "connection cut: fragments" in [record.getMessage() for record in caplog.records]
+
+
+def test_an_honest_message_in_fragments_is_taken(server: str, surface: dict[str, Any]) -> None:
+    message = serialize(Open(held=tuple((2 * n, 1) for n in range(1000)), container=surface["container"]))
+    with raw_stream(server + surface["url"]) as stream:
+        stream.socket.send([message[start : start + 100] for start in range(0, len(message), 100)])
+        stream.send(Credit(1000))
+        assert not isinstance(stream.receive(), Error)
+
+
+def test_a_client_that_answers_everything_in_fragments_is_never_cut(server: str, surface: dict[str, Any]) -> None:
+    with raw_stream(server + surface["url"]) as stream:
+        stream.send(Open(credit=100))
+        event = stream.receive()
+        while not isinstance(event, End):
+            # Several thousand frames at the pace of the server.
+            stream.socket.send([b"", serialize(Credit(30))[:5], serialize(Credit(30))[5:]])
+            event = stream.receive()
+
+
+def test_grants_that_were_held_up_come_all_at_once(server: str, surface: dict[str, Any]) -> None:
+    with raw_stream(server + surface["url"]) as stream:
+        stream.send(Open(credit=0))
+        for _ in range(1500):
+            stream.send(Credit(1))
+        assert not isinstance(stream.receive(), Error)
+
+
+def test_pings_do_not_prolong_the_wait_for_open(tmp_path: Path, keys: Keys) -> None:
+    settings: dict[str, Any] = {"workers": 1, "head_seconds": 0.5, "token_file": keys.folder / "tokens.json"}
+    with running_server(tmp_path, **settings) as url, raw_stream(f"{url}/v1/surfaces/{'0' * 20}") as stream:
+        pinging = threading.Event()
+
+        def ping() -> None:
+            with suppress(ConnectionClosed):  # the server may be the first
+                while not pinging.wait(0.1):
+                    stream.socket.ping()
+
+        thread = threading.Thread(target=ping)
+        thread.start()
+        try:
+            event = stream.receive()
+        finally:
+            pinging.set()
+            thread.join()
+        assert isinstance(event, Error)
+        assert event.code == "idle"
+
+
+def test_messages_that_change_nothing_do_not_prolong_a_wait(tmp_path: Path) -> None:
+    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        made = push(http, npy(hills(30, 30)))
+    settings: dict[str, Any] = {"workers": 1, "idle_seconds": 0.5, "bye_seconds": 0.5}
+    with running_server(tmp_path, **settings) as url, raw_stream(url + made["url"]) as stream:
+        stream.send(Open(ls.Target(level=0), credit=100_000))
+        over = threading.Event()
+
+        def speak() -> None:
+            with suppress(ConnectionClosed):  # the server may be the first
+                while not over.wait(0.05):
+                    stream.send(Credit(1))  # after the end
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        try:
+            until, event = time.monotonic() + PATIENCE, stream.receive()
+            while not isinstance(event, Error):
+                assert time.monotonic() < until
+                event = stream.receive()
+        finally:
+            over.set()
+            thread.join()
+        assert event.code == "idle"

@@ -1,0 +1,181 @@
+"""More connections than files: whoever has one is served, and the log does not grow."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import resource
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from lodestream_server import Settings
+from lodestream_server.connections.open_files import most_connections, raise_file_limit
+from lodestream_server.operation import logs
+from lodestream_server.operation.repeats import SECONDS, Repeats
+from tests.server.helpers import eventually, hills, npy, push
+
+# `serve` under a small limit.
+SCRIPT = """
+import argparse, resource, sys
+from lodestream_server.command import register
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[1])))
+    parser = argparse.ArgumentParser()
+    register(parser.add_subparsers())
+    args = parser.parse_args(sys.argv[2:])
+    sys.exit(args.run(args))
+"""
+
+
+@contextmanager
+def serving(folder: Path, files: int, *arguments: str) -> Iterator[tuple[str, Path]]:
+    """The address of a server that may open so many files, and its log."""
+    script, log = folder / "serve.py", folder / "log"
+    script.write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    options = ["--port", "0", "--workers", "1", "--data", str(folder / "data"), *arguments]
+    command = [sys.executable, str(script), str(files), "serve", *options]
+    with log.open("w") as written, subprocess.Popen(command, env=environment, stderr=written, text=True) as process:
+        try:
+            found = eventually(lambda: re.search(r"^Lodestream serving (\S+)$", log.read_text(), re.M), "an address")
+            yield found[1], log
+        finally:
+            process.terminate()
+            process.wait(60)
+
+
+def test_more_connections_than_files_neither_stop_the_server_nor_fill_its_log(tmp_path: Path) -> None:
+    with serving(tmp_path, 90) as (url, log), httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        made = push(http, npy(hills()))
+        address = urlsplit(url)
+        with ExitStack() as held:
+            for _ in range(150):
+                each = held.enter_context(socket.create_connection((address.hostname, address.port), timeout=10))
+                each.sendall(b"GET /healthz HTTP/1.1\r\nHost: ")  # and no more
+            # Its connection is from before: it is served, with a file of its own.
+            for _ in range(3):
+                assert http.get(made["url"] + "/container", follow_redirects=True).status_code == 200
+                time.sleep(0.7)
+        fresh = httpx.Client(base_url=url, trust_env=False, timeout=5)
+        with fresh:
+            assert eventually(lambda: _answered(fresh), "an answer once they have gone").status_code == 200
+        said = log.read_text()
+    assert len(said) < 20_000
+    assert "enough for 21: raise the limit" in said
+
+
+def _answered(http: httpx.Client) -> httpx.Response | None:
+    try:
+        answer = http.get("/healthz")
+    except httpx.TransportError:
+        return None
+    return answer if answer.status_code == 200 else None
+
+
+@pytest.mark.parametrize(
+    ("soft", "expected"), [(90, 21), (1024, 488), (60, 6), (10, 1), (100_000, 5000), (resource.RLIM_INFINITY, 5000)]
+)
+def test_as_many_connections_as_files_are_enough_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, soft: int, expected: int
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (soft, resource.RLIM_INFINITY))
+    assert most_connections(Settings(data=tmp_path, workers=1)) == expected
+    assert most_connections(Settings(data=tmp_path, workers=1, max_connections=7)) == 7
+
+
+@pytest.mark.parametrize(
+    ("limits", "chosen", "raised", "warned"),
+    [
+        ((256, 4096), None, 4096, True),
+        ((256, resource.RLIM_INFINITY), None, 10_048, False),
+        ((256, 4096), 50, None, False),
+        ((256, 4096), 300, 648, False),
+        ((resource.RLIM_INFINITY, resource.RLIM_INFINITY), 300, None, False),
+    ],
+)
+def test_the_limit_is_raised_as_far_as_it_is_needed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    limits: tuple[int, int],
+    chosen: int | None,
+    raised: int | None,
+    warned: bool,
+) -> None:
+    changes: list[tuple[int, int]] = []
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: limits)
+    monkeypatch.setattr(resource, "setrlimit", lambda kind, both: changes.append(both))
+    with caplog.at_level(logging.WARNING):
+        raise_file_limit(Settings(data=tmp_path, workers=1, max_connections=chosen))
+    assert changes == ([] if raised is None else [(raised, limits[1])])
+    assert bool(caplog.records) == warned
+
+
+# What is said again and again.
+
+
+def line(
+    text: str = "failed %s", *args: object, level: int = logging.ERROR, error: Exception | None = None
+) -> logging.LogRecord:
+    info = None if error is None else (type(error), error, None)
+    return logging.LogRecord("x", level, "", 0, text, args or ("here",), info)
+
+
+def test_one_and_the_same_failure_is_told_once_and_counted() -> None:
+    made = Repeats()
+    assert made.admit(line(), 0)
+    assert not any(made.admit(line(), 1) for _ in range(1000))
+    assert made.admit(line("failed %s", "there"), 1)
+    assert made.admit(line(level=logging.WARNING), 1)
+    assert made.admit(line(error=OSError(24, "files")), 1)
+    assert made.admit(line(error=OSError(28, "room")), 1)
+    assert not made.admit(line(error=OSError(24, "files")), 1)
+    assert all(made.admit(line(level=logging.INFO), 1) for _ in range(3))
+    assert made.due(SECONDS - 1) == []
+    assert [record.getMessage() for record in made.due(SECONDS + 1)] == [
+        "failed here (1000 times more)",
+        "failed here OSError: [Errno 24] files (once more)",
+    ]
+    # Still counted, for another minute; what came once is told again.
+    assert not made.admit(line(), SECONDS + 2)
+    assert made.admit(line("failed %s", "there"), SECONDS + 2)
+    assert [record.getMessage() for record in made.all()] == ["failed here (once more)"]
+    assert made.due(5 * SECONDS) == []
+    assert made.admit(line(), 5 * SECONDS)
+
+
+def test_very_many_different_failures_take_no_memory() -> None:
+    made = Repeats()
+    assert all(made.admit(line("failed %s", number), 0) for number in range(5000))
+    assert len(made._told) <= 1000
+
+
+def test_the_log_counts_and_tells_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    try:
+        handler = logs._Patient(write)
+        handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+        for _ in range(500):
+            handler.handle(line())
+        handler.flush()
+        assert os.read(read, 1 << 16) == b"ERROR failed here\nERROR failed here (499 times more)\n"
+        monkeypatch.setattr("lodestream_server.operation.repeats.SECONDS", 0.1)
+        for _ in range(3):
+            handler.handle(line())
+        taken = b""
+        while taken.count(b"\n") < 2:
+            taken += os.read(read, 1 << 16)
+        assert taken == b"ERROR failed here\nERROR failed here (2 times more)\n"
+    finally:
+        os.close(read)
+        os.close(write)

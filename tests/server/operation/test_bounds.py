@@ -1,0 +1,196 @@
+"""What one caller may have beside others: uploads, builds, promises, and bytes on the disk."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from lodestream_server.problems import BusyError, FullError, TooManyError
+from lodestream_server.storage.catalog import Catalog
+from lodestream_server.storage.records import Record
+from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, limits, read, request
+from tests.server.helpers import PATIENCE
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    size = {"free": 1000}
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(100_000, 0, size["free"]))
+    return size
+
+
+@pytest.mark.parametrize(("most", "shares"), [(1, (1, 0, 0)), (2, (1, 1, 0)), (8, (4, 2, 1)), (64, (32, 16, 8))])
+def test_of_uploads_each_caller_leaves_some_to_the_next(tmp_path: Path, most: int, shares: tuple[int, ...]) -> None:
+    made = limits(tmp_path, alone=False, max_uploads=most)
+
+    async def together() -> None:
+        async with asyncio.timeout(PATIENCE):
+            async with asyncio.TaskGroup() as group:
+                done = asyncio.Event()
+
+                async def hold(caller: Any, entered: asyncio.Future[None]) -> None:
+                    try:
+                        async with made.upload(request(b"x"), caller):
+                            entered.set_result(None)
+                            await done.wait()
+                    except (TooManyError, BusyError) as error:
+                        entered.set_exception(error)
+
+                async def take(caller: Any) -> None:
+                    entered = asyncio.get_running_loop().create_future()
+                    group.create_task(hold(caller, entered))
+                    await entered
+
+                left = most
+                for caller, share in zip((ANNA, BERT, CARL), shares, strict=True):
+                    for _ in range(share):
+                        await take(caller)
+                    left -= share
+                    kind = TooManyError if left else BusyError
+                    with pytest.raises(kind, match=f"of {caller.name}" if left else f"at most {most} uploads"):
+                        await take(caller)
+                done.set()
+        assert not made._uploads
+        assert not made._promised
+        assert not made._taken
+
+    asyncio.run(together())
+
+
+def test_builds_of_one_caller_leave_some_to_the_others(tmp_path: Path) -> None:
+    def made(builds: int, own: int, alone: bool = False) -> Any:
+        return limits(tmp_path, builds=builds, own=own, alone=alone, max_builds=10)
+
+    asyncio.run(read(made(4, 4), request(b"x")))
+    with pytest.raises(TooManyError, match="pending builds of anna"):
+        asyncio.run(read(made(5, 5), request(b"x")))
+    asyncio.run(read(made(5, 5), request(b"x"), BERT))
+    asyncio.run(read(made(9, 9, alone=True), request(b"x")))
+    with pytest.raises(BusyError, match="at most 10 pending builds on this server"):
+        asyncio.run(read(made(10, 0), request(b"x")))
+
+
+def test_promises_are_counted_for_whoever_makes_them(tmp_path: Path, disk: dict[str, int]) -> None:
+    made = limits(tmp_path, keep_free=0, owner_bytes=10**6)
+
+    async def together() -> None:
+        async with ExitStackOf(made) as held:
+            await held.begin(ANNA, 1000)
+            with pytest.raises(FullError, match="all uploads of anna"):
+                await read(made, request(b"", length=1))
+            # Nothing of it has come: there is room for the others, and for as much.
+            assert await read(made, request(b"y" * 900, length=900), BERT) == b"y" * 900
+            disk["free"] = 500
+            with pytest.raises(FullError, match="of bert"):
+                await read(made, request(b"", length=501), BERT)
+            assert await read(made, request(b"y", length=500), BERT) == b"y"
+
+    asyncio.run(together())
+
+
+class ExitStackOf:
+    """Uploads that have begun and go on until the end."""
+
+    def __init__(self, made: Any) -> None:
+        self._made = made
+        self._held: list[Any] = []
+
+    async def __aenter__(self) -> ExitStackOf:
+        return self
+
+    async def begin(self, caller: Any, length: int) -> Any:
+        upload = self._made.upload(request(b"x" * 6, b"", length=length), caller)
+        watched = await upload.__aenter__()
+        self._held.append(upload)
+        return watched
+
+    async def __aexit__(self, *error: object) -> None:
+        for upload in reversed(self._held):
+            await upload.__aexit__(None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("kept", "length", "fits"), [(0, 500, True), (0, 501, False), (400, 300, True), (400, 301, False)]
+)
+def test_an_owner_keeps_as_much_as_stays_free(
+    tmp_path: Path, disk: dict[str, int], kept: int, length: int, fits: bool
+) -> None:
+    made = limits(tmp_path, kept=kept, alone=False, keep_free=0)
+    if fits:
+        asyncio.run(read(made, request(b"x", length=length)))
+        return
+    with pytest.raises(FullError, match="bytes of anna on the server's disk, half of what they use there"):
+        asyncio.run(read(made, request(b"x", length=length)))
+    asyncio.run(read(made, request(b"x", length=500), BERT))
+    asyncio.run(read(limits(tmp_path, kept=kept, alone=True, keep_free=0), request(b"x", length=length)))
+
+
+def test_the_share_of_an_owner_may_be_chosen(tmp_path: Path, disk: dict[str, int]) -> None:
+    for alone in (False, True):
+        made = limits(tmp_path, kept=90, alone=alone, keep_free=0, owner_bytes=100)
+        asyncio.run(read(made, request(b"x", length=10)))
+        with pytest.raises(
+            FullError, match="at most 100 bytes of anna on the server's disk, got 90 bytes and 11 to come"
+        ):
+            asyncio.run(read(made, request(b"x", length=11)))
+        asyncio.run(read(made, request(b"x", length=100), BERT))
+
+
+def test_an_upload_that_does_not_say_its_size_stops_at_its_owners_share(tmp_path: Path, disk: dict[str, int]) -> None:
+    disk["free"] = 1 << 40
+    made = limits(tmp_path, keep_free=0, owner_bytes=20 << 20)
+    with pytest.raises(FullError, match="of anna"):
+        asyncio.run(read(made, request(*[bytes(1 << 24)] * 3)))
+    # What was promised and taken for good stays good, whatever comes beside it.
+    assert len(asyncio.run(read(made, request(bytes(1 << 24), b"x", length=(1 << 24) + 1), BERT))) == (1 << 24) + 1
+
+
+def record(surface: str, **values: Any) -> Record:
+    fixed: dict[str, Any] = {"name": None, "created": 1.0, "filenames": ("a",), "upload_bytes": 100, "options": {}}
+    return Record(id=surface, **{**fixed, **values})
+
+
+def test_what_is_kept_is_counted_once_for_each_owner() -> None:
+    ready = {"upload": "up", "container": "c", "info": {"bytes": 30}, "state": "ready"}
+    catalog = Catalog([record("1", owner="anna", upload="up"), record("2", owner="anna", **ready)])
+    assert (catalog.kept("anna"), catalog.kept("bert"), catalog.kept(None)) == (130, 0, 0)
+    catalog.put(record("3", owner="bert", **ready))
+    catalog.put(record("4", owner=None))
+    assert (catalog.kept("anna"), catalog.kept("bert"), catalog.kept(None)) == (130, 130, 100)
+    catalog.put(record("1", owner="anna", **ready))
+    catalog.drop("2")
+    assert catalog.kept("anna") == 130
+    catalog.put(record("1", owner="anna", **{**ready, "upload_lost": True}))
+    assert catalog.kept("anna") == 30
+    for surface in "1234":
+        catalog.drop(surface)
+    assert [catalog.kept(owner) for owner in ("anna", "bert", None)] == [0, 0, 0]
+    assert not catalog._things
+
+
+def test_what_is_kept_is_what_a_new_catalog_would_count() -> None:
+    random = Random(7)
+    catalog = Catalog()
+    for _ in range(2000):
+        surface = str(random.randrange(12))
+        if random.random() < 0.3:
+            catalog.drop(surface)
+            continue
+        number = random.randrange(4)
+        made = record(
+            surface,
+            owner=random.choice(["anna", "bert", None]),
+            upload=random.choice([None, "x", "y"]),
+            upload_lost=random.random() < 0.2,
+            container=random.choice([None, f"c{number}"]),
+            info=random.choice([None, {"bytes": 10 + number}]),
+        )
+        catalog.put(made)
+        fresh = Catalog(catalog.all())
+        for owner in ("anna", "bert", None):
+            assert catalog.kept(owner) == fresh.kept(owner)

@@ -1,0 +1,148 @@
+"""The table of settings, and everything that is made from it."""
+
+from __future__ import annotations
+
+import argparse
+import typing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from lodestream_server import Settings
+from lodestream_server.commands.serve import chosen_settings, register
+from lodestream_server.operation import settings as settings_module
+from lodestream_server.operation.bounds import Bounds
+from lodestream_server.operation.table import GROUPS, TABLE, Setting
+from tests.server import manual
+
+
+def parse(*arguments: str) -> Settings:
+    parser = argparse.ArgumentParser()
+    register(parser.add_subparsers())
+    return chosen_settings(parser.parse_args(["serve", *arguments]))
+
+
+def example(setting: Setting) -> str:
+    """Text for a value that is not the default."""
+    if setting.kind.expected.startswith("one of"):
+        return setting.kind.expected.split()[-1]
+    if setting.default is False:
+        return "yes"
+    if setting.name == "formats":
+        return "text,npy"
+    return {
+        "an integer": "7",
+        "seconds": "0.5",
+        "text": "/x",
+        "a path": "/x",
+        "words separated by commas": "a,b",
+    }.get(setting.kind.expected, "3GiB")
+
+
+@pytest.fixture(autouse=True)
+def _bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    for setting in TABLE.values():
+        monkeypatch.delenv(setting.variable, raising=False)
+
+
+def test_the_page_is_the_table() -> None:
+    assert manual.PATH.read_text() == manual.render(), "run python -m tests.server.manual"
+    assert {setting.group for setting in TABLE.values()} == set(GROUPS)
+
+
+def test_the_settings_are_the_table_and_their_types_fit() -> None:
+    assert [name for name in Settings.model_fields if name not in Bounds.model_fields] == list(TABLE)
+    assert not set(TABLE) & set(Bounds.model_fields)
+    types = typing.get_type_hints(Settings)
+    kinds: dict[type, Any] = {int: ("an integer", "bytes,"), float: "seconds", bool: "yes or no", Path: "a path"}
+    for name, setting in TABLE.items():
+        for kind, expected in kinds.items():
+            if types[name] in (kind, kind | None):
+                assert setting.kind.expected.startswith(expected), name
+        assert Settings.model_fields[name].description == setting.meaning
+
+
+@pytest.mark.parametrize("setting", TABLE.values(), ids=TABLE)
+def test_each_is_a_variable_and_an_option_and_the_option_wins(
+    setting: Setting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default, text = getattr(parse(), setting.name), example(setting)
+    arguments = [setting.option] if setting.default is False else [setting.option, text]
+    given = getattr(parse(*arguments), setting.name)
+    assert given != default
+    monkeypatch.setenv(setting.variable, text)
+    assert getattr(parse(), setting.name) == getattr(Settings(), setting.name) == given
+    if setting.default is False:
+        assert getattr(parse(f"--no-{setting.option[2:]}"), setting.name) is False
+    monkeypatch.setenv(setting.variable, "")
+    assert getattr(parse(), setting.name) == default
+
+
+def test_help_tells_every_option_with_its_default() -> None:
+    parser = argparse.ArgumentParser()
+    subparsers = parser.add_subparsers()
+    register(subparsers)
+    # Lines are broken after hyphens, too.
+    text = "".join(subparsers.choices["serve"].format_help().split())
+    for setting in TABLE.values():
+        assert f"{setting.meaning} (default: {setting.default_text})".replace(" ", "") in text, setting.name
+        assert setting.option in text
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1000", 1000), ("4GiB", 4 << 30), ("1.5 MiB", 3 << 19), ("2kB", 2000), ("3g", 3 * 10**9), ("0", 0)],
+)
+def test_sizes_carry_units(text: str, size: int) -> None:
+    assert TABLE["keep_free"].take(text) == size
+    assert TABLE["keep_free"].take(TABLE["keep_free"].kind.show(size)) == size
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("keep_free", "4 pounds", "expected bytes"),
+        ("keep_free", "-1", "expected bytes"),
+        ("upload_bytes", 0, "at least 1"),
+        ("port", 65536, "0 to 65535"),
+        ("memory", "1MiB", "at least 256MiB"),
+        ("idle_seconds", "nan", "finite number"),
+        ("idle_seconds", 0, "greater than 0"),
+        ("max_streams", 0, "greater than or equal to 1"),
+        ("insecure", "perhaps", "yes or no"),
+        ("log_format", "xml", "one of text, json"),
+        ("root_path", "maps/", "begins with a slash"),
+        ("data", "a\0b", "a path"),
+    ],
+)
+def test_what_cannot_be_is_said(name: str, value: Any, words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Settings(**{name: value})
+
+
+def test_lists_and_paths() -> None:
+    settings = parse("--origins", " https://a.example , https://b.example,", "--data", "here")
+    assert settings.origins == ("https://a.example", "https://b.example")
+    assert settings.tokens == Path("here/tokens.json")
+    assert parse("--token-file", "there").tokens == Path("there")
+
+
+def test_bounds_are_no_business_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LODESTREAM_MAX_STREAMS", "3")
+    assert Settings().max_streams == Bounds().max_streams
+    assert Settings(max_streams=3).max_streams == 3
+
+
+def test_memory_is_divided_among_builds_and_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (16 << 30, 1 << 40):
+        monkeypatch.setattr(settings_module, "memory_limit", lambda there=there: there)
+        for workers in (1, 2, 3, 7):
+            chosen = Settings(workers=workers)
+            assert chosen.memory_of_build * workers <= there // 2
+            assert chosen.memory_of_build * workers + chosen.memory_of_levels < there
+    assert Settings(memory=8 << 30, workers=4).memory_of_build == 2 << 30
+    assert Settings(memory=8 << 30, workers=4).memory_of_levels == 4 << 30
+    assert Settings(workers=1000000).memory_of_build == 512 << 20
+    assert Settings(build_memory=1 << 30).memory_of_build == 1 << 30

@@ -1,0 +1,280 @@
+"""A server that cannot start says why in one line and exits with 1; what it makes on the disk is its owner's alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import httpx
+import pytest
+
+from lodestream.errors import LodestreamError
+from lodestream_client.__main__ import main
+from lodestream_server import Settings, create_app, running_server
+from lodestream_server.access.tokens import TokenFile
+from lodestream_server.storage import durable
+from lodestream_server.storage.durable import Disk
+from lodestream_server.storage.storage import Storage
+from tests.server.helpers import PATIENCE, Keys, hills, npy, problem, push
+
+Refused = Callable[..., str]
+
+
+def lodestream(*arguments: object) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("LODESTREAM_")}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    command = [sys.executable, "-m", "lodestream_client", *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE)
+
+
+def refused_program(*arguments: object) -> str:
+    """The one line with which a process of the command ends."""
+    done = lodestream(*arguments)
+    return the_line(done.returncode, done.stdout, done.stderr)
+
+
+def the_line(code: int, out: str, err: str) -> str:
+    assert (code, out) == (1, ""), err
+    assert err.startswith("lodestream: ")
+    assert err.count("\n") == 1
+    return err.removesuffix("\n")
+
+
+@pytest.fixture
+def refused(called_here: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """The same within this process."""
+    for name in list(os.environ):
+        if name.startswith("LODESTREAM_"):
+            monkeypatch.delenv(name)
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        return the_line(code, *capsys.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def closed(tmp_path: Path) -> Iterator[Path]:
+    """A folder in which nothing can be made, not even by root."""
+    folder = tmp_path / "closed"
+    folder.mkdir(0o500)
+    if not os.access(folder, os.W_OK):
+        yield folder
+        return
+    kernel = Path("/sys/kernel")
+    if not kernel.is_dir():
+        pytest.skip("no folder refuses root here")
+    yield kernel
+
+
+def test_a_folder_that_another_server_uses(tmp_path: Path) -> None:
+    with running_server(tmp_path):
+        line = refused_program("serve", "--port", "0", "--data", tmp_path)
+    assert str(tmp_path) in line
+    assert "another" in line
+
+
+def test_a_folder_that_cannot_be_written(closed: Path, refused: Refused) -> None:
+    assert f"{closed}/lock: " in refused("serve", "--port", "0", "--data", closed)
+    assert f"{closed}/data: " in refused("serve", "--port", "0", "--data", closed / "data")
+    assert f"{closed}/tokens.json" in refused("token", "create", "--data", closed)
+    assert f"{closed}/data: " in refused("token", "create", "--data", closed / "data")
+
+
+@pytest.mark.parametrize("name", ["", "records", "uploads", "containers", "incoming", "work"])
+def test_a_folder_that_can_be_read_but_not_written_any_more(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = tmp_path / "data"
+    Storage(data).close()
+    folder = data / name
+    folder.chmod(0o500)
+    if os.access(folder, os.W_OK):  # root: what the system says of a disk that is mounted for reading
+        ask = os.access
+        monkeypatch.setattr(os, "access", lambda path, mode: path != folder and ask(path, mode))
+    with pytest.raises((LodestreamError, PermissionError), match=re.escape(str(folder))), running_server(data):
+        pass
+    folder.chmod(0o700)
+    monkeypatch.undo()
+    Storage(data).close()
+
+
+def test_a_file_in_the_place_of_a_folder(tmp_path: Path, refused: Refused) -> None:
+    file = tmp_path / "data"
+    file.write_text("not a folder")
+    for folder in (file, file / "below"):
+        assert "Not a directory" in refused("serve", "--port", "0", "--data", folder)
+        assert "Not a directory" in refused("token", "create", "--data", folder)
+    assert "Not a directory" in refused("serve", "--port", "0", "--data", file, "--token-file", tmp_path / "tokens")
+    assert file.read_text() == "not a folder"
+
+
+@pytest.mark.parametrize("content", [b"", b"[", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"version": 1, "tokens": [7]}'])
+def test_a_token_file_that_is_none(tmp_path: Path, refused: Refused, content: bytes) -> None:
+    path = tmp_path / "tokens.json"
+    path.write_bytes(content)
+    for command in (("serve", "--port", "0"), ("token", "create"), ("token", "list"), ("token", "revoke", "x")):
+        assert str(path) in refused(*command, "--data", tmp_path)
+    assert path.read_bytes() == content
+
+
+def test_a_token_file_that_cannot_be_read(tmp_path: Path, refused: Refused) -> None:
+    path = tmp_path / "tokens.json"
+    path.mkdir()
+    for command in (("serve", "--port", "0"), ("token", "create"), ("token", "list")):
+        assert str(path) in refused(*command, "--data", tmp_path)
+
+
+def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        line = refused_program("serve", "--port", port, "--data", tmp_path)
+        assert line == (f"lodestream: cannot listen on 127.0.0.1 port {port}: {os.strerror(98)}")
+        # In the same process the folder is free again.
+        for _ in range(2):
+            with pytest.raises(LodestreamError, match=f"port {port}"), running_server(tmp_path, port=port):
+                pass
+    for host in ("192.0.2.1", "nowhere.invalid"):
+        assert host in refused("serve", "--port", "0", "--host", host, "--insecure", "--data", tmp_path)
+    with running_server(tmp_path) as url:
+        assert httpx.get(f"{url}/healthz", trust_env=False).status_code == 200
+
+
+def test_a_name_with_several_addresses_is_served_at_each(tmp_path: Path) -> None:
+    found = {info[4][0] for info in socket.getaddrinfo("localhost", 0, type=socket.SOCK_STREAM)}
+    with running_server(tmp_path, host="localhost") as url:
+        assert httpx.get(f"{url}/healthz", trust_env=False).status_code == 200
+        assert url.rsplit(":", 1)[0].removeprefix("http://").strip("[]") in found
+
+
+@pytest.mark.parametrize("origin", ["*", "null"])
+def test_pages_of_all_sites_need_a_token_to_be_there(tmp_path: Path, keys: Keys, refused: Refused, origin: str) -> None:
+    for options in ((), ("--insecure",), ("--public-reads",)):
+        line = refused("serve", "--port", "0", "--data", tmp_path, "--origins", f"https://a.example,{origin}", *options)
+        assert f"LODESTREAM_ORIGINS={origin}" in line
+        assert str(tmp_path / "tokens.json") in line
+    create_app(Settings(data=keys.folder, origins=(origin,)))
+
+
+def test_pages_of_all_sites_use_a_server_with_their_token(keys: Keys) -> None:
+    with running_server(keys.folder, workers=1, origins=("*",)) as url:
+        for site in ("https://a.example", "null", url):
+            page = {"origin": site, **keys.header("write")}
+            answer = httpx.get(f"{url}/v1/surfaces", headers=page, trust_env=False)
+            assert answer.status_code == 200
+            assert answer.headers["access-control-allow-origin"] == "*"
+            assert "access-control-allow-credentials" not in answer.headers
+            assert problem(httpx.get(f"{url}/v1/surfaces", headers={"origin": site}, trust_env=False))[0] == 401
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.fixture
+def open_umask() -> Iterator[None]:
+    """A process that would let everybody read and write what it makes."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
+    data = tmp_path / "above" / "data"
+    with (
+        running_server(data, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+    ):
+        surface = push(http, npy(hills(12, 9)))
+    assert surface["state"] == "ready"
+    assert mode(data) == 0o700
+    assert mode(data / "lock") == 0o600
+    files = [path for folder in ("records", "uploads", "containers") for path in (data / folder).rglob("*")]
+    assert len(files) >= 5
+    for path in files:
+        assert mode(path) == (0o700 if path.is_dir() else 0o600), path
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_a_data_folder_that_is_open_to_others_is_closed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = tmp_path / "data"
+    for setup in (0o755, 0o777, 0o2750):
+        data.mkdir(exist_ok=True)
+        data.chmod(setup)
+        Storage(data).close()
+        assert mode(data) == setup & ~0o077
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    # With something else in it, it may be somebody's home.
+    (data / "thesis.tex").write_text("")
+    data.chmod(0o755)
+    Storage(data).close()
+    assert mode(data) == 0o755
+    (warning,) = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert "thesis.tex" in warning.getMessage()
+    assert "chmod 700" in warning.getMessage()
+
+
+def test_a_data_folder_that_cannot_be_closed_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def chmod(path: Path, mode: int) -> None:
+        raise PermissionError(1, "Operation not permitted", str(path))
+
+    tmp_path.chmod(0o755)
+    monkeypatch.setattr(Path, "chmod", chmod)
+    Storage(tmp_path).close()
+    assert "Operation not permitted" in caplog.text
+    assert str(tmp_path) in caplog.text
+
+
+@pytest.mark.usefixtures("open_umask")
+def test_the_token_file_is_its_owners_alone_from_the_first_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+
+    class Watched(Disk):
+        def write(self, file: BinaryIO, data: bytes) -> None:
+            seen.append(stat.S_IMODE(os.fstat(file.fileno()).st_mode))
+            super().write(file, data)
+            seen.append(stat.S_IMODE(os.fstat(file.fileno()).st_mode))
+
+    monkeypatch.setattr(durable, "disk", Watched())
+    path = tmp_path / "keys" / "tokens.json"
+    TokenFile(path).create("one", ("read",))
+    assert mode(path) == 0o600
+    assert mode(path.parent) == 0o700
+    path.chmod(0o640)  # whoever did so has a reason, and its successor gets this mode once it is whole
+    TokenFile(path).create("two", ("read",))
+    assert mode(path) == 0o640
+    assert seen == [0o600] * 4
+
+
+def test_a_token_file_that_cannot_be_replaced_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tokens.json"
+    TokenFile(path).create("one", ("read",))
+    before = path.read_bytes()
+
+    class Broken(Disk):
+        def rename(self, source: Path, target: Path) -> None:
+            raise OSError(5, "Input/output error", str(target))
+
+    monkeypatch.setattr(durable, "disk", Broken())
+    with pytest.raises(OSError, match="Input/output"):
+        TokenFile(path).create("two", ("read",))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    assert [token["name"] for token in json.loads(before)["tokens"]] == ["one"]

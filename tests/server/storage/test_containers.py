@@ -1,0 +1,126 @@
+"""Open containers share what is known of them."""
+
+from __future__ import annotations
+
+import gc
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import BinaryIO
+
+import httpx
+import pytest
+
+from lodestream import encode
+from lodestream.container import Index
+from lodestream_server import running_server
+from lodestream_server.problems import BusyError
+from lodestream_server.storage import containers
+from lodestream_server.storage.containers import Containers
+from lodestream_server.storage.storage import Storage
+from tests.server.helpers import hills, kept, push
+
+
+@pytest.fixture
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Of more containers than indexes are kept of, in a folder."""
+    data = encode(hills(9, 8))
+    found = [f"{number:064x}" for number in range(3 * containers._INDEXES_KEPT)]
+    for name in found:
+        (tmp_path / name).write_bytes(data)
+    monkeypatch.setattr(Storage, "__init__", lambda self: None)
+    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
+    return found
+
+
+def test_an_index_is_shared_while_a_container_is_open(names: list[str]) -> None:
+    made = Containers(Storage.__new__(Storage))
+    first = [made.open(name) for name in names]
+    again = [made.open(name) for name in names]
+    assert [one.index is other.index for one, other in zip(first, again, strict=True)] == [True] * len(names)
+    for opened in first:
+        opened.close()
+    del first, opened
+    gc.collect()
+    third = [made.open(name) for name in names]
+    assert all(one.index is other.index for one, other in zip(again, third, strict=True))
+    for opened in (*again, *third):
+        opened.close()
+
+
+def test_no_more_indexes_are_kept_than_are_worth_it(names: list[str]) -> None:
+    made = Containers(Storage.__new__(Storage))
+    before = _indexes()
+    for name in names:
+        made.open(name).close()
+    assert _indexes() - before == containers._INDEXES_KEPT
+
+
+def test_nor_more_than_so_many_bytes_of_them(names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Containers(Storage.__new__(Storage))
+    with made.open(names[0]).file as file:
+        each = containers.index_memory(file)
+    assert each > 1000
+    monkeypatch.setattr(containers, "_BYTES_KEPT", 3 * each + 1)
+    before = _indexes() - 1
+    for name in names:
+        made.open(name).close()
+    assert _indexes() - before == 3
+
+
+def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(names: list[str]) -> None:
+    with Containers(Storage.__new__(Storage)).open(names[0]).file as file:
+        each = containers.index_memory(file)
+    made = Containers(Storage.__new__(Storage), 5 * each)
+    for name in names[5:20]:  # what nobody has open any more is in nobody's way
+        made.open(name).close()
+    held = [made.open(name) for name in names[:5]]
+    with pytest.raises(BusyError, match="indexes of all surfaces that are streamed"):
+        made.open(names[5])
+    again = made.open(names[0])
+    assert again.index is held[0].index
+    again.close()
+    held.pop().close()
+    gc.collect()
+    held.append(made.open(names[5]))
+    for opened in held:
+        opened.close()
+
+
+def test_a_container_whose_index_takes_too_much_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(containers, "most_for_indexes", lambda: 1000)
+    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        surface = push(http, encode(hills()))
+        assert surface["state"] == "waiting"
+        assert "whose index takes at most" in surface["reason"]
+        assert kept(tmp_path, "containers") == []
+        assert len(kept(tmp_path, "uploads")) == 1
+
+
+def _indexes() -> int:
+    gc.collect()
+    return sum(isinstance(item, Index) for item in gc.get_objects())
+
+
+def test_of_many_who_open_a_container_at_once_one_reads_its_index(
+    names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, read = Containers(Storage.__new__(Storage)), list[int]()
+    together, right = threading.Barrier(8), containers._read_index
+
+    def counted(file: BinaryIO) -> Index:
+        read.append(1)
+        return right(file)
+
+    monkeypatch.setattr(containers, "_read_index", counted)
+
+    def open_one(_: int) -> object:
+        together.wait()
+        opened = made.open(names[0])
+        opened.close()
+        return opened.index
+
+    with ThreadPoolExecutor(8) as pool:
+        indexes = list(pool.map(open_one, range(8)))
+    assert len(set(map(id, indexes))) == 1
+    assert len(read) == 1

@@ -1,0 +1,103 @@
+"""What the operator is told of a container that turns out to be damaged while it is read."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from lodestream.errors import StreamError
+from lodestream.protocol.messages import CODES, MAX_CREDIT, Credit, Error, Event, Open
+from lodestream_server.operation.repeats import Repeats
+from lodestream_server.storage import damage
+from lodestream_server.storage.storage import Storage
+from tests.server.builds.test_builds import running
+from tests.server.helpers import closed, hills, npy, push, raw_stream
+
+
+@pytest.fixture
+def http(tmp_path: Path) -> Iterator[httpx.Client]:
+    with running(tmp_path / "data") as client:
+        yield client
+
+
+def error_of(http: httpx.Client, made: dict[str, Any], spoil: Callable[[], None], *, before: bool) -> str:
+    """The code with which a stream ends whose container is spoilt before it begins, or while it waits."""
+    if before:
+        spoil()
+    with raw_stream(f"{http.base_url}".rstrip("/") + made["url"]) as stream:
+        if not before:
+            stream.send(Open(credit=100))
+        events: list[Event] = [stream.receive()]
+        if not before:
+            spoil()
+            stream.send(Credit(MAX_CREDIT))
+        while not isinstance(events[-1], Error):
+            events.append(stream.receive())
+        closed(stream, CODES["damaged"].close)
+        return events[-1].code
+
+
+def code_of(answer: httpx.Response) -> str:
+    assert answer.status_code == 500
+    return str(answer.json()["code"])
+
+
+@pytest.mark.parametrize("way", ["opened", "streamed", "level", "fetched"])
+def test_a_damaged_container_is_told_once_with_what_to_do(
+    http: httpx.Client, tmp_path: Path, caplog: pytest.LogCaptureFixture, way: str
+) -> None:
+    made = push(http, npy(hills(60, 50)))
+    path = tmp_path / "data" / "containers" / f"{made['container']}.lode"
+
+    def cut() -> None:
+        os.truncate(path, made["bytes"] // 2)
+
+    def flip() -> None:
+        with path.open("r+b") as file:
+            file.seek(made["bytes"] - 40)  # in the index, or the footer that leads to it
+            file.write(bytes(20))
+
+    level, fetch = f"{made['url']}/levels/2?format=npy", f"/v1/containers/{made['container']}.lode"
+    for attempt in range(3):
+        if way == "opened":
+            assert error_of(http, made, flip, before=True) == "damaged"
+        elif way == "streamed" and not attempt:
+            assert error_of(http, made, cut, before=False) == "damaged"
+        else:
+            cut()
+            found = level if way == "level" else fetch
+            assert code_of(http.get(found)) == "damaged"
+    lines = [record for record in caplog.records if record.levelno >= logging.ERROR]
+    words = {record.getMessage() for record in lines}
+    assert words == {
+        f"{path}, the container of surface {made['id']}, is damaged: stop the server and run lodestream fsck --repair "
+        f"{tmp_path / 'data'}, which builds it again from its upload"
+    }
+    assert len(lines) == 3
+    assert all("expected" in vars(record)["lodestream_fields"]["problem"] for record in lines)
+    told = Repeats()
+    assert [told.admit(record, 0.0) for record in lines] == [True, False, False]
+    assert 'lodestream_errors_total{kind="damaged"} 3.0' in http.get("/metrics").text
+
+
+def test_all_surfaces_of_a_container_are_named_or_counted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    storage = Storage(tmp_path / "data")
+    names = [f"{number:020x}" for number in range(7)]
+    for known, words in (
+        (names[:2], ", ".join(names[:2])),
+        (names, f"{', '.join(names[:5])} and 2 more"),
+        ([], "none"),
+    ):
+        caplog.clear()
+        monkeypatch.setattr(storage, "surfaces_of", lambda sha256, known=known: known)
+        damage.tell(storage, "0" * 64, StreamError("expected another"))
+        assert f", the container of surface {words}, is damaged: " in caplog.records[0].getMessage()
+    storage.close()

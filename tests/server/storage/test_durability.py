@@ -1,0 +1,153 @@
+"""The power fails after any step: what was acknowledged is there, and nothing is half there."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import itertools
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from lodestream_server.maintenance.fsck import check
+from lodestream_server.storage import durable
+from lodestream_server.storage.records import Record
+from lodestream_server.storage.storage import Storage
+from lodestream_server.storage.uploads import Upload
+from tests.server.storage.disks import LosingDisk
+
+UPLOADS = {"a" * 20: b"first" * 100, "b" * 20: b"second" * 100}
+CONTAINER = b"container" * 1000
+SHA256 = hashlib.sha256(CONTAINER).hexdigest()
+
+
+@dataclass
+class Promises:
+    """What whoever uses the storage has been told."""
+
+    stored: set[str] = field(default_factory=set)
+    ready: set[str] = field(default_factory=set)
+    failed: set[str] = field(default_factory=set)
+    deleted: set[str] = field(default_factory=set)
+
+
+def take(storage: Storage, surface: str) -> None:
+    folder = storage.new_upload()
+    upload = Upload(folder, 1)
+    upload.begin("file")
+    upload.write(UPLOADS[surface])
+    upload.end()
+    sha256 = upload.digest.hexdigest()
+    storage.add(Record(surface, None, 1.0, ("file",), upload.size, {}, upload_sha256=sha256), folder)
+
+
+def build(storage: Storage, surface: str) -> None:
+    folder = durable.make_folder(storage.work_folder(surface))
+    with durable.NewFile(folder / "container") as file:
+        file.write(CONTAINER)
+    storage.ready(surface, folder / "container", SHA256, {"bytes": len(CONTAINER)})
+    durable.remove(folder)
+
+
+def keeps(folder: Path, promises: Promises) -> None:
+    storage = Storage(folder)
+    records = {record.id: record for record in storage.records()}
+    storage.close()
+    assert promises.stored | promises.failed <= records.keys()
+    assert not promises.deleted & records.keys()
+    for surface, record in records.items():
+        if surface in promises.ready:
+            assert record.state == "ready"
+        if surface in promises.failed:
+            assert record.state == "failed"
+        if surface in promises.stored:
+            assert record.state in ("queued", "ready")
+        (path,) = storage.upload_files(record)
+        assert path.read_bytes() == UPLOADS[surface]
+        if record.state == "ready":
+            assert storage.container(SHA256).read_bytes() == CONTAINER
+    # Only what this test takes for a container is wrong with what is left.
+    assert {finding.what for finding in check(folder).findings} <= {"container"}
+
+
+def lay_out(remains: dict[str, bytes | None], folder: Path) -> Path:
+    for path, data in remains.items():
+        target = folder / path.removeprefix("/")
+        if data is None:
+            target.mkdir()
+        else:
+            target.write_bytes(data)
+    return folder
+
+
+def test_the_power_fails_after_any_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.CRITICAL)
+    promises, seen = Promises(), set[str]()
+    plain = durable.disk
+
+    def fail(disk: LosingDisk) -> None:
+        monkeypatch.setattr(durable, "disk", plain)
+        for names, data in itertools.product((False, True), repeat=2):
+            remains = disk.remains(names=names, data=data)
+            # Most steps change nothing in most views.
+            case = repr((sorted(remains.items()), promises))
+            if case not in seen:
+                seen.add(case)
+                keeps(lay_out(remains, tmp_path / f"left-{len(seen)}"), promises)
+        monkeypatch.setattr(durable, "disk", disk)
+
+    first, second = UPLOADS
+    storage = Storage(tmp_path / "data")
+    losing = LosingDisk(tmp_path / "data", fail)
+    monkeypatch.setattr(durable, "disk", losing)
+    take(storage, first)
+    promises.stored.add(first)
+    build(storage, first)
+    promises.ready.add(first)
+    take(storage, second)
+    promises.stored.add(second)
+    promises.stored.remove(second)
+    storage.failed(second, "no surface")
+    promises.failed.add(second)
+    promises.failed.remove(second)
+    take(storage, second)
+    promises.stored.add(second)
+    build(storage, second)
+    promises.ready.add(second)
+    promises.stored.remove(first)
+    promises.ready.remove(first)
+    storage.delete(first)
+    promises.deleted.add(first)
+    fail(losing)
+    promises.stored.remove(second)
+    promises.ready.remove(second)
+    storage.delete(second)
+    storage.close()
+    assert len(seen) > 50
+
+
+def test_a_surface_has_not_failed_until_that_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a client was told as failed would be queued again after a restart."""
+    surface = next(iter(UPLOADS))
+    storage = Storage(tmp_path / "data")
+    take(storage, surface)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "_write", full)
+        storage.failed(surface, "no surface")
+    record = storage.get(surface)
+    assert record.state == "waiting"
+    assert record.reason is not None
+    assert record.reason.startswith("no surface (this could not be recorded: ")
+    storage.failed(surface, "no surface")
+    storage.close()
+    again = Storage(tmp_path / "data")
+    assert again.get(surface).state == "failed"
+    again.close()
