@@ -13,9 +13,9 @@ from lodestream.errors import LodestreamError
 
 from .commands import decode, demo, encode, formats, info, pull, push, retry, surfaces
 from .commands.arguments import Subparsers, add_command
-from .commands.interrupts import exit_code, unwrapping
-from .commands.output import Parser, clean_warnings, note
 from .starting import EndingAtOnce
+from .terminal.interrupts import exit_code, unwrapping
+from .terminal.output import Parser, clean_warnings, note
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -16,11 +16,11 @@ from lodestream.errors import (
 )
 from lodestream.target import Target
 
+from ..terminal.interrupts import interruptible
+from ..terminal.output import note, progress_bar
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_target_options, target_of
 from .inputs import input_files, named
-from .interrupts import interruptible
 from .outcome import Outcome, check_grid, check_out, note_unmet
-from .output import note, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,10 +11,10 @@ from typing import Any
 
 from lodestream.errors import OptionError
 
+from ..terminal.interrupts import interruptible
+from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 from .arguments import Subparsers, add_command, add_json_option, add_surface_options, precisions, surface_options
 from .inputs import input_files
-from .interrupts import interruptible
-from .output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 
 __all__ = ["register", "run"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from ..terminal.output import cell, console, print_json
 from .arguments import Subparsers, add_command, add_json_option
-from .output import cell, console, print_json
 
 __all__ = ["register", "run"]
 

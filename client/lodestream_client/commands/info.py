@@ -10,9 +10,9 @@ from typing import Any
 from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
 
 from ..requests import addresses
+from ..terminal.output import cell, console, human_size, point_words, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
 from .inputs import input_files, named
-from .output import cell, console, human_size, point_words, print_json
 
 __all__ = ["register", "run"]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from lodestream.errors import CorruptStreamError, FormatError, LodestreamError, OptionError, RemoteError, TooLargeError
 
-from .output import human_size, note
+from ..terminal.output import human_size, note
 
 if TYPE_CHECKING:
     from ..requests.api import Identity

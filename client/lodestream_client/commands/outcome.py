@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import FormatError
 from lodestream.target import Target
 
-from .output import human_size, note, print_json, require_folder
+from ..terminal.output import human_size, note, print_json, require_folder
 
 if TYPE_CHECKING:
     from lodestream.container import Header

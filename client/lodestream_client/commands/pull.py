@@ -18,6 +18,8 @@ from lodestream.errors import (
 from lodestream.target import Target
 
 from ..requests import addresses
+from ..terminal.interrupts import exit_code, interruptible
+from ..terminal.output import human_size, note, progress_bar
 from .arguments import (
     Subparsers,
     add_command,
@@ -31,10 +33,8 @@ from .arguments import (
     target_of,
     token_of,
 )
-from .interrupts import exit_code, interruptible
 from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
-from .output import human_size, note, progress_bar
 
 if TYPE_CHECKING:
     from ..sync import Stream

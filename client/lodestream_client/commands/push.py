@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..terminal.output import human_size, note_details, print_json, progress_bar, say
 from .arguments import (
     Subparsers,
     add_command,
@@ -19,7 +20,6 @@ from .arguments import (
     token_of,
 )
 from .inputs import input_files
-from .output import human_size, note_details, print_json, progress_bar, say
 
 if TYPE_CHECKING:
     from ..requests.bodies import Source

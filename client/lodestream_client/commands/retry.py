@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from ..terminal.output import note_details, print_json, progress_bar, say
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_surface, token_of
-from .output import note_details, print_json, progress_bar, say
 
 __all__ = ["register", "run"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from ..terminal.output import cell, console, human_size, note, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_server, parse_surface, token_of
-from .output import cell, console, human_size, note, print_json
 
 __all__ = ["register", "run_list", "run_rm"]
 

@@ -18,7 +18,7 @@ import httpx
 
 from lodestream.errors import LodestreamError
 
-from ..commands.interrupts import raising
+from ..terminal.interrupts import raising
 
 __all__ = ["own_server"]
 

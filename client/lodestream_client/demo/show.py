@@ -17,7 +17,7 @@ import lodestream as ls
 from lodestream.errors import LodestreamError
 
 from .. import sync
-from ..commands.output import cell, console, human_size, note, print_json, progress_bar
+from ..terminal.output import cell, console, human_size, note, print_json, progress_bar
 from . import picture, plain
 from .service import own_server
 from .terrain import terrain
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from lodestream.decoding.decoder import View
 
-    from ..commands.output import Progress
     from ..requests.api import Description
+    from ..terminal.output import Progress
 
 __all__ = ["show"]
 

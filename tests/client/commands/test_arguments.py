@@ -5,9 +5,10 @@ import argparse
 import pytest
 
 from lodestream.errors import OptionError
-from lodestream_client.commands import arguments, output
+from lodestream_client.commands import arguments
 from lodestream_client.requests import addresses
 from lodestream_client.stream import pacing
+from lodestream_client.terminal import output
 
 
 @pytest.mark.parametrize(

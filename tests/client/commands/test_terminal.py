@@ -13,7 +13,7 @@ import pytest
 
 import lodestream as ls
 import lodestream_client
-from lodestream_client.commands import output
+from lodestream_client.terminal import output
 
 from ..conftest import Run
 from ..scripted import document, problem, scripted
@@ -122,7 +122,7 @@ def test_warnings_and_logs_of_libraries() -> None:
     code = (
         "import logging, warnings\n"
         "from lodestream.errors import FormatWarning\n"
-        "from lodestream_client.commands.output import clean_warnings\n"
+        "from lodestream_client.terminal.output import clean_warnings\n"
         "with clean_warnings():\n"
         f"    warnings.warn({EVIL!a}, UserWarning)\n"
         f"    warnings.warn({EVIL!a}, FormatWarning)\n"
