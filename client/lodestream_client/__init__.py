@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from .requests.api import Description, Identity
 
 _HOMES = {
-    "Description": ("requests", "Description"),
-    "Identity": ("requests", "Identity"),
+    "Description": ("requests.api", "Description"),
+    "Identity": ("requests.api", "Identity"),
     "SilenceError": ("errors", "SilenceError"),
     "Stream": ("aio", "Stream"),
     "UnreachableError": ("errors", "UnreachableError"),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .operation.settings import Settings
     from .running import running_server
 
-_HOMES = {"Settings": "settings", "create_app": "app", "running_server": "running"}
+_HOMES = {"Settings": "operation.settings", "create_app": "app", "running_server": "running"}
 
 __all__ = ["Settings", "create_app", "running_server"]
 

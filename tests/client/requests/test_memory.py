@@ -231,7 +231,7 @@ def test_options_that_have_no_place(terrain_file: Path) -> None:
 
 def test_nothing_is_imported_for_files_that_only_memory_needs() -> None:
     statement = (
-        "from lodestream_client import bodies\n"
+        "from lodestream_client.requests import bodies\n"
         "parcel = bodies.prepared(['a.npy', b'bytes', open('/dev/null', 'rb')], bodies.Asked(), None)\n"
         "assert len(parcel.files) == 3"
     )

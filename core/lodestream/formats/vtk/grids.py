@@ -1,6 +1,6 @@
 """Grids that VTK reads, as surfaces: points, attributes, and what is blanked as holes.
 
-VTK runs in a process of its own (see `vtk_process`), so that no file can bring down this one, take its memory, or make
+VTK runs in a process of its own (see `process`), so that no file can bring down this one, take its memory, or make
 it open another file.
 """
 
@@ -45,7 +45,7 @@ _MOST_ARRAYS = 1_000
 _SECONDS, _BYTES_A_SECOND = 20, 1 << 20
 
 _LAST_SECONDS = 10.0  # for a process that says nothing any more
-_SCRIPT = Path(__file__).with_name("vtk_process.py")
+_SCRIPT = Path(__file__).with_name("process.py")
 _ROLES = {"normals": (NORMAL, (3,), "f"), "texture": (TEXTURE, (2,), "f")}
 
 
@@ -56,7 +56,7 @@ class Reading:
     Attributes
     ----------
     kind : str
-        The reader, as `vtk_process` names them.
+        The reader, as `process` names them.
     path : Path
     promised : int
         Bytes of its arrays, or what they can be.
