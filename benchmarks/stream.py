@@ -107,10 +107,10 @@ def first_table(surfaces: dict[str, Served]) -> None:
     """When the first layer is there, and at how many bytes."""
     rows = []
     for name, served in surfaces.items():
-        for road, url, transport in roads(served):
+        for transport, url, transport in transports(served):
             found = sorted(asyncio.run(first(url, transport)) for _ in range(REPEATS))
             seconds, size = found[len(found) // 2]
-            rows.append([name, road, f"{seconds * 1000:.0f}", f"{seconds / ROUND_TRIP:.2f}", f"{size:,}"])
+            rows.append([name, transport, f"{seconds * 1000:.0f}", f"{seconds / ROUND_TRIP:.2f}", f"{size:,}"])
     head = ["surface", "transport", "ms", "round trips", "bytes received"]
     table("First drawable surface, 100 ms round trip, rate unlimited, median of three", head, rows)
     note("Aim for WebSocket: at most 2.5 round trips after the TCP connection, and 2,048 bytes.")
@@ -124,7 +124,7 @@ async def first(url: str, transport: Any) -> tuple[float, int]:
             return time.monotonic() - started, stream.wire_bytes
 
 
-def roads(served: Served) -> list[tuple[str, str, str]]:
+def transports(served: Served) -> list[tuple[str, str, str]]:
     return [
         ("WebSocket", served.url, "ws"),
         ("Range, URL of surface", served.url, "http"),
@@ -142,9 +142,9 @@ def error_table(array: Array, served: Served) -> None:
             plain = timed(partial(download, size=prefix), served.file, delay)
             trip = f"{2 * delay * 1000:.0f} ms"
             rows.append([trip, f"{share:.0e}", "plain download", f"{prefix:,}", f"{plain:.3f}", ""])
-            for road, url, transport in roads(served):
+            for transport, url, transport in transports(served):
                 seconds = timed(partial(pull, target=target, rms=share * array.extent, transport=transport), url, delay)
-                rows.append(["", "", road, "", f"{seconds:.3f}", f"{seconds / plain:.2f}"])
+                rows.append(["", "", transport, "", f"{seconds:.3f}", f"{seconds / plain:.2f}"])
     head = ["round trip", "RMS / extent", "transport", "bytes", "seconds", "ratio"]
     table(f"{array.name} to an RMS error at 1 Mbit/s, median of three", head, rows)
     note("Aim: at most 1.15 times the plain download of the same prefix with httpx.")

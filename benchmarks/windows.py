@@ -13,7 +13,7 @@ import lodestream as ls
 from lodestream.container import Index, read_index
 from lodestream.container.sections import FOOTER_LENGTH
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 from lodestream.transfer.range_download import RangeDownload
 from lodestream.transfer.receiver_state import Reception
 
@@ -101,7 +101,7 @@ def shares(points: Any, container: bytes, index: Index, place: tuple[int, int], 
     (top, left), (bottom, right) = place, (place[0] + length, place[1] + length)
     target = ls.Target(region=((top, bottom), (left, right)))
     chosen = plan(index, target)
-    decoder = ls.Decoder(wish_of(target))
+    decoder = ls.Decoder(selection_of(target))
     for part in chosen.slices:
         decoder.feed_at(part.offset, container[part.offset : part.end])
     assert np.array_equal(decoder.surface().points, points[top:bottom, left:right])

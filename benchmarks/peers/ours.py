@@ -24,7 +24,7 @@ _LARGE = (("rms", 1e-3), ("rms", 1e-4), ("rms", 1e-5), ("max", 1e-4))
 
 
 def ours(trial: Trial) -> None:
-    """Pictures of all layers of each stream, measured here and not as told; what is told is checked against them."""
+    """All layers of each stream, measured here and not as told; what is told is checked against that."""
     lodestream.decode(lodestream.encode(np.zeros((5, 5))))  # loads what is imported when it is first needed
     trial.peak = type(trial.peak)()
     surface = lodestream.Surface(trial.surface.points, trial.surface.closed)
@@ -89,13 +89,15 @@ def _stream(
             continue
         decoder.feed(container[held : mark.bytes])
         held = mark.bytes
-        picture = decoded if last else decoder.view().points
+        reconstruction = decoded if last else decoder.view().points
         seconds = whole_seconds if last else math.nan
         if number == near and not last and made_for is None:
             _, seconds, _ = trial.timed(lambda mark=mark: _prefix(container, mark))  # type: ignore[misc]
         times, peaks = (encode_seconds, seconds), (encode_peak, decode_peak)
-        trial.add(f"{setting}, layer {number}", mark.bytes, picture, times, peaks, stream=setting, file=len(container))
-        _check(trial, mark, picture)
+        trial.add(
+            f"{setting}, layer {number}", mark.bytes, reconstruction, times, peaks, stream=setting, file=len(container)
+        )
+        _check(trial, mark, reconstruction)
     return float(trial.rows[-1][made_for[0]]) if made_for is not None else 0.0
 
 
@@ -116,9 +118,11 @@ def _prefix(container: bytes, mark: Mark) -> NDArray[Any]:
     return points
 
 
-def _check(trial: Trial, mark: Mark, picture: NDArray[Any]) -> None:
+def _check(trial: Trial, mark: Mark, reconstruction: NDArray[Any]) -> None:
     """A note where an error told is not the error measured, beyond what the rounding of float32 figures allows."""
-    rms, largest = (value * trial.surface.extent for value in trial.surface.errors(picture, trial.surface.vertices))
+    rms, largest = (
+        value * trial.surface.extent for value in trial.surface.errors(reconstruction, trial.surface.vertices)
+    )
     for name, told, measured in (("RMS", mark.rms, rms), ("maximum", mark.max_error, largest)):
         if abs(told - measured) > 1e-3 * measured + 1e-6 * trial.surface.extent:
             trial.notes.append(f"{name} told {told:.6g}, measured {measured:.6g}, at {mark.bytes} bytes")

@@ -1,4 +1,4 @@
-"""A window, and some attributes only, through both clients, by both roads, over real sockets."""
+"""A window, and some attributes only, through both clients, by both transports, over real sockets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import lodestream as ls
 import lodestream_client as client
 from lodestream.container import read_index
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 from lodestream_client import sync
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, linked
@@ -61,19 +61,19 @@ def asynchronous(request: pytest.FixtureRequest) -> bool:
 
 
 @pytest.fixture(params=["ws", "http"])
-def road(request: pytest.FixtureRequest) -> str:
+def transport(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def follow(url: str, asynchronous: bool, road: Any, target: ls.Target, **options: Any) -> BaseStream:
+def follow(url: str, asynchronous: bool, transport: Any, target: ls.Target, **options: Any) -> BaseStream:
     if not asynchronous:
-        with sync.connect(url, target=target, transport=road, **options) as stream:
+        with sync.connect(url, target=target, transport=transport, **options) as stream:
             for _ in stream:
                 pass
             return stream
 
     async def loop() -> BaseStream:
-        async with client.connect(url, target=target, transport=road, **options) as stream:
+        async with client.connect(url, target=target, transport=transport, **options) as stream:
             async for _ in stream:
                 pass
             return stream
@@ -96,13 +96,13 @@ def test_it_is_what_cutting_the_whole_gives(
     container: bytes,
     given: ls.Surface,
     asynchronous: bool,
-    road: str,
+    transport: str,
     order: Any,
     region: Any,
     attributes: Any,
 ) -> None:
     target = ls.Target(order=order, region=region, attributes=attributes)
-    stream = follow(address, asynchronous, road, target)
+    stream = follow(address, asynchronous, transport, target)
     assert stream.ended == "complete"
     found = stream.decoder.surface()
     assert np.array_equal(found.points, cut(given.points, region))
@@ -126,17 +126,17 @@ def test_it_is_what_cutting_the_whole_gives(
     ids=repr,
 )
 def test_limits_of_a_part(
-    address: str, container: bytes, asynchronous: bool, road: str, limit: dict[str, Any], ended: str
+    address: str, container: bytes, asynchronous: bool, transport: str, limit: dict[str, Any], ended: str
 ) -> None:
     chosen = limit if "attributes" in limit else {"region": WINDOW, **limit}
     target = ls.Target(**chosen)
-    stream = follow(address, asynchronous, road, target)
+    stream = follow(address, asynchronous, transport, target)
     assert stream.ended == ended
     # A reader with the whole file at hand, given what the plan says and nothing else.
     index = read_index(lambda offset, length: container[offset : offset + length], len(container))
     expected = plan(index, target)
     assert (stream.decoder.bytes, stream.planned) == (expected.bytes, expected.bytes)
-    decoder = ls.Decoder(wish_of(target))
+    decoder = ls.Decoder(selection_of(target))
     for place in expected.slices:
         decoder.feed_at(place.offset, container[place.offset : place.end])
     assert np.array_equal(stream.decoder.surface().points, decoder.surface().points)
@@ -144,11 +144,11 @@ def test_limits_of_a_part(
 
 
 def test_a_part_goes_on_where_a_connection_broke(
-    address: str, given: ls.Surface, asynchronous: bool, road: str
+    address: str, given: ls.Surface, asynchronous: bool, transport: str
 ) -> None:
     target = ls.Target(region=WINDOW, attributes=("speed",))
     with linked(address, lambda number: Fault(cut_down=9000) if number < 2 else Fault()) as link:
-        stream = follow(link.url, asynchronous, road, target, window=4000)
+        stream = follow(link.url, asynchronous, transport, target, window=4000)
     assert np.array_equal(stream.decoder.surface().points, cut(given.points, WINDOW))
     assert np.array_equal(stream.decoder.surface().attributes["speed"], cut(given.attributes["speed"], WINDOW))
     assert stream.data_bytes == stream._reception.held.total, "nothing came twice"
@@ -165,7 +165,7 @@ def test_a_part_goes_on_where_a_connection_broke(
     ids=["rows", "columns", "names"],
 )
 def test_what_the_surface_does_not_have_is_refused(
-    address: str, asynchronous: bool, road: str, target: ls.Target, words: str
+    address: str, asynchronous: bool, transport: str, target: ls.Target, words: str
 ) -> None:
     with pytest.raises(ls.OptionError, match=words):
-        follow(address, asynchronous, road, target)
+        follow(address, asynchronous, transport, target)

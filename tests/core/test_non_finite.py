@@ -20,7 +20,7 @@ from lodestream.container.fields import FieldWriter
 from lodestream.container.frames import section_extent
 from lodestream.entropy.mask import encode_mask
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 
 from .surfaces import follow, index_of, terrain, torus
 
@@ -278,7 +278,7 @@ def test_what_the_index_plans_gives_the_same(kind: str) -> None:
         index = index_of(container)
         target = ls.Target(region=(rows, columns))
         chosen = plan(index, target)
-        window = ls.Decoder(wish_of(target))
+        window = ls.Decoder(selection_of(target))
         for place in (*chosen.before, *chosen.ranges, *chosen.after):
             window.feed_at(place.offset, container[place.offset : place.end])
         assert window.complete

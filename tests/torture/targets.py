@@ -208,7 +208,7 @@ def _mend_pages(out: bytearray) -> None:
         root = parse_root(last, header)
     except (StreamError, InputError, KeyError):
         return
-    for page in (*root.segment_pages, *root.piece_pages):
+    for page in (*root.segment_pages, *root.chunk_pages):
         crc = zlib.crc32(out[page.range.offset : page.range.end])
         out[page.told : page.told + 4] = crc.to_bytes(4, "little")
     out[last.end - 4 : last.end] = zlib.crc32(out[last.offset : last.end - 4]).to_bytes(4, "little")

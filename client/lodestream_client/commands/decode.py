@@ -113,9 +113,9 @@ class _Job:
         progress: Callable[[float], None],
     ) -> None:
         from lodestream.decoding.decoder import Decoder
-        from lodestream.planning.selection import wish_of
+        from lodestream.planning.selection import selection_of
 
-        self.decoder: Decoder = Decoder(wish_of(target), max_vertices=max_vertices, level=target.level)
+        self.decoder: Decoder = Decoder(selection_of(target), max_vertices=max_vertices, level=target.level)
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
         self.read_bytes = 0

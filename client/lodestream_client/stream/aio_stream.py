@@ -44,7 +44,7 @@ class Stream(BaseStream):
     async def _open(self) -> None:
         self._wake = asyncio.Event()
         try:
-            while not self._roads.met and await self._step():
+            while not self._transports.met and await self._step():
                 pass
         except BaseException:
             await self._abandon()

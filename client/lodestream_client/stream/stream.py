@@ -33,7 +33,7 @@ from ..requests import addresses, answers, api, problems
 from ..requests.answers import Answer, Incoming
 from ..requests.api import Identity, identity_of_file
 from .pacing import Link, window_for
-from .transport import Roads, Transport
+from .transport import Transport, Transports
 
 if TYPE_CHECKING:
     import httpx
@@ -89,7 +89,7 @@ class BaseStream:
         sink: Sink | None,
         max_vertices: int | None,
     ) -> None:
-        self._roads = Roads(url, transport, deadline)
+        self._transports = Transports(url, transport, deadline)
         self.silence = silence
         self._token = token
         self._close_timeout = close_timeout
@@ -118,7 +118,7 @@ class BaseStream:
     @property
     def url(self) -> str:
         """The URL of the surface or file."""
-        return self._roads.url
+        return self._transports.url
 
     @property
     def silence(self) -> float:
@@ -173,7 +173,7 @@ class BaseStream:
     @property
     def transport(self) -> str:
         """The transport in use: ``ws`` or ``http``."""
-        return self._roads.road
+        return self._transports.transport
 
     @property
     def connections(self) -> int:
@@ -238,11 +238,11 @@ class BaseStream:
     # The way.
 
     def _travel(self) -> Way:
-        self._roads.start(time.monotonic())
+        self._transports.start(time.monotonic())
         while True:
             before, self._withheld = self._reception.held.total, ""
             try:
-                yield from self._by_socket() if self._roads.road == "ws" else self._by_parts()
+                yield from self._by_socket() if self._transports.transport == "ws" else self._by_parts()
                 return
             except LodestreamError as error:
                 if isinstance(error, RemoteError | InputError | NotFoundError):
@@ -252,7 +252,7 @@ class BaseStream:
                     return
                 progressed = self._reception.held.total > before
                 try:
-                    pause = self._roads.failed(error, time.monotonic(), progressed=progressed)
+                    pause = self._transports.failed(error, time.monotonic(), progressed=progressed)
                 except LodestreamError:
                     self._truncated = True
                     raise
@@ -281,7 +281,7 @@ class BaseStream:
                 download.stop()
             elif self._turns != turns:
                 download.turn()
-        self._roads.met = True
+        self._transports.met = True
         while self.ended is None:
             left = self._tick()
             yield self._flush()
@@ -314,7 +314,7 @@ class BaseStream:
                 status, headers, address = yield self._get(address, dict(request.headers), patience)
                 self._connections += 1
                 download.answer(status, headers, time.monotonic())
-                self._roads.met = True
+                self._transports.met = True
                 while piece := (yield self._read()):
                     yield from self._pace(len(piece))
                     self._take(lambda piece=piece: download.receive(piece))  # type: ignore[misc]

@@ -45,7 +45,7 @@ class Stream(BaseStream):
         self._held = ExitStack()
         self._wake = threading.Event()
         try:
-            while not self._roads.met and self._step():
+            while not self._transports.met and self._step():
                 pass
         except BaseException:
             self._abandon()

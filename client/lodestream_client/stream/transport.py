@@ -12,7 +12,7 @@ from lodestream.errors import LodestreamError, NotFoundError, OptionError
 
 from ..requests import addresses, problems
 
-__all__ = ["Roads", "Transport"]
+__all__ = ["Transport", "Transports"]
 
 Transport = Literal["auto", "ws", "http"]
 
@@ -24,7 +24,7 @@ _LONGEST_PAUSE = 5.0
 _FIRST_ATTEMPTS = 3
 
 
-class Roads:
+class Transports:
     """The transports to one URL.
 
     Parameters
@@ -39,7 +39,7 @@ class Roads:
     Attributes
     ----------
     url : str
-    road : "ws" or "http"
+    transport : "ws" or "http"
         The transport of the next attempt.
     met : bool
         Whether the server has answered as expected. Before that there are only three attempts, because a wrong URL
@@ -53,7 +53,7 @@ class Roads:
             raise OptionError(f"expected 0 or more seconds until the deadline, got {deadline}")
         self.url = addresses.source_url(url)
         self._allowed = _allowed(self.url, transport)
-        self.road = self._allowed[0]
+        self.transport = self._allowed[0]
         self._blocked: LodestreamError | None = None  # what became of its WebSocket
         self._deadline = deadline
         self._attempts = 0
@@ -80,19 +80,19 @@ class Roads:
         """
         if progressed:
             self.start(now)
-        if self.road == "ws" and "http" in self._allowed and problems.blocks_sockets(error, met=self.met):
-            self.road, self._blocked = "http", error
+        if self.transport == "ws" and "http" in self._allowed and problems.blocks_sockets(error, met=self.met):
+            self.transport, self._blocked = "http", error
             return 0.0
-        # A wrong address is one by either road.
+        # A wrong address is one by either transport.
         twice = isinstance(error, NotFoundError) and isinstance(self._blocked, NotFoundError)
-        if self.road == "http" and self._blocked is not None and not self.met and not twice:
+        if self.transport == "http" and self._blocked is not None and not self.met and not twice:
             error.args = (f"{error} (and by WebSocket: {self._blocked})", *error.args[1:])
         if not problems.passes(error):
             raise error
         if not self.met and self._attempts >= _FIRST_ATTEMPTS - 1:
             raise error
         if not progressed:
-            self.road = self._allowed[-1] if self.road == self._allowed[0] else self._allowed[0]
+            self.transport = self._allowed[-1] if self.transport == self._allowed[0] else self._allowed[0]
         pause = self._pause()
         if now + pause >= self._since + self._deadline:
             raise error

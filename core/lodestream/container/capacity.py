@@ -34,7 +34,7 @@ _LEAST = 16 * 1024 * 1024
 _SHARE = 0.4
 _PLAIN_SHARE = 0.08
 
-_COEFFICIENT, _PICTURE, _MASKS, _TABLE = 7, 16, 4, 2048
+_COEFFICIENT, _RECONSTRUCTION, _MASKS, _TABLE = 7, 16, 4, 2048
 _EDGE = 12  # rows or columns
 
 #: Rows and columns of a grid, and the bytes of a number in each of its channels.
@@ -88,7 +88,7 @@ class Capacity:
         needed = masked * _MASKS + tables * _TABLE
         for (rows, columns), sizes in grids:
             edges = (1 + _EDGE / rows) * (1 + _EDGE / columns)
-            each = sum(_PICTURE + 2 * size + _COEFFICIENT * edges for size in sizes)
+            each = sum(_RECONSTRUCTION + 2 * size + _COEFFICIENT * edges for size in sizes)
             needed += int(rows * columns * each)
         if needed > self.bytes:
             enough = -(-(needed - _LEAST) // BYTES_PER_VERTEX)

@@ -1,4 +1,4 @@
-"""The pieces of an exactness section: one for each channel in each window of each block."""
+"""The chunks of an residual section: one for each channel in each window of each block."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Window", "count_windows", "windows"]
 
 
 class Window(NamedTuple):
-    """A piece's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept."""
+    """A chunk's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept."""
 
     channel: int
     block: int
@@ -21,11 +21,11 @@ class Window(NamedTuple):
 
 
 def windows(header: Header) -> Iterator[Window]:
-    """All pieces in the order of the file: block by block, row by row of windows, channel by channel.
+    """All chunks in the order of the file: block by block, row by row of windows, channel by channel.
 
-    A block of which holes are kept has as many pieces again, in the same order, of these.
+    A block of which holes are kept has as many chunks again, in the same order, of these.
     """
-    height, width = (1 << exponent for exponent in header.piece)
+    height, width = (1 << exponent for exponent in header.chunk)
     for block, ((rows, columns), _) in enumerate(header.blocks):
         for kept in (False, True) if header.kept and header.kept[block] else (False,):
             for top in range(0, rows, height):
@@ -36,5 +36,5 @@ def windows(header: Header) -> Iterator[Window]:
 
 
 def count_windows(header: Header) -> int:
-    """How many windows there are, each with a piece for every channel; those of kept holes count for themselves."""
+    """How many windows there are, each with a chunk for every channel; those of kept holes count for themselves."""
     return sum(1 for _ in windows(header)) // header.channels

@@ -8,7 +8,7 @@ from ..errors import CorruptStreamError, UnsupportedVersionError
 from .fields import FieldReader, FieldWriter
 from .model import Header
 
-__all__ = ["KNOWN", "needed_codecs", "parse_codecs", "piece_codec", "serialize_codecs"]
+__all__ = ["KNOWN", "chunk_codec", "needed_codecs", "parse_codecs", "serialize_codecs"]
 
 BIT_PLANES, LARGE_UNITS, INDICES, MASKS, DIFFERENCES, OFFSETS = 1, 2, 3, 4, 5, 6
 #: By number, see docs/format.md, section 3.
@@ -20,13 +20,13 @@ KNOWN = {
     DIFFERENCES: "differences",
     OFFSETS: "offsets",
 }
-# Of a piece of exactness by its rule; raw values need none.
+# Of a chunk of residual by its rule; raw values need none.
 _OF_RULE = (None, DIFFERENCES, DIFFERENCES, OFFSETS)
 
 
-def needed_codecs(header: Header, pieces: Iterable[bytes]) -> tuple[int, ...]:
-    """What a container of this header with these pieces of exactness needs, by rising number."""
-    needed = {codec for piece in pieces if (codec := piece_codec(piece)) is not None}
+def needed_codecs(header: Header, chunks: Iterable[bytes]) -> tuple[int, ...]:
+    """What a container of this header with these chunks of residual needs, by rising number."""
+    needed = {codec for chunk in chunks if (codec := chunk_codec(chunk)) is not None}
     if header.masked:
         needed.add(MASKS)
     if header.quantiser is not None:
@@ -36,9 +36,9 @@ def needed_codecs(header: Header, pieces: Iterable[bytes]) -> tuple[int, ...]:
     return tuple(sorted(needed | {BIT_PLANES}))
 
 
-def piece_codec(piece: bytes | memoryview) -> int | None:
-    """What a piece of exactness needs; None: nothing."""
-    return _OF_RULE[piece[0] & 3] if piece else None
+def chunk_codec(chunk: bytes | memoryview) -> int | None:
+    """What a chunk of residual needs; None: nothing."""
+    return _OF_RULE[chunk[0] & 3] if chunk else None
 
 
 def serialize_codecs(out: FieldWriter, needed: tuple[int, ...]) -> None:

@@ -27,7 +27,7 @@ _LONGEST_START = 10
 _KNOWN = {
     sections.HEADER,
     sections.LAYER,
-    sections.EXACTNESS,
+    sections.RESIDUAL,
     sections.METADATA,
     sections.INDEX,
     sections.MASKS,

@@ -12,7 +12,7 @@ from ..grid.layout import Layout
 from ..grid.multiblock import grids_of
 from ..quantization.band_steps import MOST_BASE, Quantiser
 from ..quantization.lattice import Lattice
-from ..transform.predictors import CURVES, default_predictors, fitted_steps
+from ..transform.predictors import INTERFACES, default_predictors, fitted_steps
 from . import codecs
 from .fields import LARGEST, FieldReader, FieldWriter
 from .frames import Frame
@@ -30,7 +30,7 @@ from .shape import (
 
 __all__ = ["parse_header", "parse_masks", "serialize_header"]
 
-#: Rows of a tile, or of a piece of exactness, times columns, as exponents of two.
+#: Rows of a tile, or of a chunk of residual, times columns, as exponents of two.
 _LEAST_BITS, _MOST_BITS = 8, 16
 _RULES = ("affine", "decimal")
 
@@ -45,7 +45,7 @@ def serialize_header(header: Header) -> bytes:
     out.byte(DTYPES.index(header.dtype))
     out.varint(header.point_channels)
     out.varint(header.layer_count)
-    for exponents in (header.tile, header.piece):
+    for exponents in (header.tile, header.chunk):
         out.byte(exponents[0] | exponents[1] << 4)
     out.byte(header.large)
     out.varint(0 if header.quantiser is None else header.quantiser.base)
@@ -66,7 +66,7 @@ def serialize_header(header: Header) -> bytes:
         out.varint(levels)
     fitted = fitted_steps(header.layout)
     for channel, predictors in enumerate(header.predictors):
-        own = [(level, axis) for level, axis in fitted if axis < CURVES or channel < header.geometric]
+        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < header.geometric]
         out.varint(len(own))
         for level, axis in own:
             out.pack("bb", *(int(x) for x in predictors[level, axis]))
@@ -128,7 +128,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
     point_channels, layer_count = fields.varint(2**16), fields.varint()
-    tile, piece, large = _exponents(fields.byte()), _exponents(fields.byte()), fields.byte()
+    tile, chunk, large = _exponents(fields.byte()), _exponents(fields.byte()), fields.byte()
     base = fields.varint(MOST_BASE)
     extent = fields.number()
     arrangement = None
@@ -149,7 +149,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     longest = max(length for shape, _ in blocks for length in shape)
     if longest > LONGEST_AXIS:
         raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {longest:,}")
-    for name, exponents in (("tiles", tile), ("pieces", piece)):
+    for name, exponents in (("tiles", tile), ("chunks", chunk)):
         # Across a narrow surface long ones would be many, and nearly empty.
         many = count_rectangles(blocks, exponents) > 64 + len(blocks) + (points >> max(exponents))
         if many or not _LEAST_BITS <= sum(exponents) <= _MOST_BITS or min(exponents) < 1:
@@ -172,7 +172,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     predictors = np.stack([default_predictors(grids)] * channels)
     fitted = fitted_steps(grids)
     for channel in range(channels):
-        own = [(level, axis) for level, axis in fitted if axis < CURVES or channel < min(point_channels, 3)]
+        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < min(point_channels, 3)]
         start, count = fields.at, fields.varint()
         if count != len(own):
             raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
@@ -193,7 +193,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         extent=extent,
         empty=empty,
         tile=tile,
-        piece=piece,
+        chunk=chunk,
         large=large,
         exact=bool(flags & 8),
         corrected=bool(flags & 16),

@@ -1,6 +1,6 @@
-"""The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and pieces.
+"""The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and chunks.
 
-A page tells of a run of tiles, or of windows of exactness, and needs no other to be understood: who wants a part of a
+A page tells of a run of tiles, or of windows of residual, and needs no other to be understood: who wants a part of a
 large surface reads the root and the pages of that part.
 """
 
@@ -18,12 +18,12 @@ from .chunks import count_windows
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .metadata import check_length
-from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Piece, Segment
+from .model import ByteRange, Chunk, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Segment
 from .sections import FOOTER_LENGTH, OPTIONAL, read_errors, section_start, write_errors
 
 __all__ = ["PAGE", "PagePlace", "Root", "parse_index", "parse_root", "serialize_index"]
 
-#: Tiles, or windows of exactness, that a page tells of.
+#: Tiles, or windows of residual, that a page tells of.
 PAGE = 256
 # In the first byte of an entry: passes - 1 and layers skipped from which on more bytes tell the rest.
 _PASSES, _SKIP = 7, 31
@@ -32,7 +32,7 @@ _CRC = 4  # bytes at the end of a section
 
 def serialize_index(index: Index) -> tuple[bytes, bytes]:
     """Payloads of the pages and of the root; levels' byte counts and shapes follow from the rest."""
-    segments, pieces = _segment_pages(index), _piece_pages(index)
+    segments, chunks = _segment_pages(index), _chunk_pages(index)
     out = FieldWriter()
     out.varint(len(index.layers))
     for layer in index.layers:
@@ -42,19 +42,19 @@ def serialize_index(index: Index) -> tuple[bytes, bytes]:
     for level in index.levels:
         write_errors(out, level.errors)
     out.varint(index.header.length)
-    out.varint(index.exactness.length if index.exactness else 0)
+    out.varint(index.residual.length if index.residual else 0)
     out.varint(index.metadata.length)
     out.varint(len(index.optional))
     for optional in index.optional:
         out.byte(optional.kind)
         out.varint(optional.range.offset)
         out.varint(optional.range.length)
-    for pages in (segments, pieces):
+    for pages in (segments, chunks):
         out.varint(len(pages))
         for page in pages:
             out.varint(len(page))
             out.pack("I", zlib.crc32(page))
-    return b"".join(segments + pieces), bytes(out.data)
+    return b"".join(segments + chunks), bytes(out.data)
 
 
 def _segment_pages(index: Index) -> list[bytes]:
@@ -99,17 +99,17 @@ def _write_unit(out: FieldWriter, segments: list[Segment]) -> None:
         layer = segment.layer
 
 
-def _piece_pages(index: Index) -> list[bytes]:
+def _chunk_pages(index: Index) -> list[bytes]:
     pages, size = [], PAGE * index.header.channels
-    rest = sum(piece.range.length for piece in index.pieces)
-    for first in range(0, len(index.pieces), size):
+    rest = sum(chunk.range.length for chunk in index.chunks)
+    for first in range(0, len(index.chunks), size):
         out = FieldWriter()
         out.varint(rest)
-        for piece in index.pieces[first : first + size]:
-            rest -= piece.range.length
-            out.varint(piece.range.length)
-            if piece.range.length:
-                out.pack("H", piece.check)
+        for chunk in index.chunks[first : first + size]:
+            rest -= chunk.range.length
+            out.varint(chunk.range.length)
+            if chunk.range.length:
+                out.pack("H", chunk.check)
         pages.append(bytes(out.data))
     return pages
 
@@ -128,18 +128,18 @@ class PagePlace(NamedTuple):
 
 @dataclass(frozen=True)
 class Root:
-    """What the root tells; of segments and pieces it names the pages only.
+    """What the root tells; of segments and chunks it names the pages only.
 
     ``layers`` are places and errors, ``levels`` errors. ``index`` is the place of pages and root.
     """
 
     layers: tuple[tuple[ByteRange, Errors], ...]
     levels: tuple[Errors, ...]
-    exactness: ByteRange | None
+    residual: ByteRange | None
     metadata: ByteRange
     optional: tuple[OptionalSection, ...]
     segment_pages: tuple[PagePlace, ...]
-    piece_pages: tuple[PagePlace, ...]
+    chunk_pages: tuple[PagePlace, ...]
     index: ByteRange
 
 
@@ -155,7 +155,7 @@ def parse_root(frame: Frame, header: Header) -> Root:
     channels = header.channels
     layers = [(fields.varint(), read_errors(fields, channels)) for _ in range(fields.varint(len(frame.payload)))]
     levels = [read_errors(fields, channels) for _ in range(fields.varint(len(frame.payload)))]
-    start, exactness = fields.varint(), fields.varint()
+    start, residual = fields.varint(), fields.varint()
     said = fields.at
     metadata = fields.varint()
     check_length(metadata, said, section=True)
@@ -165,7 +165,7 @@ def parse_root(frame: Frame, header: Header) -> Root:
 
     places = _Places(start, optional)
     placed = tuple((places.next(length), errors) for length, errors in layers)
-    exact = places.next(exactness) if exactness else None
+    exact = places.next(residual) if residual else None
     where = places.next(metadata)
     pages = places.end()
     agree = len(layers) == header.layer_count and len(levels) == header.levels + 1
@@ -211,8 +211,8 @@ def parse_index(pages: Frame, root: Frame, header: Header) -> Index:
         tuple(layers),
         tuple(LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(told.levels)),
         tuple(segment for own in segments for segment in own),
-        told.exactness,
-        _parse_pieces(_pages_of(pages, told.piece_pages), header, told.exactness) if told.exactness else (),
+        told.residual,
+        _parse_chunks(_pages_of(pages, told.chunk_pages), header, told.residual) if told.residual else (),
         told.metadata,
         told.index,
         root.end + FOOTER_LENGTH,
@@ -332,24 +332,24 @@ def _parse_units(
         raise CorruptStreamError(f"expected {units} units, got {unit}", fields.at)
 
 
-def _parse_pieces(pages: list[FieldReader], header: Header, exactness: ByteRange) -> tuple[Piece, ...]:
-    """The pieces of the exactness section."""
+def _parse_chunks(pages: list[FieldReader], header: Header, residual: ByteRange) -> tuple[Chunk, ...]:
+    """The chunks of the residual section."""
     count = count_windows(header) * header.channels
-    found: list[Piece] = []
-    at, end = -1, exactness.end - _CRC
+    found: list[Chunk] = []
+    at, end = -1, residual.end - _CRC
     for fields in pages:
         start = fields.at
-        # Pieces fill the end of their section, before its CRC.
-        first = end - fields.varint(exactness.length)
-        if first < exactness.offset or at not in (-1, first):
-            raise CorruptStreamError("expected pieces within their section, one after another, got others", start)
+        # Chunks fill the end of their section, before its CRC.
+        first = end - fields.varint(residual.length)
+        if first < residual.offset or at not in (-1, first):
+            raise CorruptStreamError("expected chunks within their section, one after another, got others", start)
         at = first
         for _ in range(min(PAGE * header.channels, count - len(found))):
-            length = fields.varint(exactness.length)
+            length = fields.varint(residual.length)
             (check,) = fields.unpack("H") if length else (0,)
-            found.append(Piece(ByteRange(at, length), int(check)))
+            found.append(Chunk(ByteRange(at, length), int(check)))
             at += length
         fields.end()
     if at != end:
-        raise CorruptStreamError("expected pieces that fill their section, got others", exactness.offset)
+        raise CorruptStreamError("expected chunks that fill their section, got others", residual.offset)
     return tuple(found)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CorruptStreamError
-from ..grid.connectivity import Arrangement, Part, whole_part
+from ..grid.connectivity import Arrangement, Patch, whole_patch
 from ..grid.layout import Layout
 from ..grid.multiblock import grids_of, shared_points
 from ..grid.patches import level_shapes
@@ -23,6 +23,7 @@ from ..surface import Closed
 __all__ = [
     "AttributeKind",
     "ByteRange",
+    "Chunk",
     "Errors",
     "Header",
     "Index",
@@ -30,7 +31,6 @@ __all__ = [
     "LayerRecord",
     "LevelRecord",
     "OptionalSection",
-    "Piece",
     "Segment",
     "count_rectangles",
 ]
@@ -106,14 +106,14 @@ class Header:
         For each channel the levels, as bits, that have no coefficient other than 0.
     tile : (int, int)
         Exponents of two: rows and columns of a tile, in coefficients of one band.
-    piece : (int, int)
-        Exponents of two: rows and columns of points of a piece of the exactness section.
+    chunk : (int, int)
+        Exponents of two: rows and columns of points of a chunk of the residual section.
     large : int
         The coarsest level whose units are large; 0: none are. Those of indices never are.
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
-        An exactness section follows the layers.
+        An residual section follows the layers.
     layer_count : int
         Layers of the complete stream.
     codecs : tuple of int
@@ -130,7 +130,7 @@ class Header:
     mask_data : tuple of bytes, one for each block
         Coded masks; empty where all points are valid.
     kept : tuple of int, one for each block; empty where there are none
-        Holes whose values come back, with pieces of the exactness section of their own.
+        Holes whose values come back, with chunks of the residual section of their own.
     kept_data : tuple of bytes, one for each block
         Coded masks of them; empty where they are all or none of the holes.
     quantiser : Quantiser or None
@@ -153,7 +153,7 @@ class Header:
     extent: float
     empty: tuple[int, ...]
     tile: tuple[int, int]
-    piece: tuple[int, int]
+    chunk: tuple[int, int]
     large: int
     exact: bool
     corrected: bool
@@ -197,12 +197,12 @@ class Header:
         return (self.dtype,) * self.point_channels + tuple(kinds)
 
     @cached_property
-    def parts(self) -> tuple[Part, ...]:
+    def patches(self) -> tuple[Patch, ...]:
         """What is coded as a grid each."""
         if self.arrangement is not None:
-            return self.arrangement.parts
+            return self.arrangement.patches
         (rows, columns), closed = self.blocks[0]
-        return (whole_part(0, (rows, columns), closed),)
+        return (whole_patch(0, (rows, columns), closed),)
 
     @cached_property
     def layout(self) -> Layout:
@@ -232,14 +232,14 @@ class Header:
         """Rows and columns of a level of the only block; None where there are several."""
         if len(self.blocks) > 1:
             return None
-        return level_shapes(self.parts, self.layout, level, [self.shape])[0]
+        return level_shapes(self.patches, self.layout, level, [self.shape])[0]
 
     @property
     def tables(self) -> int:
-        """About how many tiles and pieces all channels have, and blocks: told without laying them out."""
-        tiles, pieces = (count_rectangles(self.blocks, exponents) for exponents in (self.tile, self.piece))
-        pieces *= self.corrected * (1 + any(self.kept))
-        return (16 + len(self.blocks) + 2 * tiles + pieces) * self.channels
+        """About how many tiles and chunks all channels have, and blocks: told without laying them out."""
+        tiles, chunks = (count_rectangles(self.blocks, exponents) for exponents in (self.tile, self.chunk))
+        chunks *= self.corrected * (1 + any(self.kept))
+        return (16 + len(self.blocks) + 2 * tiles + chunks) * self.channels
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
@@ -284,8 +284,8 @@ class LayerRecord:
     """A step of quality over the whole surface.
 
     ``end`` is the length of the container's prefix that ends with the layer, ``level`` the finest level with a decoded
-    segment, ``rms`` and ``max_error`` the measured errors of the full-resolution picture that the layer completes, in
-    the surface's unit. ``channels``: see `Errors`.
+    segment, ``rms`` and ``max_error`` the measured errors of the full-resolution reconstruction that the layer
+    completes, in the surface's unit. ``channels``: see `Errors`.
     """
 
     number: int
@@ -340,7 +340,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class Chunk:
     """What corrects one channel in one window of a block; ``check`` is the lower half of the CRC-32 of its bytes."""
 
     range: ByteRange
@@ -359,8 +359,8 @@ class OptionalSection:
 class Index:
     """Where everything lies in a complete container.
 
-    ``exactness`` is None where the lattice alone is exact, or nothing is stored beyond it; ``pieces`` of it stand in
-    the order of `pieces.windows`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the SHA-256
+    ``residual`` is None where the lattice alone is exact, or nothing is stored beyond it; ``chunks`` of it stand in
+    the order of `chunks.windows`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the SHA-256
     of the values where all are exact.
     """
 
@@ -368,8 +368,8 @@ class Index:
     layers: tuple[LayerRecord, ...]
     levels: tuple[LevelRecord, ...]
     segments: tuple[Segment, ...]
-    exactness: ByteRange | None
-    pieces: tuple[Piece, ...]
+    residual: ByteRange | None
+    chunks: tuple[Chunk, ...]
     metadata: ByteRange
     index: ByteRange
     size: int
@@ -379,5 +379,5 @@ class Index:
 
     @property
     def surface_end(self) -> int:
-        """The length of the prefix that holds header, layers and exactness: the complete surface."""
-        return self.exactness.end if self.exactness else self.layers[-1].end
+        """The length of the prefix that holds header, layers and residual: the complete surface."""
+        return self.residual.end if self.residual else self.layers[-1].end

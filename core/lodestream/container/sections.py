@@ -16,7 +16,6 @@ from .metadata import check_length, packed
 from .model import ByteRange, Errors, Header
 
 __all__ = [
-    "EXACTNESS",
     "FOOTER_LENGTH",
     "HEADER",
     "INDEX",
@@ -27,23 +26,24 @@ __all__ = [
     "METADATA",
     "OPTIONAL",
     "PAGES",
+    "RESIDUAL",
     "SIGNATURE",
     "VERSION",
     "Entry",
     "check_of",
     "check_signature",
     "is_container",
+    "parse_chunks",
     "parse_footer",
     "parse_layer",
     "parse_metadata",
-    "parse_pieces",
     "read_errors",
     "section",
     "section_start",
+    "serialize_chunks",
     "serialize_footer",
     "serialize_layer",
     "serialize_metadata",
-    "serialize_pieces",
     "write_errors",
 ]
 
@@ -52,7 +52,7 @@ MAGIC = b"\xf5LODE\r\n"  # a byte that UTF-8 never has, the name, a line end tha
 SIGNATURE = MAGIC + bytes([VERSION])
 #: Containers began so while the format was made, with versions of their own; none was released.
 _EARLIER_MAGIC = b"\x89LODE\r\n"
-HEADER, LAYER, EXACTNESS, METADATA, INDEX, MASKS, KEPT_MASKS, PAGES = 1, 2, 3, 4, 5, 6, 7, 8
+HEADER, LAYER, RESIDUAL, METADATA, INDEX, MASKS, KEPT_MASKS, PAGES = 1, 2, 3, 4, 5, 6, 7, 8
 #: Kinds from here on may be skipped by a reader that does not know them.
 OPTIONAL = 128
 FOOTER_LENGTH = 28
@@ -78,7 +78,7 @@ def section_start(length: int) -> int:
 
 
 def check_of(data: bytes | memoryview) -> int:
-    """What tells that a segment or a piece by itself is whole: the lower half of its CRC-32."""
+    """What tells that a segment or a chunk by itself is whole: the lower half of its CRC-32."""
     return zlib.crc32(data) & 0xFFFF
 
 
@@ -170,26 +170,26 @@ def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
     return values
 
 
-def serialize_pieces(errors: Errors, pieces: Sequence[bytes]) -> bytes:
-    """Payload of the exactness section: the errors that are left, the pieces' lengths, then the pieces."""
+def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
+    """Payload of the residual section: the errors that are left, the chunks' lengths, then the chunks."""
     out = FieldWriter()
     write_errors(out, errors)
-    for piece in pieces:
-        out.varint(len(piece))
-    return bytes(out.data) + b"".join(pieces)
+    for chunk in chunks:
+        out.varint(len(chunk))
+    return bytes(out.data) + b"".join(chunks)
 
 
-def parse_pieces(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[bytes, int]]]:
-    """The errors that an exactness section, which stands at ``offset``, leaves; its pieces and their places."""
+def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[bytes, int]]]:
+    """The errors that an residual section, which stands at ``offset``, leaves; its chunks and their places."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     lengths = [fields.varint(len(payload)) for _ in windows(header)]
-    pieces = []
+    chunks = []
     for length in lengths:
         at = fields.at
-        pieces.append((bytes(fields.take(length)), at))
+        chunks.append((bytes(fields.take(length)), at))
     fields.end()
-    return errors, pieces
+    return errors, chunks
 
 
 def serialize_footer(index: int, root: int) -> bytes:

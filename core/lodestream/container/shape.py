@@ -1,4 +1,4 @@
-"""The part of a header that says what a surface is made of: blocks, curves, parts and attributes."""
+"""The part of a header that says what a surface is made of: blocks, interfaces, patches and attributes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..coordinates.coordinate_rules import are_rules
 from ..errors import CorruptStreamError
-from ..grid.connectivity import Arrangement, Curve, Part, Side
+from ..grid.connectivity import Arrangement, Interface, Patch, Side
 from ..grid.multiblock import covers
 from ..joints import check_runs
 from ..surface import Closed
@@ -31,7 +31,7 @@ __all__ = [
 DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 #: Most rows or columns of a block that kernels take. The format has no such limit.
 LONGEST_AXIS = 2**31 - 1
-_MOST_PARTS = 1 << 16
+_MOST_PATCHES = 1 << 16
 
 Blocks = tuple[tuple[tuple[int, int], Closed], ...]
 
@@ -41,33 +41,33 @@ def _bits(*flags: bool) -> int:
 
 
 def serialize_arrangement(out: FieldWriter, blocks: Blocks, arrangement: Arrangement) -> None:
-    """Blocks, curves and parts."""
+    """Blocks, interfaces and patches."""
     out.varint(len(blocks))
     for shape, closed in blocks:
         out.varint(shape[0])
         out.varint(shape[1])
         out.byte(_bits(*closed))
-    out.varint(len(arrangement.curves))
-    for curve in arrangement.curves:
-        out.varint(curve.length << 2 | _bits(curve.closed, curve.stops))
-    out.varint(len(arrangement.parts))
-    for part in arrangement.parts:
-        shape = blocks[part.block][0]
-        window = part.rows != (0, shape[0]) or part.columns != (0, shape[1])
-        out.varint(part.block)
-        out.byte(_bits(*part.closed, *part.flipped, *part.stops, window))
-        out.byte(_bits(*part.clamped, *(side is not None for side in part.sides)))
+    out.varint(len(arrangement.interfaces))
+    for interface in arrangement.interfaces:
+        out.varint(interface.length << 2 | _bits(interface.closed, interface.stops))
+    out.varint(len(arrangement.patches))
+    for patch in arrangement.patches:
+        shape = blocks[patch.block][0]
+        window = patch.rows != (0, shape[0]) or patch.columns != (0, shape[1])
+        out.varint(patch.block)
+        out.byte(_bits(*patch.closed, *patch.flipped, *patch.stops, window))
+        out.byte(_bits(*patch.clamped, *(side is not None for side in patch.sides)))
         if window:
-            for start, stop in (part.rows, part.columns):
+            for start, stop in (patch.rows, patch.columns):
                 out.varint(start)
                 out.varint(stop - start)
-        for side in part.sides:
+        for side in patch.sides:
             if side is not None:
-                out.varint(side.curve << 1 | side.reversed)
+                out.varint(side.interface << 1 | side.reversed)
 
 
 def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
-    """Undo `serialize_arrangement`, checking that parts cover the blocks and fit their curves."""
+    """Undo `serialize_arrangement`, checking that patches cover the blocks and fit their interfaces."""
     start = fields.at
     blocks = []
     points = 0
@@ -78,35 +78,37 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
         if shape[0] * shape[1] < 2 or points > LARGEST or flags > 3:
             raise CorruptStreamError(f"expected blocks of points, got {shape[0]} x {shape[1]}", start)
         blocks.append((shape, (bool(flags & 1), bool(flags & 2))))
-    curves = []
+    interfaces = []
     for _ in range(_count(fields, 0)):
         number = fields.varint()
-        curves.append(Curve(number >> 2, bool(number & 1), bool(number & 2)))
-    parts = [_parse_part(fields, blocks, curves) for _ in range(_count(fields))]
-    used = {side.curve for part in parts for side in part.sides if side is not None}
-    if len(used) != len(curves):
+        interfaces.append(Interface(number >> 2, bool(number & 1), bool(number & 2)))
+    patches = [_parse_patch(fields, blocks, interfaces) for _ in range(_count(fields))]
+    used = {side.interface for patch in patches for side in patch.sides if side is not None}
+    if len(used) != len(interfaces):
         raise CorruptStreamError(
-            f"expected curves that are sides of parts, got {len(curves) - len(used)} others", start
+            f"expected interfaces that are sides of patches, got {len(interfaces) - len(used)} others", start
         )
-    own: list[list[Part]] = [[] for _ in blocks]
-    for part in parts:
-        own[part.block].append(part)
+    own: list[list[Patch]] = [[] for _ in blocks]
+    for patch in patches:
+        own[patch.block].append(patch)
     for number, (shape, closed) in enumerate(blocks):
         if not covers(shape, closed, own[number]):
-            raise CorruptStreamError(f"expected parts that cover block {number} once, got others", start)
-    return tuple(blocks), Arrangement(tuple(parts), tuple(curves))
+            raise CorruptStreamError(f"expected patches that cover block {number} once, got others", start)
+    return tuple(blocks), Arrangement(tuple(patches), tuple(interfaces))
 
 
 def _count(fields: FieldReader, least: int = 1) -> int:
     start = fields.at
-    count = fields.varint(_MOST_PARTS)
+    count = fields.varint(_MOST_PATCHES)
     # Each takes a byte at least: nothing is made that was not sent.
     if not least <= count <= len(fields.data):
         raise CorruptStreamError(f"expected {least} to {len(fields.data)} of them, got {count}", start)
     return count
 
 
-def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]], curves: list[Curve]) -> Part:
+def _parse_patch(
+    fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]], interfaces: list[Interface]
+) -> Patch:
     start = fields.at
     block = fields.varint(len(blocks) - 1)
     flags, ends = fields.byte(), fields.byte()
@@ -126,20 +128,26 @@ def _parse_part(fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]
         if not ends & 16 << number:
             sides.append(None)
             continue
-        value = fields.varint(2 * _MOST_PARTS)
+        value = fields.varint(2 * _MOST_PATCHES)
         side, along = Side(value >> 1, bool(value & 1)), 1 - number // 2
-        curve = curves[side.curve] if side.curve < len(curves) else None
+        interface = interfaces[side.interface] if side.interface < len(interfaces) else None
         length = lengths[number // 2]
-        pole = curve is not None and curve.length == 1
-        same = curve is not None and (curve.length, curve.closed, curve.stops) == (length, closed[along], stops[along])
+        pole = interface is not None and interface.length == 1
+        same = interface is not None and (interface.length, interface.closed, interface.stops) == (
+            length,
+            closed[along],
+            stops[along],
+        )
         if not (pole or same) or closed[1 - along] or not ends & 1 << number:
-            raise CorruptStreamError(f"expected a curve of {length} points at a clamped side, got {curve}", start)
+            raise CorruptStreamError(
+                f"expected an interface of {length} points at a clamped side, got {interface}", start
+            )
         sides.append(side)
     wraps = [w and n == count for w, n, count in zip(whole, lengths[::-1], shape, strict=True)]
     if flags > 127 or min(lengths) < 1 or (closed[0] and not wraps[0]) or (closed[1] and not wraps[1]):
         raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
     top, bottom, left, right = sides
-    return Part(
+    return Patch(
         block,
         rows,
         columns,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import CorruptStreamError
 from . import sections
 from .frames import Frame, whole_section
-from .model import Index, Piece, Segment
+from .model import Chunk, Index, Segment
 
 __all__ = ["Slices", "State"]
 
@@ -21,9 +21,9 @@ __all__ = ["Slices", "State"]
 class State(NamedTuple):
     """What a view is made of.
 
-    ``all_planes`` says that nothing but exactness is missing; ``whole_level`` is the level to which, counted from the
+    ``all_planes`` says that nothing but residual is missing; ``whole_level`` is the level to which, counted from the
     coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
-    exactness is missing in the region that comes first.
+    residual is missing in the region that comes first.
     """
 
     number: int
@@ -38,14 +38,14 @@ class State(NamedTuple):
 
 
 class Slices:
-    """Collects bytes at their places and hands each segment and piece of exactness on once, when it is whole.
+    """Collects bytes at their places and hands each segment and chunk of residual on once, when it is whole.
 
     Parameters
     ----------
     index : Index
     segments : sequence of Segment
         Those that are wanted, in file order.
-    pieces : mapping of int to Piece
+    chunks : mapping of int to Chunk
         Those that are wanted, by their number.
     partial : bool
         They are not the whole surface: the errors of states on the way are not known (NaN).
@@ -54,12 +54,12 @@ class Slices:
     """
 
     def __init__(
-        self, index: Index, segments: Sequence[Segment], pieces: Mapping[int, Piece], partial: bool, whole: bool
+        self, index: Index, segments: Sequence[Segment], chunks: Mapping[int, Chunk], partial: bool, whole: bool
     ) -> None:
         self._index, self._partial, self._whole = index, partial, whole
-        numbered = {piece.range.offset: number for number, piece in pieces.items()}
+        numbered = {chunk.range.offset: number for number, chunk in chunks.items()}
         self._numbers: Mapping[int, int] = numbered
-        items: list[Segment | Piece] = [*segments, *pieces.values()]
+        items: list[Segment | Chunk] = [*segments, *chunks.values()]
         self._items = sorted(items, key=lambda item: item.range.offset)
         self._starts = [item.range.offset for item in self._items]
         # What is not whole yet: runs of bytes by the place where each goes on, several where the order has changed.
@@ -76,7 +76,7 @@ class Slices:
         self._near_tiles: NDArray[np.bool_] | None = None
         self._near: tuple[_Groups, ...] = ()
         self._reached: list[int] | None = None  # None while all comes in order
-        self._segments, self._pieces = len(segments), len(pieces)
+        self._segments, self._chunks = len(segments), len(chunks)
         self._corrected = 0
         tiles = index.header.layout.tiles
         self._wanted = segments
@@ -88,12 +88,12 @@ class Slices:
     def continue_file(self, position: int) -> None:
         """Begin where a file was read in its order as far as a section that ends at ``position``.
 
-        All bytes of the surface count from there on, not only those of segments and pieces.
+        All bytes of the surface count from there on, not only those of segments and chunks.
         """
         self._in_file, self._bytes = True, position
         for item in self._items[: bisect_left(self._starts, position)]:
             self._seen.add(item.range.offset)
-            if isinstance(item, Piece):
+            if isinstance(item, Chunk):
                 self._corrected += 1
             else:
                 self._count(item)
@@ -123,8 +123,8 @@ class Slices:
         if self._in_file:
             self._bytes += max(min(offset + len(data), self._index.surface_end) - offset, 0)
 
-    def items(self) -> Iterator[tuple[Segment | Piece, bytes]]:
-        """Segments and pieces that are whole now, in the order of the file."""
+    def items(self) -> Iterator[tuple[Segment | Chunk, bytes]]:
+        """Segments and chunks that are whole now, in the order of the file."""
         end = self._run_start + len(self._run)
         first = bisect_left(self._starts, self._run_start)
         last = bisect_right(self._starts, end)
@@ -136,9 +136,9 @@ class Slices:
                 yield item, bytes(self._run[start : start + item.range.length])
         self._drop(end)
 
-    def number(self, piece: Piece) -> int:
-        """The number of a piece of exactness."""
-        return self._numbers[piece.range.offset]
+    def number(self, chunk: Chunk) -> int:
+        """The number of a chunk of residual."""
+        return self._numbers[chunk.range.offset]
 
     def _drop(self, end: int) -> None:
         """Forget bytes that belong to whole items only."""
@@ -188,7 +188,7 @@ class Slices:
         if layer is not None:
             record = self._index.layers[layer]
             last = layer == len(self._index.layers) - 1
-            if last and not self._pieces:
+            if last and not self._chunks:
                 return self._end(layer)
             held = record.end if self._in_file else self._bytes
             finest = self._layer_level[layer]
@@ -225,18 +225,18 @@ class Slices:
         held = self._index.surface_end if self._in_file else self._bytes
         return State(number, last.level, held, last.rms, last.max_error, True, True)
 
-    def hold_piece(self, piece: Piece) -> State | None:
-        """Note a piece of exactness; the complete state, if everything is there."""
+    def hold_chunk(self, chunk: Chunk) -> State | None:
+        """Note a chunk of residual; the complete state, if everything is there."""
         if self._held != self._segments:
-            raise CorruptStreamError("expected all segments before exactness, got fewer", piece.range.offset)
+            raise CorruptStreamError("expected all segments before residual, got fewer", chunk.range.offset)
         self._corrected += 1
         if not self._in_file:
-            self._bytes += piece.range.length
-        if self._corrected < self._pieces:
+            self._bytes += chunk.range.length
+        if self._corrected < self._chunks:
             return None
-        if self._whole and not self._in_file and self._index.exactness is not None:
+        if self._whole and not self._in_file and self._index.residual is not None:
             # With the frame of the section.
-            self._bytes += self._index.exactness.length - sum(p.range.length for p in self._index.pieces)
+            self._bytes += self._index.residual.length - sum(p.range.length for p in self._index.chunks)
         return self._end(len(self._index.layers))
 
 

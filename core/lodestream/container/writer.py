@@ -9,7 +9,7 @@ from typing import Any
 from . import headers, sections
 from .codecs import needed_codecs
 from .index import serialize_index
-from .model import ByteRange, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Piece, Segment
+from .model import ByteRange, Chunk, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Segment
 
 __all__ = ["CodedLayer", "CodedSegment", "write_container"]
 
@@ -41,7 +41,7 @@ def write_container(
     header: Header,
     layers: Sequence[CodedLayer],
     levels: Sequence[Errors],
-    pieces: Sequence[bytes],
+    chunks: Sequence[bytes],
     metadata: Mapping[str, Any],
     *,
     exact: bool,
@@ -56,16 +56,16 @@ def write_container(
     layers : sequence of CodedLayer
     levels : sequence of Errors
         One for each level.
-    pieces : sequence of bytes
-        Of the exactness section, in the order of `pieces.windows`; nothing, or all empty, where there is none.
+    chunks : sequence of bytes
+        Of the residual section, in the order of `chunks.windows`; nothing, or all empty, where there is none.
     metadata : mapping
     exact : bool
         The complete stream restores every value bit for bit.
     optional : mapping of int to bytes, optional
         Payloads of optional sections by their kinds.
     """
-    header = replace(header, exact=exact, corrected=any(pieces), layer_count=len(layers))
-    header = replace(header, codecs=needed_codecs(header, pieces))
+    header = replace(header, exact=exact, corrected=any(chunks), layer_count=len(layers))
+    header = replace(header, codecs=needed_codecs(header, chunks))
     out = bytearray(headers.serialize_header(header))
     header = replace(header, length=len(out))
     records, segments, finest = [], [], 0
@@ -84,13 +84,13 @@ def write_container(
             place += len(s.data)
             finest = max(finest, header.layout.tiles[s.tile].level)
         records.append(LayerRecord(number, start, len(out), finest, *layer.errors))
-    exactness, places = None, []
+    residual, places = None, []
     if header.corrected:
-        exactness = _append(out, sections.EXACTNESS, sections.serialize_pieces(levels[-1], pieces))
-        place = len(out) - 4 - sum(map(len, pieces))
-        for piece in pieces:
-            places.append(Piece(ByteRange(place, len(piece)), sections.check_of(piece)))
-            place += len(piece)
+        residual = _append(out, sections.RESIDUAL, sections.serialize_chunks(levels[-1], chunks))
+        place = len(out) - 4 - sum(map(len, chunks))
+        for chunk in chunks:
+            places.append(Chunk(ByteRange(place, len(chunk)), sections.check_of(chunk)))
+            place += len(chunk)
     where_metadata = _append(out, sections.METADATA, sections.serialize_metadata(dict(metadata)))
     others = tuple(OptionalSection(kind, _append(out, kind, payload)) for kind, payload in (optional or {}).items())
     index = Index(
@@ -98,7 +98,7 @@ def write_container(
         tuple(records),
         tuple(LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(levels)),
         tuple(segments),
-        exactness,
+        residual,
         tuple(places),
         where_metadata,
         ByteRange(len(out), 0),

@@ -1,4 +1,4 @@
-"""The picture of a window: of every level only what the window is made of, so that it costs what a window costs.
+"""The reconstruction of a window: of every level only what the window is made of, so that it costs what a window costs.
 
 From the finest level down, an axis is followed by the samples that are wanted, see `lodestream.grid.support`. The nodes
 and details that give them back are one stretch of the axis. It is stepped like an axis of its own: where it ends inside
@@ -21,7 +21,7 @@ from ..transform.lifting import CLAMP, FRACTION_BITS, inverse_step
 from ..transform.predictors import predictor
 from ..transform.pyramid import allocate
 
-__all__ = ["AxisCrop", "crop_axis", "window_picture"]
+__all__ = ["AxisCrop", "crop_axis", "reconstruct_window"]
 
 #: Nodes that the third step wants of a run.
 _LEAST_NODES = 4
@@ -79,7 +79,7 @@ def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
     return AxisCrop(first, made, start - 2 * first)
 
 
-def window_picture(
+def reconstruct_window(
     header: Header, channel: int, tiles: Tiles, state: NDArray[np.int8], region: Region
 ) -> tuple[NDArray[np.int32], int]:
     """A window of one channel in a state, of a surface of one grid.
@@ -96,7 +96,7 @@ def window_picture(
     Returns
     -------
     int32, shape (row, column), and int
-        Lattice coordinates over two to the power of the second: those that `channel_picture` has there.
+        Lattice coordinates over two to the power of the second: those that `reconstruct_channel` has there.
     """
     layout = header.layout
     whole = 0
@@ -109,15 +109,15 @@ def window_picture(
         crops.append((rows, columns))
         spans = _nodes(rows), _nodes(columns)
     sizes = spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]
-    picture = allocate(sizes)
-    _put(tiles, 0, state, False, picture, ((spans[0][0], sizes[0], 0), (spans[1][0], sizes[1], 0)))
+    reconstruction = allocate(sizes)
+    _put(tiles, 0, state, False, reconstruction, ((spans[0][0], sizes[0], 0), (spans[1][0], sizes[1], 0)))
     for level, crop in enumerate(reversed(crops), start=1):
         steps = crop[0].step, crop[1].step
         finer = crops[-level - 1] if level < layout.levels else None
         wanted = region if finer is None else (_nodes(finer[0]), _nodes(finer[1]))
         canvas = allocate((steps[0].length, steps[1].length))
         corner = canvas[: steps[0].coarse, : steps[1].coarse]
-        corner[...] = picture
+        corner[...] = reconstruction
         if level == whole + 1:
             np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
             corner <<= FRACTION_BITS
@@ -130,8 +130,8 @@ def window_picture(
                 inverse_step(canvas, axis, steps[axis], rule)
         (top, bottom), (left, right) = wanted
         rows_made, columns_made = crop[0].start, crop[1].start
-        picture = canvas[rows_made : rows_made + bottom - top, columns_made : columns_made + right - left]
-    return picture, FRACTION_BITS if whole < layout.levels else 0
+        reconstruction = canvas[rows_made : rows_made + bottom - top, columns_made : columns_made + right - left]
+    return reconstruction, FRACTION_BITS if whole < layout.levels else 0
 
 
 def _nodes(crop: AxisCrop) -> tuple[int, int]:

@@ -12,13 +12,13 @@ from ..container import headers, sections
 from ..container.capacity import Capacity
 from ..container.digest import DIGEST
 from ..container.frames import Frame, FrameReader, index_extent, section_extent
-from ..container.model import ByteRange, Header, Index, Piece
+from ..container.model import ByteRange, Chunk, Header, Index
 from ..container.reader import INDEX_GROWTH, index_from, index_of, read_metadata
 from ..container.slices import Slices, State
 from ..entropy.dequantize import UNANNOUNCED
 from ..errors import CorruptStreamError, TruncatedStreamError
 from ..library import why_missing
-from ..planning.selection import Wish, select
+from ..planning.selection import Selection, select
 from ..surface import Surface
 from ..target import Region
 from .reconstruction import Coded, Progress, Reconstruction
@@ -33,14 +33,14 @@ Bytes = bytes  # the name within classes that have a property of this name
 
 
 class Decoder:
-    """Decodes a container piece by piece, and gives a `View` for each state whose errors are known.
+    """Decodes a container chunk by chunk, and gives a `View` for each state whose errors are known.
 
     `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
     `CorruptStreamError` with its offset; everything before it stays usable.
 
     Parameters
     ----------
-    wish : Wish, optional
+    selection : Wish, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
         not known (NaN) before it is complete.
     max_vertices : int or None
@@ -56,8 +56,10 @@ class Decoder:
         are more bytes than such a surface can have.
     """
 
-    def __init__(self, wish: Wish | None = None, *, max_vertices: int | None = None, level: int | None = None) -> None:
-        self._wish = wish or Wish()
+    def __init__(
+        self, selection: Selection | None = None, *, max_vertices: int | None = None, level: int | None = None
+    ) -> None:
+        self._selection = selection or Selection()
         self._finest = level
         self.capacity = Capacity(max_vertices)
         self.header: Header | None = None
@@ -98,7 +100,7 @@ class Decoder:
     def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
         """Decode a slice of the container that starts at ``offset``; returns the views that it completes.
 
-        Slices must come in the order of a `plan`. They may be cut into pieces of any size.
+        Slices must come in the order of a `plan`. They may be cut into chunks of any size.
         """
         before = len(self.layers)
         if self._slices is not None:
@@ -132,7 +134,7 @@ class Decoder:
         """
         self._focus, self._turned = region, True
         if self.header is not None:
-            Wish(region).check(self.header)
+            Selection(region).check(self.header)
         self._follow_focus()
 
     def finish(self) -> None:
@@ -183,7 +185,7 @@ class Decoder:
 
     @property
     def bytes(self) -> int:
-        """Bytes received of header, layers and exactness; 0 before the first layer is complete."""
+        """Bytes received of header, layers and residual; 0 before the first layer is complete."""
         return self.layers[-1].bytes if self.layers else 0
 
     @property
@@ -207,8 +209,8 @@ class Decoder:
             raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
         elif frame.kind == sections.LAYER:
             self._take_layer(frame, self.header)
-        elif frame.kind == sections.EXACTNESS:
-            self._take_exactness(frame, self.header)
+        elif frame.kind == sections.RESIDUAL:
+            self._take_residual(frame, self.header)
         elif frame.kind == sections.METADATA:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
         elif frame.kind == sections.PAGES:
@@ -238,13 +240,13 @@ class Decoder:
         if self.header is not None:
             raise CorruptStreamError("expected one header, got a second", frame.offset)
         self.header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
-        self._wish.check(self.header)
-        self._wish.check_size(self.header, self.capacity, self._finest)
+        self._selection.check(self.header)
+        self._selection.check_size(self.header, self.capacity, self._finest)
         if not self.header.masked:
             self._begin(self.header)
 
     def _begin(self, header: Header) -> None:
-        self._wanted = self._wish.tiles(header)
+        self._wanted = self._selection.tiles(header)
         self._progress = Progress(header)
         self._reconstruction = _reconstruction(header)
         self._level = 0
@@ -276,12 +278,12 @@ class Decoder:
         whole = complete or (last and self._level == header.levels)
         self._show(State(number, self._level, frame.end, errors.rms, errors.maximum, complete, whole))
 
-    def _take_exactness(self, frame: Frame, header: Header) -> None:
+    def _take_residual(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
-            raise CorruptStreamError("expected layers, got exactness", frame.offset)
-        errors, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, header)
-        for number, piece in enumerate(pieces):
-            self._reconstruction.correct(number, *piece)
+            raise CorruptStreamError("expected layers, got residual", frame.offset)
+        errors, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
+        for number, chunk in enumerate(chunks):
+            self._reconstruction.correct(number, *chunk)
         self._show(State(len(self.layers), header.levels, frame.end, errors.rms, errors.maximum, True, True))
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
@@ -300,7 +302,7 @@ class Decoder:
             levels[levels == UNANNOUNCED] = 0
         if made.whole_near and self._near is not None:
             state[self._near[:, None] & (state == UNANNOUNCED)] = 0
-        if self.header is not None and self._wish.region is not None:
+        if self.header is not None and self._selection.region is not None:
             # What lies outside has no part in the window.
             state[~self._wanted] = 0
         self.layers.append(
@@ -317,7 +319,7 @@ class Decoder:
                 corrected,
                 self._values,
                 self._digest,
-                self._wish,
+                self._selection,
             )
         )
 
@@ -343,9 +345,9 @@ class Decoder:
         elif self.header is not None:
             self.capacity.take(INDEX_GROWTH * len(run))
             self.index = index_from(bytes(run), place, self.header)
-            chosen = select(self.index, self._wish)
-            partial = self._wish.region is not None
-            self._slices = Slices(self.index, chosen.segments, chosen.pieces, partial, chosen.whole)
+            chosen = select(self.index, self._selection)
+            partial = self._selection.region is not None
+            self._slices = Slices(self.index, chosen.segments, chosen.chunks, partial, chosen.whole)
             if self.layers or self._frames.pending:
                 # The file was read in its own order so far, and is not any more.
                 self._slices.continue_file(self._frames.position)
@@ -360,7 +362,7 @@ class Decoder:
 
     def _follow_focus(self) -> None:
         if self._turned and self._slices is not None and self.header is not None:
-            self._near = None if self._focus is None else Wish(self._focus).tiles(self.header)
+            self._near = None if self._focus is None else Selection(self._focus).tiles(self.header)
             self._slices.focus(self._near)
 
     def _take_slice(self, offset: int, data: Bytes) -> None:
@@ -369,10 +371,10 @@ class Decoder:
         for item, payload in self._slices.items():
             place = item.range.offset
             if sections.check_of(payload) != item.check:
-                raise CorruptStreamError("expected a segment or piece to match its CRC, got other bytes", place)
-            if isinstance(item, Piece):
+                raise CorruptStreamError("expected a segment or chunk to match its CRC, got other bytes", place)
+            if isinstance(item, Chunk):
                 self._reconstruction.correct(self._slices.number(item), payload, place)
-                state = self._slices.hold_piece(item)
+                state = self._slices.hold_chunk(item)
             else:
                 known = bool(self._progress.top[item.tile, item.channel])
                 top = 0 if known else item.top

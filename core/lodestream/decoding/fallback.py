@@ -69,14 +69,14 @@ class PlainReconstruction(Reconstruction):
             blocks.append(Values(arrays))
         return blocks
 
-    def _part(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
+    def _window_values(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
         rows, columns = (slice(*span) for span in region)
         whole = self._whole(length, state, self.header.levels, chosen)[0]
         return Values([np.ascontiguousarray(array[rows, columns]) for array in whole.arrays])
 
-    def _restored(self, known: NDArray[Any], piece: bytes, offset: int) -> NDArray[Any]:
+    def _restored(self, known: NDArray[Any], chunk: bytes, offset: int) -> NDArray[Any]:
         try:
-            return reference.restore(piece, known)
+            return reference.restore(chunk, known)
         except StreamError as error:
             raise CorruptStreamError(str(error), offset) from None
 

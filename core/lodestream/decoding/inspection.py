@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..container import headers, sections
 from ..container.fields import told, told_roughly
 from ..container.frames import Frame, section_extent, whole_section
-from ..container.model import ByteRange, Errors, Header, Index, LayerRecord, OptionalSection, Piece, Segment
+from ..container.model import ByteRange, Chunk, Errors, Header, Index, LayerRecord, OptionalSection, Segment
 from ..coordinates.height_fields import to_xyz
 from ..coordinates.seams import restore
 from ..errors import CorruptStreamError, InputError, TooLargeError, TruncatedStreamError
@@ -26,7 +26,7 @@ from ..quantization.lattice import Lattice
 from ..quantization.measure import extent_of
 from ..surface import Surface
 from .decoder import Decoder
-from .reconstruction import Picture, Reconstruction, initial_state
+from .reconstruction import Coordinates, Reconstruction, initial_state
 
 __all__ = ["Inspection", "inspect"]
 
@@ -67,8 +67,8 @@ class _Found:
 
     layers: list[LayerRecord] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
-    pieces: list[Piece] = field(default_factory=list)
-    exactness: ByteRange | None = None
+    chunks: list[Chunk] = field(default_factory=list)
+    residual: ByteRange | None = None
     remaining: Errors | None = None
     metadata: ByteRange | None = None
     optional: list[OptionalSection] = field(default_factory=list)
@@ -178,10 +178,10 @@ def _note(found: _Found, frame: Frame, header: Header) -> None:
     place = ByteRange(frame.offset, frame.end - frame.offset)
     if frame.kind == sections.LAYER:
         _note_layer(found, frame, header)
-    elif frame.kind == sections.EXACTNESS:
-        found.remaining, pieces = sections.parse_pieces(frame.payload, frame.payload_offset, header)
-        found.exactness = place
-        found.pieces = [Piece(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in pieces]
+    elif frame.kind == sections.RESIDUAL:
+        found.remaining, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
+        found.residual = place
+        found.chunks = [Chunk(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in chunks]
     elif frame.kind == sections.METADATA:
         found.metadata = place
     elif frame.kind >= sections.OPTIONAL:
@@ -235,8 +235,8 @@ def _compare(index: Index, found: _Found) -> None:
     pairs: tuple[tuple[str, Sequence[object], Sequence[object]], ...] = (
         ("layer", index.layers, found.layers),
         ("segment", index.segments, found.segments),
-        ("piece", index.pieces, found.pieces),
-        ("section", (index.exactness, index.metadata), (found.exactness, found.metadata)),
+        ("chunk", index.chunks, found.chunks),
+        ("section", (index.residual, index.metadata), (found.residual, found.metadata)),
         ("optional section", index.optional, found.optional),
     )
     for word, named, real in pairs:
@@ -341,7 +341,7 @@ def _bound(windows: WindowErrors, cells: NDArray[np.float64], layer: LayerRecord
 
 
 class _Ruler:
-    """Measures pictures as the encoder does: on lattice coordinates, each vertex once, holes left out."""
+    """Measures reconstructions as the encoder does: on lattice coordinates, each vertex once, holes left out."""
 
     def __init__(self, header: Header, reconstruction: Reconstruction, surface: Surface) -> None:
         self._header, self._reconstruction = header, reconstruction
@@ -355,32 +355,32 @@ class _Ruler:
         self._others = other_originals(header.arrangement, arrays, masks, header.geometric)
 
     def errors(self, state: NDArray[np.int8], cells: list[NDArray[np.float64]] | None = None) -> Errors:
-        """Errors of the full-resolution picture of a state, exactness aside; ``cells``: see `coordinate_distances`."""
+        """Errors of a state at full resolution, the residual aside; ``cells``: see `coordinate_distances`."""
         header, known = self._header, self._reconstruction
 
-        def picture(channel: int) -> Picture:
-            return known.picture(known.length, state, header.levels, channel)
+        def reconstruction(channel: int) -> Coordinates:
+            return known.reconstruction(known.length, state, header.levels, channel)
 
-        pictures = [picture(channel) for channel in range(header.geometric)]
+        reconstructions = [reconstruction(channel) for channel in range(header.geometric)]
         lattices = header.lattices[: header.geometric]
-        distances, *found = self._compared(self._originals, lattices, pictures, cells=cells)
+        distances, *found = self._compared(self._originals, lattices, reconstructions, cells=cells)
         if header.channels > 1:
             found = found or [distances]
             for number, (originals, component) in enumerate(self._others, header.geometric):
                 own = header.lattices[number : number + 1]
-                found += self._compared(originals, own, [picture(number)], component)
+                found += self._compared(originals, own, [reconstruction(number)], component)
         return Errors(*distances, tuple(found))
 
     def _compared(
         self,
         originals: list[Original],
         lattices: Sequence[Lattice],
-        pictures: list[Picture],
+        reconstructions: list[Coordinates],
         component: int = 0,
         cells: list[NDArray[np.float64]] | None = None,
     ) -> list[tuple[float, float]]:
-        curves = len(self._header.layout.grids) - len(self._header.parts)
-        parts = range(len(self._header.parts))
-        coordinates = [np.stack([grids[curves + k] for grids, _ in pictures]) for k in parts]
-        fractions = [fraction for _, fraction in pictures]
+        interfaces = len(self._header.layout.grids) - len(self._header.patches)
+        patches = range(len(self._header.patches))
+        coordinates = [np.stack([grids[interfaces + k] for grids, _ in reconstructions]) for k in patches]
+        fractions = [fraction for _, fraction in reconstructions]
         return coordinate_distances(originals, lattices, coordinates, fractions, component, cells)

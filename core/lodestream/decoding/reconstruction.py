@@ -1,4 +1,4 @@
-"""Segments into points: the state of a surface that is being refined, and pictures of any state that it passed."""
+"""Segments into points: the state of a surface that is being refined, and values of any state that it passed."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from ..target import Region
 from ..transform.lifting import FRACTION_BITS
 from ..transform.predictors import COEFFICIENT_BITS
 from ..transform.pyramid import allocate, inverse
-from .crop import window_picture
+from .crop import reconstruct_window
 
 __all__ = [
     "Coded",
-    "Picture",
+    "Coordinates",
     "Progress",
     "Reconstruction",
     "Values",
-    "channel_picture",
     "initial_state",
+    "reconstruct_channel",
     "to_values",
 ]
 
 #: Lattice coordinates of each grid, over two to the power of the second.
-Picture = tuple[list[NDArray[np.int32]], int]
+Coordinates = tuple[list[NDArray[np.int32]], int]
 
 _BATCH = 64  # segments decoded in one go: few enough that an interruption is not kept waiting
 
@@ -55,11 +55,11 @@ class Coded:
 
 
 class Reconstruction:
-    """Decodes segments when a picture asks for them, in the order in which they were added.
+    """Decodes segments when a reconstruction asks for them, in the order in which they were added.
 
     A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
-    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are pictures too: what later passes
-    told is ignored.
+    `UNANNOUNCED` where that is not known. States that lie behind what was decoded are reconstructions too: what later
+    passes told is ignored.
     """
 
     def __init__(self, header: Header) -> None:
@@ -68,7 +68,7 @@ class Reconstruction:
         self._added = self._taken = self._forgotten = 0
         self._begun: tuple[int, list[Callable[[], None]]] = 0, []  # the batch on its way: what it ends before, its work
         self._lock = Lock()
-        self._pieces: dict[int, tuple[bytes, int]] = {}
+        self._chunks: dict[int, tuple[bytes, int]] = {}
         self._tiles: list[Tiles] = []
 
     @property
@@ -82,9 +82,9 @@ class Reconstruction:
         self._added += 1
 
     def correct(self, number: int, data: bytes, offset: int) -> None:
-        """Take a piece of the exactness section, which stands at ``offset``."""
+        """Take a chunk of the residual section, which stands at ``offset``."""
         if data:
-            self._pieces[number] = data, offset
+            self._chunks[number] = data, offset
 
     def blocks(
         self,
@@ -101,13 +101,13 @@ class Reconstruction:
         Raises
         ------
         CorruptStreamError
-            When ``corrected`` is asked for and a piece of the exactness section does not fit.
+            When ``corrected`` is asked for and a chunk of the residual section does not fit.
         """
         header = self.header
         blocks = self._whole(length, state, level, chosen)
         if corrected:
             self._correct(blocks, chosen)
-        masks = level_masks(header.parts, header.layout, level, header.masks)
+        masks = level_masks(header.patches, header.layout, level, header.masks)
         for block, mask, kept in zip(blocks, masks, header.kept_masks, strict=True):
             if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
                 block.clear(~(mask | kept) if corrected and kept is not None else ~mask, header.hole)
@@ -116,28 +116,28 @@ class Reconstruction:
     def _whole(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
     ) -> list[Values]:
-        """The values of all blocks before exactness and holes."""
-        return to_values(self.header, self.pictures(length, state, level, chosen), level)
+        """The values of all blocks before residual and holes."""
+        return to_values(self.header, self.reconstructions(length, state, level, chosen), level)
 
-    def pictures(
+    def reconstructions(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
-    ) -> list[Picture]:
+    ) -> list[Coordinates]:
         """The grids of ``level`` of each channel, in lattice coordinates, see `blocks`."""
-        pictures: list[Picture] = []
+        reconstructions: list[Coordinates] = []
         with self._lock:
             self._decode(length)
             for channel, tiles in enumerate(self._tiles):
                 if chosen is None or chosen[channel]:
-                    pictures.append(channel_picture(self.header, channel, tiles, state[:, channel], level))
+                    reconstructions.append(reconstruct_channel(self.header, channel, tiles, state[:, channel], level))
                 else:
-                    pictures.append(pictures[0])  # of the right shapes
-        return pictures
+                    reconstructions.append(reconstructions[0])  # of the right shapes
+        return reconstructions
 
-    def picture(self, length: int, state: NDArray[np.int8], level: int, channel: int) -> Picture:
-        """One channel of the grids of ``level``, see `pictures`."""
+    def reconstruction(self, length: int, state: NDArray[np.int8], level: int, channel: int) -> Coordinates:
+        """One channel of the grids of ``level``, see `reconstructions`."""
         with self._lock:
             self._decode(length)
-            return channel_picture(self.header, channel, self._tiles[channel], state[:, channel], level)
+            return reconstruct_channel(self.header, channel, self._tiles[channel], state[:, channel], level)
 
     def window(
         self,
@@ -152,7 +152,7 @@ class Reconstruction:
         Takes memory for what the window is made of, not for the surface. See `blocks`.
         """
         header = self.header
-        values = self._part(length, state, region, chosen)
+        values = self._window_values(length, state, region, chosen)
         if corrected:
             self._correct([values], chosen, region)
         if (mask := header.masks[0]) is not None:
@@ -161,13 +161,13 @@ class Reconstruction:
             values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
         return values
 
-    def _part(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
-        """The values of a window before exactness and holes."""
+    def _window_values(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
+        """The values of a window before residual and holes."""
         header = self.header
         with self._lock:
             self._decode(length)
-            pictures = [
-                window_picture(header, channel, tiles, state[:, channel], region) if chosen[channel] else None
+            reconstructions = [
+                reconstruct_window(header, channel, tiles, state[:, channel], region) if chosen[channel] else None
                 for channel, tiles in enumerate(self._tiles)
             ]
         shape = region[0][1] - region[0][0], region[1][1] - region[1][0]
@@ -175,32 +175,32 @@ class Reconstruction:
         for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
             array = np.zeros((*shape, count), header.dtypes[channel])
             for component in range(count):
-                if (picture := pictures[channel]) is not None:
-                    store_values(header.lattices[channel], picture, array, component)
+                if (reconstruction := reconstructions[channel]) is not None:
+                    store_values(header.lattices[channel], reconstruction, array, component)
                 channel += 1
             arrays.append(array)
         return Values(arrays)
 
     def _correct(self, blocks: list[Values], chosen: NDArray[np.bool_] | None, region: Region | None = None) -> None:
-        """Restore all windows of exactness that there are, or of a region of the only block those inside."""
+        """Restore all windows of residual that there are, or of a region of the only block those inside."""
         top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
         for number, window in enumerate(windows(self.header)):
             inside = region is None or all(
                 a <= start and stop <= b
                 for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
             )
-            if number in self._pieces and inside and (chosen is None or chosen[window.channel]):
+            if number in self._chunks and inside and (chosen is None or chosen[window.channel]):
                 values = blocks[window.block].window(window, top, left)
                 masks = self.header.kept_masks if window.kept else self.header.masks
-                mask, (data, offset) = masks[window.block], self._pieces[number]
+                mask, (data, offset) = masks[window.block], self._chunks[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
                 places = slice(None) if valid is None else valid
                 known = values[places]
                 values[places] = self._restored(known.ravel(), data, offset).reshape(known.shape)
 
-    def _restored(self, known: NDArray[Any], piece: bytes, offset: int) -> NDArray[Any]:
-        """The values of a piece of the exactness section."""
-        return chunk_coder.decode_piece(known, piece, offset)
+    def _restored(self, known: NDArray[Any], chunk: bytes, offset: int) -> NDArray[Any]:
+        """The values of a chunk of the residual section."""
+        return chunk_coder.decode_chunk(known, chunk, offset)
 
     def _prepare(self) -> list[Tiles]:
         if not self._tiles:
@@ -296,25 +296,25 @@ def initial_state(header: Header) -> NDArray[np.int8]:
     return np.where(known, 0, UNANNOUNCED).astype(np.int8)
 
 
-def channel_picture(
+def reconstruct_channel(
     header: Header,
     channel: int,
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
     canvases: list[NDArray[np.int32]] | None = None,
-) -> Picture:
+) -> Coordinates:
     """One channel of the grids of ``level`` in a state.
 
     Parameters
     ----------
     canvases : list of int32 arrays, optional
-        Of the shapes of the level, one for each grid, where the picture is made; new ones otherwise.
+        Of the shapes of the level, one for each grid, where the reconstruction is made; new ones otherwise.
 
     Returns
     -------
     (list of int32 arrays, shape (row, column), int)
-        Lattice coordinates of each grid, curves first, over two to the power of the second.
+        Lattice coordinates of each grid, interfaces first, over two to the power of the second.
     """
     layout = header.layout
     whole = 0
@@ -353,24 +353,24 @@ class Values:
             array[holes] = np.nan if array.dtype.kind == "f" else 0 if number else array.dtype.type(hole)
 
 
-def to_values(header: Header, pictures: Sequence[Picture], level: int) -> list[Values]:
-    """Values of each channel's picture, block by block."""
-    layout, parts = header.layout, header.parts
-    curves = len(layout.grids) - len(parts)
+def to_values(header: Header, reconstructions: Sequence[Coordinates], level: int) -> list[Values]:
+    """Values of each channel's reconstruction, block by block."""
+    layout, patches = header.layout, header.patches
+    interfaces = len(layout.grids) - len(patches)
     components = [header.point_channels, *(kind.channels for kind in header.attributes)]
-    grids: list[list[NDArray[Any]]] = []  # of each array, of each part
+    grids: list[list[NDArray[Any]]] = []  # of each array, of each patch
     channel = 0
     for count in components:
         arrays = [
-            np.empty((*layout.shape(curves + k, level), count), header.dtypes[channel]) for k in range(len(parts))
+            np.empty((*layout.shape(interfaces + k, level), count), header.dtypes[channel]) for k in range(len(patches))
         ]
         for component in range(count):
-            coordinates, fraction = pictures[channel]
+            coordinates, fraction = reconstructions[channel]
             for k, array in enumerate(arrays):
-                store_values(header.lattices[channel], (coordinates[curves + k], fraction), array, component)
+                store_values(header.lattices[channel], (coordinates[interfaces + k], fraction), array, component)
             channel += 1
         grids.append(arrays)
     return [
         Values([np.ascontiguousarray(assemble(own, layout, level, shape, arrays)) for arrays in grids])
-        for own, (shape, _) in zip(numbered_by_block(parts, len(header.blocks)), header.blocks, strict=True)
+        for own, (shape, _) in zip(numbered_by_block(patches, len(header.blocks)), header.blocks, strict=True)
     ]

@@ -15,7 +15,7 @@ from ..coordinates.height_fields import level_metadata, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
 from ..grid.patches import level_masks, level_positions, numbered_by_block
 from ..joints import Nodes
-from ..planning.selection import Wish, restored
+from ..planning.selection import Selection, restored
 from ..surface import Block, Closed, Surface
 from ..target import Region
 from .reconstruction import Reconstruction, Values
@@ -35,7 +35,7 @@ class View:
     level : int
         Finest level of which there are decoded data.
     bytes : int
-        Bytes received of header, layers and exactness.
+        Bytes received of header, layers and residual.
     rms, max_error : float
         Measured errors at full resolution, in the surface's unit.
     complete : bool
@@ -54,7 +54,7 @@ class View:
     _corrected: bool = field(repr=False, compare=False)
     _metadata: dict[str, Any] = field(repr=False, compare=False)
     _digest: dict[str, Any] = field(repr=False, compare=False)
-    _wish: Wish = field(repr=False, compare=False)
+    _selection: Selection = field(repr=False, compare=False)
 
     @property
     def points(self) -> NDArray[Any]:
@@ -106,16 +106,16 @@ class View:
         OptionError
             If the region is outside the surface, the surface has several blocks, or the view holds another region only.
         """
-        header, shown = self._reconstruction.header, self._wish.region
-        wish = Wish(region, self._wish.attributes)
-        wish.check(header)
+        header, shown = self._reconstruction.header, self._selection.region
+        selection = Selection(region, self._selection.attributes)
+        selection.check(header)
         if shown is not None and not all(
             a <= start and stop <= b for (start, stop), (a, b) in zip(region, shown, strict=True)
         ):
             raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
         state = self._state.copy()
-        state[~wish.tiles(header)] = 0
-        return replace(self, _wish=wish, _state=state).surface()
+        state[~selection.tiles(header)] = 0
+        return replace(self, _selection=selection, _state=state).surface()
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
         """The state as a `Surface`, at full resolution or at a coarser level.
@@ -143,13 +143,13 @@ class View:
         if asked:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
         digest = self._digest.get(DIGEST)
-        region = self._wish.region
+        region = self._selection.region
         if not finest and region is not None:
             raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
-        chosen = self._wish.channels(header)
+        chosen = self._selection.channels(header)
         if region is None:
             grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
-            masks = level_masks(header.parts, header.layout, level, header.masks)
+            masks = level_masks(header.patches, header.layout, level, header.masks)
             closures: tuple[Closed, ...] = tuple(closed for _, closed in header.blocks)
         else:
             grids, masks = [self._window(region, chosen)], [header.masks[0]]
@@ -162,7 +162,7 @@ class View:
             named = {
                 kind.name: array if kind.components else array[..., 0]
                 for kind, array in zip(header.attributes, attributes, strict=True)
-                if self._wish.attributes is None or kind.name in self._wish.attributes
+                if self._selection.attributes is None or kind.name in self._selection.attributes
             }
             if mask is not None and region is None and not mask.any():
                 mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
@@ -202,18 +202,18 @@ class View:
 
     def _nodes(self, level: int) -> list[Nodes]:
         """Which rows and columns of each block are shown at a level, or in the window."""
-        header, region = self._reconstruction.header, self._wish.region
+        header, region = self._reconstruction.header, self._selection.region
         if region is not None:
             return [(np.arange(*region[0]), np.arange(*region[1]))]
-        owned = zip(numbered_by_block(header.parts, len(header.blocks)), header.blocks, strict=True)
-        return [level_positions(own, len(header.parts), header.layout, level, shape) for own, (shape, _) in owned]
+        owned = zip(numbered_by_block(header.patches, len(header.blocks)), header.blocks, strict=True)
+        return [level_positions(own, len(header.patches), header.layout, level, shape) for own, (shape, _) in owned]
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
         """Which holes of the only block have values."""
         kept = self._reconstruction.header.kept_masks[0]
         if kept is None or not (finest and self._corrected):
             return None
-        region = self._wish.region
+        region = self._selection.region
         return kept if region is None else kept[slice(*region[0]), slice(*region[1])]
 
     def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:

@@ -51,71 +51,71 @@ class ClosedLoop:
         self._chooser = IndexChooser(table)
 
     def indices(
-        self, steps: NDArray[np.int64], rules: NDArray[np.float32], pictures: Sequence[NDArray[np.int32]]
+        self, steps: NDArray[np.int64], rules: NDArray[np.float32], reconstructions: Sequence[NDArray[np.int32]]
     ) -> NDArray[np.int32]:
-        """The index of every coefficient, flat; and what the reader will have of the grids, into ``pictures``.
+        """The index of every coefficient, flat; and what the reader will have of the grids, into ``reconstructions``.
 
         For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         table, predictors = self._table, self._predictors
-        for picture in pictures:
-            picture.fill(0)
+        for reconstruction in reconstructions:
+            reconstruction.fill(0)
         self._chooser.begin(steps, rules)
-        coder = _Coder(table, self._chooser, steps, self._aims, pictures)
+        coder = _Coder(table, self._chooser, steps, self._aims, reconstructions)
         for level, of_grid in self._levels:
             if level == 0:
                 coder.code(of_grid, {})
-                take_nodes(pictures, table.layout)
+                take_nodes(reconstructions, table.layout)
                 continue
             for number in of_grid:
-                take_details(pictures, table.layout, predictors, number, level)
+                take_details(reconstructions, table.layout, predictors, number, level)
             details = {
-                number: _Details(table.layout, predictors, number, level, pictures[number]) for number in of_grid
+                number: _Details(table.layout, predictors, number, level, reconstructions[number]) for number in of_grid
             }
             both = {number: table.bands[own, KIND] == _BOTH for number, own in of_grid.items()}
             coder.code({k: own[~both[k]] for k, own in of_grid.items()}, {k: d.along_one() for k, d in details.items()})
             coder.code({k: own[both[k]] for k, own in of_grid.items()}, {k: d.along_both() for k, d in details.items()})
             for number in of_grid:
-                inverse_level(pictures[number], table.layout, predictors, number, level)
+                inverse_level(reconstructions[number], table.layout, predictors, number, level)
         return self._chooser.end()
 
 
 def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]]]:
-    """Level by level, curves before the parts that take their sides from them: the numbers of each grid's bands."""
+    """Level by level, interfaces before patches that take their sides from them: the numbers of each grid's bands."""
     layout = table.layout
     levels = np.array([tile.level for tile in layout.tiles])[table.windows[:, 0]]
     every = list(range(len(layout.grids)))
-    curves = sum(grid.curve for grid in layout.grids)
+    interfaces = sum(grid.interface for grid in layout.grids)
     for level in range(layout.levels + 1):
-        groups = [every] if level == 0 else [every[:curves], every[curves:]]
+        groups = [every] if level == 0 else [every[:interfaces], every[interfaces:]]
         for group in groups:
             yield level, {k: table.of_grid[k][levels[table.of_grid[k]] == level] for k in group}
 
 
 class _Details:
-    """What the third step predicts of the details of a level of a grid, from what the reader has in ``picture``."""
+    """What the third step predicts of the details of a level of a grid, from what the reader has of it."""
 
     def __init__(
-        self, layout: Layout, predictors: NDArray[np.int8], grid: int, level: int, picture: NDArray[np.int32]
+        self, layout: Layout, predictors: NDArray[np.int8], grid: int, level: int, reconstruction: NDArray[np.int32]
     ) -> None:
         self._steps, (rows, columns) = layout.steps(grid, level), layout.shape(grid, level)
         self._rules = [predictor(predictors, layout.grids[grid], step, level, a) for a, step in enumerate(self._steps)]
-        self._picture, (self._top, self._left) = picture[:rows, :columns], layout.shape(grid, level - 1)
+        self._reconstructed, (self._top, self._left) = reconstruction[:rows, :columns], layout.shape(grid, level - 1)
         self._predicted = allocate((rows, columns))
 
     def along_one(self) -> NDArray[np.int32]:
         """Those along one axis, from the nodes; int32, shape (row, column) of the level."""
-        nodes = self._picture[: self._top, : self._left]
+        nodes = self._reconstructed[: self._top, : self._left]
         self._predicted[: self._top, self._left :] = self._third_step(nodes, 1)
         self._predicted[self._top :, : self._left] = self._third_step(nodes, 0)
         return self._predicted
 
     def along_both(self) -> NDArray[np.int32]:
         """Those along both, once those along one axis are known, too."""
-        details = self._predicted[: self._top, self._left :] + self._picture[: self._top, self._left :]
+        details = self._predicted[: self._top, self._left :] + self._reconstructed[: self._top, self._left :]
         both = self._predicted[self._top :, self._left :]
         both[...] = self._third_step(details, 0)
-        both += self._third_step(self._picture[self._top :, : self._left], 1)
+        both += self._third_step(self._reconstructed[self._top :, : self._left], 1)
         return self._predicted
 
     def _third_step(self, nodes: NDArray[np.int32], axis: int) -> NDArray[np.int32]:
@@ -123,7 +123,7 @@ class _Details:
 
 
 class _Coder:
-    """Chooses the indices of bands, and puts what the reader makes of them into pictures of the grids."""
+    """Chooses the indices of bands, and puts what the reader makes of them into reconstructions of the grids."""
 
     def __init__(
         self,
@@ -131,10 +131,10 @@ class _Coder:
         chooser: IndexChooser,
         steps: NDArray[np.int64],
         aims: Sequence[NDArray[np.int32]],
-        pictures: Sequence[NDArray[np.int32]],
+        reconstructions: Sequence[NDArray[np.int32]],
     ) -> None:
         self._table, self._chooser, self._steps = table, chooser, steps
-        self._aims, self._pictures = aims, pictures
+        self._aims, self._reconstructed_grids = aims, reconstructions
         self._targets, self._sizes = np.zeros((2, table.size), np.int32)
         self._signs = np.zeros(table.size, np.int8)
         self._early = np.zeros(table.size, np.uint8)
@@ -158,7 +158,7 @@ class _Coder:
             np.sign(chosen, out=self._own(self._signs, number), casting="same_kind")
         known = self._sizes, self._signs, self._early, self._table.bands, self._table.windows, self._steps
         for grid, numbers in of_grid.items():
-            spread_bands(*known, numbers, self._complete, self._complete.size, self._pictures[grid], (0, 0))
+            spread_bands(*known, numbers, self._complete, self._complete.size, self._reconstructed_grids[grid], (0, 0))
 
     def _own(self, flat: NDArray[Any], number: int) -> NDArray[Any]:
         """A band in a flat array, shape (row, column), a view."""

@@ -96,7 +96,7 @@ def encode(
     for bits in _COARSER:
         if prepared.precision is not None or len(container) <= longest(raw):
             break
-        # What looks like noise is not worth coding: the lattice keeps the highest bits, exactness stores the rest.
+        # What looks like noise is not worth coding: the lattice keeps the highest bits, residual stores the rest.
         container = min(container, Encoding(prepared, rising, bits).run(), key=len)
     rising(1.0)
     return container

@@ -55,7 +55,7 @@ def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32
                 weight, taps = (step / quantiser.base) ** 2, []
                 for axis in range(2):
                     count, detail = steps_along(band, tile.level, table.layout, axis)
-                    alone = table.layout.grids[band.grid].curve and axis == 1
+                    alone = table.layout.grids[band.grid].interface and axis == 1
                     first, second, gain = _alone(count) if alone else _filter(count, detail)
                     weight *= gain
                     taps += [first, second]

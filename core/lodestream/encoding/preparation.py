@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.model import AttributeKind, JointChanges
 from ..coordinates.height_fields import to_heights
-from ..grid.connectivity import Arrangement, Curve, LatticeBlock, Part, Side, arrange, stored, whole_part
+from ..grid.connectivity import Arrangement, Interface, LatticeBlock, Patch, Side, arrange, stored, whole_patch
 from ..grid.layout import Layout
 from ..grid.multiblock import grids_of, shared_points
 from ..joints import Groups
@@ -28,12 +28,12 @@ from ..transform.pyramid import allocate
 
 __all__ = ["Precisions", "Preparation", "given_channel"]
 
-#: Coefficients of a tile in a band, and points of a piece of exactness, as exponents of two.
-TILE_BITS, PIECE_BITS = 12, 12
+#: Coefficients of a tile in a band, and points of a chunk of residual, as exponents of two.
+TILE_BITS, CHUNK_BITS = 12, 12
 #: The same for surfaces of at most so many points, where these take many bytes each.
-_SMALL_TILE, _SMALL_PIECE, _SMALL = 11, 10, 1 << 19
-#: Of x, y, z, where no window is wanted, or small pieces would take many more bytes.
-_WHOLE_TILE, _WHOLE_PIECE = 14, 16
+_SMALL_TILE, _SMALL_CHUNK, _SMALL = 11, 10, 1 << 19
+#: Of x, y, z, where no window is wanted, or small chunks would take many more bytes.
+_WHOLE_TILE, _WHOLE_CHUNK = 14, 16
 
 #: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
 _FINEST, _COARSEST = 128, 8
@@ -73,12 +73,12 @@ class Preparation:
     rms : float or None
         Largest root mean square error of a stream that is made for it.
     layout : Layout
-    pieces : list of (int, int)
-        Exponents of two: what may be the rows and columns of a piece of exactness, the smallest first.
+    chunks : list of (int, int)
+        Exponents of two: what may be the rows and columns of a chunk of residual, the smallest first.
     arrangement : Arrangement or None
         None where the surface is one block that shares no side.
-    parts : tuple of Part
-    originals : list of Original, one for each part
+    patches : tuple of Patch
+    originals : list of Original, one for each patch
     joint_changes : JointChanges or None
         See `Header`.
     """
@@ -116,16 +116,16 @@ class Preparation:
         self.arrangement = self._arranged()
         if self.arrangement is None:
             shape = first.shape
-            self.parts: tuple[Part, ...] = (whole_part(0, shape, first.closed),)
+            self.patches: tuple[Patch, ...] = (whole_patch(0, shape, first.closed),)
             small = self._takes_small_tiles()
             bits = _SMALL_TILE if small else TILE_BITS if self.geometric == 1 else _WHOLE_TILE
             self.layout = Layout.single(shape, first.closed, tile_exponents(shape, bits))
-            self.pieces = piece_exponents(shape, small)
+            self.chunks = chunk_exponents(shape, small)
         else:
-            # It is never read in windows: tiles and pieces may be as large as costs the fewest bytes.
-            self.parts = self.arrangement.parts
+            # It is never read in windows: tiles and chunks may be as large as costs the fewest bytes.
+            self.patches = self.arrangement.patches
             self.layout = Layout(grids_of(self.arrangement), _square(_WHOLE_TILE))
-            self.pieces = [_square(_WHOLE_PIECE)]
+            self.chunks = [_square(_WHOLE_CHUNK)]
         masks = [block.mask for block in surface.blocks]
         self.originals = originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks)
         self.joint_changes = self._joint_changes()
@@ -176,7 +176,7 @@ class Preparation:
     def coordinates(self, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
         """Lattice coordinates of a channel, one array for each grid of the layout; what is shared agrees."""
         arrays = [allocate(grid.shape) for grid in self.layout.grids]
-        curves = len(arrays) - len(self.parts)
+        interfaces = len(arrays) - len(self.patches)
         if self.arrangement is None:
             lattice.coordinates(self.channel(0, channel), out=arrays[0])
             block = self.surface.blocks[0]
@@ -189,33 +189,33 @@ class Preparation:
                 arrays[0][...] = settle_holes(arrays[0], mask, self.layout)
             return arrays
         known: set[int] = set()
-        for number, part in enumerate(self.parts):
-            values = stored(part, self.channel(part.block, channel))
-            arrays[curves + number][...] = lattice.coordinates(values)
+        for number, patch in enumerate(self.patches):
+            values = stored(patch, self.channel(patch.block, channel))
+            arrays[interfaces + number][...] = lattice.coordinates(values)
             if channel >= self.geometric:
                 continue
-            for side, line in zip(part.sides, _lines(arrays[curves + number]), strict=True):
+            for side, line in zip(patch.sides, _lines(arrays[interfaces + number]), strict=True):
                 if side is None:
                     continue
-                curve = arrays[side.curve][:, 0]
-                if side.curve not in known:
-                    curve[:] = (line[::-1] if side.reversed else line)[: curve.size]
-                    known.add(side.curve)
+                interface = arrays[side.interface][:, 0]
+                if side.interface not in known:
+                    interface[:] = (line[::-1] if side.reversed else line)[: interface.size]
+                    known.add(side.interface)
         if channel < self.geometric:
-            self._agree(arrays, curves)
+            self._agree(arrays, interfaces)
         return arrays
 
-    def _agree(self, arrays: list[NDArray[np.int32]], curves: int) -> None:
-        """Sides take their points from their curves: under holes, and on coarser lattices, these may differ."""
-        for number, grid in enumerate(self.layout.grids[:curves]):
+    def _agree(self, arrays: list[NDArray[np.int32]], interfaces: int) -> None:
+        """Sides take their points from their interfaces: under holes, and on coarser lattices, these may differ."""
+        for number, grid in enumerate(self.layout.grids[:interfaces]):
             for end, source in enumerate(grid.sources[:2]):
                 if source is not None:
                     arrays[number][-end, 0] = arrays[source.grid][-1 if source.reversed else 0, 0]
-        for number, part in enumerate(self.parts):
-            for side, line in zip(part.sides, _lines(arrays[curves + number]), strict=True):
+        for number, patch in enumerate(self.patches):
+            for side, line in zip(patch.sides, _lines(arrays[interfaces + number]), strict=True):
                 if side is not None:
-                    curve = arrays[side.curve][:, 0]
-                    line[:] = curve[::-1] if side.reversed else curve
+                    interface = arrays[side.interface][:, 0]
+                    line[:] = interface[::-1] if side.reversed else interface
 
     def _takes_small_tiles(self) -> bool:
         """Whether the surface has few points, of many bytes each: floats on no lattice."""
@@ -228,7 +228,7 @@ class Preparation:
         if self.geometric == 1 or (len(blocks) == 1 and not _may_share(blocks[0], self.arrays[0][0])):
             if len(blocks) == 1:
                 return None
-            return Arrangement(tuple(whole_part(k, b.shape, b.closed) for k, b in enumerate(blocks)), ())
+            return Arrangement(tuple(whole_patch(k, b.shape, b.closed) for k, b in enumerate(blocks)), ())
         lattices = choose_lattices(self._valid, self.geometric, self.precision, None, steps=self._steps)
         sources = []
         for block, arrays in zip(blocks, self.arrays, strict=True):
@@ -238,26 +238,26 @@ class Preparation:
                 points[~block.mask] = 0  # whatever stands under holes agrees
             sources.append(LatticeBlock(points, block.closed, block.mask))
         found = arrange(sources, self.geometric)
-        parts, curves = list(found.parts), list(found.curves)
-        for number, part in enumerate(parts):
-            window = stored(part, sources[part.block].coordinates)
-            sides = list(part.sides)
-            mask = sources[part.block].mask
-            valid = _lines(np.ones(part.shape, np.bool_) if mask is None else stored(part, mask))
+        patches, interfaces = list(found.patches), list(found.interfaces)
+        for number, patch in enumerate(patches):
+            window = stored(patch, sources[patch.block].coordinates)
+            sides = list(patch.sides)
+            mask = sources[patch.block].mask
+            valid = _lines(np.ones(patch.shape, np.bool_) if mask is None else stored(patch, mask))
             for place, line in enumerate(_lines(window)):
-                wraps = part.closed[place // 2]  # such an axis has no ends
+                wraps = patch.closed[place // 2]  # such an axis has no ends
                 pole = not wraps and len(line) > 1 and valid[place].all() and (line == line[0]).all()
                 if sides[place] is None and pole:
-                    sides[place] = Side(len(curves), False)
-                    curves.append(Curve(1, False, False))
+                    sides[place] = Side(len(interfaces), False)
+                    interfaces.append(Interface(1, False, False))
             first, last, left, right = sides
-            clamped = [a or s is not None for a, s in zip(part.clamped, sides, strict=True)]
-            parts[number] = replace(
-                part, sides=(first, last, left, right), clamped=(clamped[0], clamped[1], clamped[2], clamped[3])
+            clamped = [a or s is not None for a, s in zip(patch.clamped, sides, strict=True)]
+            patches[number] = replace(
+                patch, sides=(first, last, left, right), clamped=(clamped[0], clamped[1], clamped[2], clamped[3])
             )
-        if len(parts) == 1 and not curves and parts[0].flipped == parts[0].stops == (False, False):
+        if len(patches) == 1 and not interfaces and patches[0].flipped == patches[0].stops == (False, False):
             return None
-        return Arrangement(tuple(parts), tuple(curves))
+        return Arrangement(tuple(patches), tuple(interfaces))
 
     def _joint_changes(self) -> JointChanges | None:
         shapes = [block.shape for block in self.given.blocks]
@@ -279,12 +279,12 @@ def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, 
     return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
 
 
-def piece_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
-    """Rows and columns that pieces of exactness of a surface of one grid may have, as exponents of two.
+def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
+    """Rows and columns that chunks of residual of a surface of one grid may have, as exponents of two.
 
     The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
     """
-    sizes = [_SMALL_PIECE] * small + [PIECE_BITS, _WHOLE_PIECE]
+    sizes = [_SMALL_CHUNK] * small + [CHUNK_BITS, _WHOLE_CHUNK]
     return [_fitting(*shape, bits) for bits in sizes]
 
 
@@ -350,7 +350,7 @@ def _filled(block: Block) -> Arrays:
 def _known(values: NDArray[Any], block: Block, coordinate: bool) -> NDArray[np.bool_] | None:
     """Where one channel has numbers that are worth coding, shape (row, column); None: everywhere.
 
-    A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; exactness gives both
+    A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; residual gives both
     back. Numbers that lie further out than all valid ones are left to it as well.
     """
     if values.dtype.kind != "f" or (coordinate and block.kept is None):

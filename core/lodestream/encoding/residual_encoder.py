@@ -1,4 +1,4 @@
-"""The writing end of the exactness section: what each window needs for its values to come back as they were given."""
+"""The writing end of the residual section: what each window needs for its values to come back as they were given."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ..residual import chunk_coder
 from ..surface import Block, Surface
 from .preparation import Preparation, given_channel
 
-__all__ = ["as_returned", "encode_pieces", "piece_size"]
+__all__ = ["as_returned", "chunk_size", "encode_chunks"]
 
-#: Bytes of tables for each piece, and what small pieces may cost: a share of all bytes.
+#: Bytes of tables for each chunk, and what small chunks may cost: a share of all bytes.
 _TABLES, _WORTH = 8, 0.01
 
 
-def encode_pieces(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
-    """The section's pieces; and of each channel whether it is exact then.
+def encode_chunks(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+    """The section's chunks; and of each channel whether it is exact then.
 
     A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
     NaN and infinities, and all values of holes that are kept.
@@ -32,15 +32,15 @@ def encode_pieces(prepared: Preparation, header: Header, restored: list[Values])
     prepared : Preparation
     header : Header
     restored : list of Values, one for each block
-        What comes back without these pieces.
+        What comes back without these chunks.
     """
-    coder = _PieceCoder(prepared, header, restored)
-    pieces = [coder.code(window) for window in windows(header)]
-    return pieces, coder.exact
+    coder = _ChunkCoder(prepared, header, restored)
+    chunks = [coder.code(window) for window in windows(header)]
+    return chunks, coder.exact
 
 
-def piece_size(prepared: Preparation, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
-    """The smallest pieces that do not cost much, as exponents of two of their rows and columns.
+def chunk_size(prepared: Preparation, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
+    """The smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
     middle of the surface.
@@ -48,20 +48,20 @@ def piece_size(prepared: Preparation, header: Header, restored: list[Values], co
     Parameters
     ----------
     prepared, header, restored
-        As in `encode_pieces`.
+        As in `encode_chunks`.
     coefficients : float
         Bytes that the coefficients take.
     """
-    if len(prepared.pieces) == 1:
-        return prepared.pieces[0]
-    shape, largest = header.shape, prepared.pieces[-1]
+    if len(prepared.chunks) == 1:
+        return prepared.chunks[0]
+    shape, largest = header.shape, prepared.chunks[-1]
     starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, largest, strict=True)]
     stops = [min(start + (1 << e), length) for start, length, e in zip(starts, shape, largest, strict=True)]
     share = math.prod(stop - start for start, stop in zip(starts, stops, strict=True)) / math.prod(shape)
     costs = []
-    for piece in prepared.pieces:
-        tried = replace(header, piece=piece)
-        coder = _PieceCoder(prepared, tried, restored)
+    for chunk in prepared.chunks:
+        tried = replace(header, chunk=chunk)
+        coder = _ChunkCoder(prepared, tried, restored)
         inside = (
             window
             for window in windows(tried)
@@ -69,11 +69,11 @@ def piece_size(prepared: Preparation, header: Header, restored: list[Values], co
         )
         costs.append(sum(len(coder.code(window)) + _TABLES for window in inside) / share)
     most = min(costs) + _WORTH * (min(costs) + coefficients)
-    return next(piece for piece, cost in zip(prepared.pieces, costs, strict=True) if cost <= most)
+    return next(chunk for chunk, cost in zip(prepared.chunks, costs, strict=True) if cost <= most)
 
 
-class _PieceCoder:
-    """Makes pieces; ``exact`` says of each channel whether it is exact with those so far."""
+class _ChunkCoder:
+    """Makes chunks; ``exact`` says of each channel whether it is exact with those so far."""
 
     def __init__(self, prepared: Preparation, header: Header, restored: list[Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
@@ -85,7 +85,7 @@ class _PieceCoder:
         self.exact = [True] * header.channels
 
     def code(self, window: Window) -> bytes:
-        """One piece."""
+        """One chunk."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]
         mask = prepared.kept[window.block] if window.kept else block.mask
@@ -101,7 +101,7 @@ class _PieceCoder:
                 given, wanted = wanted, known
             self.exact[channel] &= chunk_coder.agree(given, wanted)
         step = self._header.lattices[channel].step if wanted.dtype == np.float32 else None
-        return chunk_coder.encode_piece(wanted, known, step)
+        return chunk_coder.encode_chunk(wanted, known, step)
 
 
 def as_returned(surface: Surface, hole: int) -> Iterator[Block]:

@@ -14,7 +14,7 @@ from ..container.digest import DIGEST, values_digest
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
 from ..container.writer import CodedLayer, CodedSegment, write_container
-from ..decoding.reconstruction import Picture, channel_picture, initial_state, to_values
+from ..decoding.reconstruction import Coordinates, initial_state, reconstruct_channel, to_values
 from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.bitplanes import pass_count, pass_gains
 from ..entropy.tile_coder import Channel, TileCoder, planes_of
@@ -31,7 +31,7 @@ from .allocation import TileCurve, assign_layers
 from .closed_loop import ClosedLoop, quantise
 from .large_units import large_level
 from .preparation import Preparation
-from .residual_encoder import as_returned, encode_pieces, piece_size
+from .residual_encoder import as_returned, chunk_size, encode_chunks
 
 __all__ = ["Encoding", "UnreachableError"]
 
@@ -104,8 +104,8 @@ class Encoding:
         states, errors = self._measured(states)
         self.progress(0.7)
         coefficients = sum(float(curve.bits.sum()) for curve in curves) / 8
-        self.header = replace(self.header, piece=piece_size(prepared, self.header, self._last, coefficients))
-        pieces, exact = encode_pieces(prepared, self.header, self._last)
+        self.header = replace(self.header, chunk=chunk_size(prepared, self.header, self._last, coefficients))
+        chunks, exact = encode_chunks(prepared, self.header, self._last)
         lossless = all(exact)
         levels = self._level_errors(_remaining(errors[-1], exact, self.geometric))
         self.progress(0.8)
@@ -113,8 +113,8 @@ class Encoding:
         if lossless:
             metadata[DIGEST] = values_digest(as_returned(prepared.given, self.header.hole))
         coded = self._coded(states, errors)
-        optional = self._optional(coded, pieces)
-        return write_container(self.header, coded, levels, pieces, metadata, exact=lossless, optional=optional)
+        optional = self._optional(coded, chunks)
+        return write_container(self.header, coded, levels, chunks, metadata, exact=lossless, optional=optional)
 
     def _header(self) -> Header:
         prepared, surface = self.prepared, self.prepared.surface
@@ -131,7 +131,7 @@ class Encoding:
             extent=prepared.extent,
             empty=tuple(self._empty_levels(channel.top) for channel in self.channels),
             tile=self.layout.tile,
-            piece=prepared.pieces[-1],
+            chunk=prepared.chunks[-1],
             large=self.large,
             exact=False,
             corrected=False,
@@ -244,15 +244,15 @@ class Encoding:
         fractions = []
         for number in range(self.geometric):
             places = [canvas[number, :, : -PADDING or None] for canvas in canvases]
-            fractions.append(self._picture(number, state, places)[1])
+            fractions.append(self._reconstructed(number, state, places)[1])
         return self._distances_of(canvases, fractions, cells)
 
     def _distances_of(
         self, shown: list[NDArray[np.int32]], fractions: list[int], cells: list[NDArray[np.float64]] | None = None
     ) -> list[tuple[float, float]]:
         """Errors of coordinates over two to these powers."""
-        lattices, parts = self.lattices[: self.geometric], shown[self._curves_first :]
-        return coordinate_distances(self.prepared.originals, lattices, parts, fractions, cells=cells)
+        lattices, patches = self.lattices[: self.geometric], shown[self._curves_first :]
+        return coordinate_distances(self.prepared.originals, lattices, patches, fractions, cells=cells)
 
     def _errors(
         self, state: State, canvases: list[NDArray[np.int32]], cells: list[NDArray[np.float64]] | None = None
@@ -263,7 +263,7 @@ class Encoding:
             found = found or [distances]
             for number, (originals, component) in enumerate(self._others, self.geometric):
                 places = [canvas[0, :, : -PADDING or None] for canvas in canvases]
-                fraction = self._picture(number, state, places)[1]
+                fraction = self._reconstructed(number, state, places)[1]
                 shown = [canvas[:1] for canvas in canvases[self._curves_first :]]
                 found += coordinate_distances(originals, [self.lattices[number]], shown, [fraction], component)
         channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in found)
@@ -272,7 +272,7 @@ class Encoding:
     @property
     def _curves_first(self) -> int:
         """How many grids are curves."""
-        return len(self.layout.grids) - len(self.prepared.parts)
+        return len(self.layout.grids) - len(self.prepared.patches)
 
     @cached_property
     def _others(self) -> list[tuple[list[Original], int]]:
@@ -281,16 +281,18 @@ class Encoding:
         arrays = [[_with_channels(array) for array in (b.points, *b.attributes.values())] for b in blocks]
         return other_originals(prepared.arrangement, arrays, [block.mask for block in blocks], self.geometric)
 
-    def _picture(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Picture:
-        return channel_picture(self.header, number, self.tiles[number], state[:, number], self.layout.levels, canvases)
+    def _reconstructed(self, number: int, state: State, canvases: list[NDArray[np.int32]] | None = None) -> Coordinates:
+        return reconstruct_channel(
+            self.header, number, self.tiles[number], state[:, number], self.layout.levels, canvases
+        )
 
     def _canvases(self) -> list[NDArray[np.int32]]:
-        """Room for a picture of each channel that is a coordinate, one array for each grid."""
+        """Room for a reconstruction of each channel that is a coordinate, one array for each grid."""
         shapes = [grid.shape for grid in self.layout.grids]
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
     def _measured(self, states: list[State]) -> tuple[list[State], list[Errors]]:
-        """Errors of every layer's picture; a layer that would raise the RMS is merged with the one after it."""
+        """Errors of every layer's reconstruction; a layer that would raise the RMS is merged with the one after it."""
         canvases, start, announced = self._canvases(), initial_state(self.header), self._all_passes()
         kept: list[State] = []
         errors: list[Errors] = []
@@ -311,11 +313,13 @@ class Encoding:
             kept.append(state)
             errors.append(measured)
             codes.append(self._codes(measured, cells))
-        # The canvases hold the complete picture of the coordinates, unless attributes took their place.
+        # The canvases hold the complete reconstruction of the coordinates, unless attributes took their place.
         shared = self.geometric if len(self.channels) == self.geometric else 0
-        pictures: list[Picture] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
-        pictures += [self._picture(number, states[-1]) for number in range(shared, len(self.channels))]
-        self._last = to_values(self.header, pictures, self.layout.levels)
+        reconstructions: list[Coordinates] = [
+            ([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)
+        ]
+        reconstructions += [self._reconstructed(number, states[-1]) for number in range(shared, len(self.channels))]
+        self._last = to_values(self.header, reconstructions, self.layout.levels)
         return kept, errors
 
     def _codes(self, errors: Errors, cells: list[NDArray[np.float64]]) -> NDArray[np.uint8] | None:
@@ -326,13 +330,13 @@ class Encoding:
             return no_errors(self.header)
         return layer_codes(cells[0], self.header) if cells else None
 
-    def _optional(self, coded: list[CodedLayer], pieces: list[bytes]) -> dict[int, bytes]:
+    def _optional(self, coded: list[CodedLayer], chunks: list[bytes]) -> dict[int, bytes]:
         """Errors of windows, if they take little of the bytes."""
         codes = [known for known in self._window_codes if known is not None]
         if len(codes) < len(coded):
             return {}
         payload = serialize_window_errors(codes)
-        total = sum(len(s.data) for layer in coded for s in layer.segments) + sum(map(len, pieces))
+        total = sum(len(s.data) for layer in coded for s in layer.segments) + sum(map(len, chunks))
         return {WINDOW_ERRORS: payload} if len(payload) < _WINDOWS_SHARE * total else {}
 
     def _level_errors(self, last: Errors) -> list[Errors]:

@@ -1,9 +1,9 @@
 """Where the levels, bands and tiles of a surface lie: pure geometry, the same for writer and reader.
 
-A surface is coded as one or more *grids*: the parts of its blocks, and the curves along which parts meet. The
+A surface is coded as one or more *grids*: the patches of its blocks, and the interfaces along which patches meet. The
 coefficients of one channel of a grid fill an array of the grid's own shape. Level l occupies the first rows and
 columns of it, as many as its grid has; a step splits that corner into the nodes of level l - 1 and up to three *bands*
-of details around it, as is usual for wavelets. A *tile* is a piece of all bands of one level over the same part of a
+of details around it, as is usual for wavelets. A *tile* is a piece of all bands of one level over the same patch of a
 grid, or all bands of a level of several small grids; level 0 of all grids is one tile.
 """
 
@@ -28,9 +28,9 @@ _NONE: Sides = (False, False, False, False)
 
 
 class Source(NamedTuple):
-    """Where a side's points come from: the grid of a curve, perhaps backwards.
+    """Where a side's points come from: the grid of an interface, perhaps backwards.
 
-    Of a curve's end: another curve's first point, or its last one if ``reversed``.
+    Of an interface's end: another interface's first point, or its last one if ``reversed``.
     """
 
     grid: int
@@ -67,7 +67,7 @@ class Band(NamedTuple):
 class Tile(NamedTuple):
     """A tile: its level, its place in the level's grid of tiles, its bands (none empty), its parent's number or -1.
 
-    ``whole`` are the bands of channels that take nothing from curves.
+    ``whole`` are the bands of channels that take nothing from interfaces.
     """
 
     level: int
@@ -89,7 +89,7 @@ def tile_bounds(length: int, exponent: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Grid:
-    """What is coarsened by itself: a part of a block, or a curve of one column.
+    """What is coarsened by itself: a patch of a block, or an interface of one column.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Grid:
         The axis is not coarsened further once its length is even.
     sources : four Source or None
         Of the same sides: where their points come from, as far as the channel is a coordinate. No tile holds those.
-    curve : bool
+    interface : bool
     """
 
     shape: tuple[int, int]
@@ -109,7 +109,7 @@ class Grid:
     clamped: Sides = _NONE
     stops: tuple[bool, bool] = (False, False)
     sources: tuple[Source | None, Source | None, Source | None, Source | None] = (None, None, None, None)
-    curve: bool = False
+    interface: bool = False
 
     @property
     def taken(self) -> Sides:
@@ -141,7 +141,7 @@ class Layout:
     Parameters
     ----------
     grids : sequence of Grid
-        Curves first. A surface of one block that shares no side is one grid.
+        Interfaces first. A surface of one block that shares no side is one grid.
     tile : (int, int)
         Exponents of two of a tile's rows and columns, in coefficients of one band.
     """
@@ -173,7 +173,7 @@ class Layout:
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:
-        """All tiles, coarsest level first, then group by group (curves first), row by row."""
+        """All tiles, coarsest level first, then group by group (interfaces first), row by row."""
         every = range(len(self.grids))
         tiles = [Tile(0, (0, 0), *self._members(every, 0), -1)]
         parents: dict[int, tuple[int, int, int]] = {}  # grid -> number of its first tile, tiles down, tiles across
@@ -198,7 +198,7 @@ class Layout:
         return tuple(tiles)
 
     def _groups(self) -> list[list[list[int]]]:
-        """For each level the grids whose tiles are common: all curves, and neighbouring parts that are small there.
+        """For each level the grids whose tiles are common: all interfaces, and neighbouring patches small there.
 
         Grids that have a tile in common have one at the coarser levels too.
         """
@@ -211,8 +211,8 @@ class Layout:
             for group in groups:
                 shapes = [self.shape(number, level) for number in group]
                 points = sum(rows * columns for rows, columns in shapes)
-                joins = merged and self.grids[group[0]].curve == self.grids[merged[-1][0]].curve
-                if joins and (self.grids[group[0]].curve or size + points <= most):
+                joins = merged and self.grids[group[0]].interface == self.grids[merged[-1][0]].interface
+                if joins and (self.grids[group[0]].interface or size + points <= most):
                     merged[-1] = merged[-1] + group
                     size += points
                 else:
@@ -232,7 +232,7 @@ class Layout:
 
     def _bounds(self, group: list[int], level: int) -> tuple[list[int], list[int]]:
         coarse = self.shape(group[0], level - 1)
-        if len(group) > 1 or self.grids[group[0]].curve:
+        if len(group) > 1 or self.grids[group[0]].interface:
             return [0, coarse[0]], [0, coarse[1]]  # one tile, of which only the number of bounds matters
         return tile_bounds(coarse[0], self.tile[0]), tile_bounds(coarse[1], self.tile[1])
 
@@ -243,7 +243,7 @@ class Layout:
         bounds: tuple[list[int], list[int]] | None = None,
         place: tuple[int, int] = (0, 0),
     ) -> tuple[tuple[Band, ...], tuple[Band, ...]]:
-        """The tile's bands of coordinates, and of channels that take nothing from curves and have none."""
+        """The tile's bands of coordinates, and of channels that take nothing from interfaces and have none."""
         bands: list[Band] = []
         whole: list[Band] = []
         for number in group:
@@ -251,7 +251,7 @@ class Layout:
             coarse = self.shape(number, level - 1) if level else self.shape(number, 0)
             own = bounds if bounds and len(group) == 1 else ([0, coarse[0]], [0, coarse[1]])
             bands += self._bands(number, level, own, place, grid.taken)
-            if self.shared and not grid.curve:
+            if self.shared and not grid.interface:
                 whole += self._bands(number, level, own, place, _NONE)
         coordinate = tuple(bands)
         return coordinate, tuple(whole) if self.shared else coordinate

@@ -15,7 +15,7 @@ from ..target import Target
 from .byte_ranges import RangeSet
 from .plan import Ended, Mark, Plan
 from .region_first import region_first
-from .selection import select, wish_of
+from .selection import select, selection_of
 
 __all__ = ["Ended", "Mark", "Plan", "plan"]
 
@@ -57,7 +57,7 @@ def _whole(index: Index, target: Target) -> Plan:
 def _prefix(index: Index, target: Target) -> Plan:
     """Quality order: the file's own."""
     marks = [Mark(r.end, r.number, r.level, r.end, r.rms, r.max_error) for r in index.layers]
-    if index.exactness:
+    if index.residual:
         marks.append(_exact(index, len(marks), index.surface_end))
     marks, ended = _until(marks, target, index.header.extent)
     return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended, prefix=True)
@@ -109,7 +109,7 @@ def _slices_of_layers(index: Index, level: int) -> Plan:
 
 
 def _by_level(index: Index, target: Target, level: int) -> Plan:
-    """Level order: level by level, the segments of all layers; the complete surface also has its exactness."""
+    """Level order: level by level, the segments of all layers; the complete surface also has its residual."""
     tiles = index.header.layout.tiles
     ranges, held = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
@@ -120,9 +120,9 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
         for place in places:
             _append(ranges, place)
             held += place.length
-        if state.level == index.header.levels and index.exactness:
-            _append(ranges, index.exactness)
-            held += index.exactness.length
+        if state.level == index.header.levels and index.residual:
+            _append(ranges, index.residual)
+            held += index.residual.length
         marks.append(Mark(held, state.level, state.level, held, state.rms, state.max_error))
     if target.level is not None:
         return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
@@ -131,8 +131,8 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
 
 
 def _selected(index: Index, target: Target) -> Plan:
-    """A window, or some attributes only: segments in file order or level by level, then pieces of exactness."""
-    chosen = select(index, wish_of(target))
+    """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
+    chosen = select(index, selection_of(target))
     tiles, partial = index.header.layout.tiles, target.region is not None
     finest = index.header.levels if target.level is None else target.level
     if finest > index.header.levels:
@@ -163,10 +163,10 @@ def _selected(index: Index, target: Target) -> Plan:
         state = index.levels[finest]
         last, ended = _mark(held, finest, finest, state.rms, state.max_error, partial), "level"
     else:
-        for piece in chosen.pieces.values():
-            _append(ranges, piece.range)
-            held += piece.range.length
-        state, number = index.levels[-1], len(index.layers) if chosen.pieces else len(index.layers) - 1
+        for chunk in chosen.chunks.values():
+            _append(ranges, chunk.range)
+            held += chunk.range.length
+        state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
         last, ended = Mark(held, number, finest, held, state.rms, state.max_error), "complete"
     marks = [mark for mark in marks if mark.sent < held] + [last]
     if target.level is None:

@@ -10,7 +10,7 @@ from ..container.model import ByteRange, Index
 from ..target import Region
 from .byte_ranges import RangeSet
 from .plan import Mark, Plan
-from .selection import Wish
+from .selection import Selection
 
 __all__ = ["region_first"]
 
@@ -40,9 +40,9 @@ def region_first(index: Index, chosen: Plan, region: Region) -> Plan:
     OptionError
         If the surface has no such region, or several blocks.
     """
-    wish = Wish(region)
-    wish.check(index.header)
-    tiles = wish.tiles(index.header)
+    selection = Selection(region)
+    selection.check(index.header)
+    tiles = selection.tiles(index.header)
     near = RangeSet((s.range.offset, s.range.length) for s in index.segments if tiles[s.tile])
     head: list[ByteRange] = []
     first: list[ByteRange] = []

@@ -1,4 +1,4 @@
-"""Which segments and pieces of a container are needed for a window or for some attributes."""
+"""Which segments and chunks of a container are needed for a window or for some attributes."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from ..container.capacity import Capacity
 from ..container.chunks import windows
-from ..container.model import Header, Index, Piece, Segment
+from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
 from ..grid.support import check_region, needed_tiles
 from ..library import why_missing
 from ..target import Region, Target
 
-__all__ = ["Selection", "Wish", "restored", "select", "wish_of"]
+__all__ = ["SelectedSlices", "Selection", "restored", "select", "selection_of"]
 
 
 @dataclass(frozen=True)
-class Wish:
+class Selection:
     """The requested part of a surface: a window of its points (None: all) and attributes by name (None: all)."""
 
     region: Region | None = None
@@ -88,10 +88,10 @@ class Wish:
 
 
 def restored(header: Header, region: Region) -> Region:
-    """What has to be decoded for a region of the only block: a piece of exactness restores all of its own window."""
+    """What has to be decoded for a region of the only block: a chunk of residual restores all of its own window."""
     if not header.corrected:
         return region
-    sizes = [1 << exponent for exponent in header.piece]
+    sizes = [1 << exponent for exponent in header.chunk]
     rows, columns = (
         (start // size * size, min(-(-stop // size) * size, length))
         for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
@@ -99,25 +99,25 @@ def restored(header: Header, region: Region) -> Region:
     return rows, columns
 
 
-def wish_of(target: Target) -> Wish:
-    """The wish in a target."""
-    return Wish(target.region, target.attributes)
+def selection_of(target: Target) -> Selection:
+    """The selection in a target."""
+    return Selection(target.region, target.attributes)
 
 
 @dataclass(frozen=True)
-class Selection:
-    """Segments in file order, and pieces of exactness by number, that a wish takes.
+class SelectedSlices:
+    """Segments in file order, and chunks of residual by number, that a selection takes.
 
     ``whole`` says that these are all of the container.
     """
 
     segments: tuple[Segment, ...]
-    pieces: dict[int, Piece]
+    chunks: dict[int, Chunk]
     whole: bool
 
 
-def select(index: Index, wish: Wish) -> Selection:
-    """What of a container a wish takes.
+def select(index: Index, selection: Selection) -> SelectedSlices:
+    """What of a container a selection takes.
 
     Raises
     ------
@@ -125,18 +125,18 @@ def select(index: Index, wish: Wish) -> Selection:
         When the surface does not have it.
     """
     header = index.header
-    wish.check(header)
-    if wish.region is None and wish.attributes is None:
-        return Selection(index.segments, {k: p for k, p in enumerate(index.pieces) if p.range.length}, True)
-    tiles, channels = wish.tiles(header), wish.channels(header)
+    selection.check(header)
+    if selection.region is None and selection.attributes is None:
+        return SelectedSlices(index.segments, {k: p for k, p in enumerate(index.chunks) if p.range.length}, True)
+    tiles, channels = selection.tiles(header), selection.channels(header)
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
-    pieces = {}
-    if index.pieces:
-        for number, (window, piece) in enumerate(zip(windows(header), index.pieces, strict=True)):
-            touches = wish.region is None or all(
+    chunks = {}
+    if index.chunks:
+        for number, (window, chunk) in enumerate(zip(windows(header), index.chunks, strict=True)):
+            touches = selection.region is None or all(
                 start < b and a < stop
-                for (start, stop), (a, b) in zip(wish.region, (window.rows, window.columns), strict=True)
+                for (start, stop), (a, b) in zip(selection.region, (window.rows, window.columns), strict=True)
             )
-            if piece.range.length and touches and channels[window.channel]:
-                pieces[number] = piece
-    return Selection(segments, pieces, False)
+            if chunk.range.length and touches and channels[window.channel]:
+                chunks[number] = chunk
+    return SelectedSlices(segments, chunks, False)

@@ -50,7 +50,7 @@ def steps_along(band: Band, level: int, layout: Layout, axis: int) -> tuple[int,
     The points of a curve reach across the parts beside it, as nodes do.
     """
     first = max(level, 1)
-    if layout.grids[band.grid].curve and axis == 1:
+    if layout.grids[band.grid].interface and axis == 1:
         return layout.levels + 1 - first, False
     every = range(first, layout.levels + 1)
     return sum(1 for k in every if layout.steps(band.grid, k)[axis].midpoints), band.kind[axis]

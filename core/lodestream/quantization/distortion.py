@@ -1,4 +1,4 @@
-"""Lattice coordinates into values, and their distances from the original without a picture in between."""
+"""Lattice coordinates into values, and their distances from the original without a reconstruction in between."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _rule(lattice: Lattice, fraction: int) -> tuple[bool, float, float, float]:
 
 @dataclass(frozen=True)
 class Original:
-    """The points of one part that pictures are compared with.
+    """The points of one patch that reconstructions are compared with.
 
     Attributes
     ----------
@@ -72,12 +72,12 @@ class Original:
 def originals_of(
     arrangement: Arrangement | None, points: Sequence[NDArray[Any]], masks: Sequence[NDArray[np.bool_] | None]
 ) -> list[Original]:
-    """What the pictures of each part are compared with; each vertex of several parts is counted in one of them.
+    """What the values of each patch are compared with; each vertex of several patches is counted in one of them.
 
     Parameters
     ----------
     arrangement : Arrangement or None
-        None: there is one block, which is one part.
+        None: there is one block, which is one patch.
     points : C-contiguous arrays, shape (row, column, channel), one for each block
     masks : bool, shape (row, column), or None, one for each block
         True where a point is valid.
@@ -86,11 +86,11 @@ def originals_of(
         return [Original(points[0], masks[0])]
     originals = []
     counter = VertexCounter(arrangement)
-    for part in arrangement.parts:
-        mask = masks[part.block]
-        counted = np.ones(part.shape, np.bool_) if mask is None else stored(part, mask)
-        counter.count(part, counted)
-        originals.append(Original(stored(part, points[part.block]), counted))
+    for patch in arrangement.patches:
+        mask = masks[patch.block]
+        counted = np.ones(patch.shape, np.bool_) if mask is None else stored(patch, mask)
+        counter.count(patch, counted)
+        originals.append(Original(stored(patch, points[patch.block]), counted))
     return originals
 
 
@@ -100,14 +100,14 @@ def other_originals(
     masks: Sequence[NDArray[np.bool_] | None],
     geometric: int,
 ) -> list[tuple[list[Original], int]]:
-    """What the pictures of each channel that is no coordinate are compared with, and its number in those arrays.
+    """What the reconstructions of each channel that is no coordinate are compared with, and its number in those arrays.
 
-    Points count where they are valid and the channel is finite; those of several parts count in each of them.
+    Points count where they are valid and the channel is finite; those of several patches count in each of them.
 
     Parameters
     ----------
     arrangement : Arrangement or None
-        None: there is one block, which is one part.
+        None: there is one block, which is one patch.
     arrays : for each block its points, then its attributes
         Shape (row, column, channel).
     masks : bool, shape (row, column), or None, one for each block
@@ -115,18 +115,18 @@ def other_originals(
     geometric : int
         The first so many channels of the points are coordinates.
     """
-    parts = None if arrangement is None else arrangement.parts
-    if parts is None:
+    patches = None if arrangement is None else arrangement.patches
+    if patches is None:
         valid = [masks[0]]
     else:
-        own = [(part, masks[part.block]) for part in parts]
-        valid = [None if mask is None else stored(part, mask) for part, mask in own]
+        own = [(patch, masks[patch.block]) for patch in patches]
+        valid = [None if mask is None else stored(patch, mask) for patch, mask in own]
     found = []
     for number, array in enumerate(arrays[0]):
         first = 0 if number else geometric
         if first == array.shape[2]:
             continue
-        points = [array] if parts is None else [stored(part, arrays[part.block][number]) for part in parts]
+        points = [array] if patches is None else [stored(patch, arrays[patch.block][number]) for patch in patches]
         points = [np.ascontiguousarray(values) for values in points]
         for channel in range(first, array.shape[2]):
             every = zip(points, valid, strict=True)
@@ -156,15 +156,15 @@ def coordinate_distances(
 
     Parameters
     ----------
-    originals : one for each part
+    originals : one for each patch
     lattices : one for each channel that is compared, at most three
-    coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each part
+    coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each patch
     fractions : int for each of these channels
         Coordinates stand over two to this power.
     channel : int
         The first of the points' channels that are compared.
     cells : list, optional
-        Is given, for each part, sums and largest of the squared distances in cells of `kernels.PART_ROWS` x
+        Is given, for each patch, sums and largest of the squared distances in cells of `kernels.PART_ROWS` x
         `kernels.PART_COLUMNS` points, float64, shape (row of cells, column of cells, 2), unless they are out of range.
 
     Returns
@@ -177,34 +177,34 @@ def coordinate_distances(
         return [(0.0, 0.0)] * _kinds(len(lattices))
     if dtype.kind == "f" or dtype.itemsize < 8:
         rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
-        parts = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
-        worst = [max(float(part[..., kind, 1].max()) for part in parts) for kind in range(_kinds(len(lattices)))]
+        patches = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
+        worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in range(_kinds(len(lattices)))]
         if 1e-250 < worst[0] < 1e250:
             if cells is not None:
-                cells += [part[..., 0, :] for part in parts]
-            totals = [math.fsum(math.fsum(part[..., k, 0].flat) for part in parts) for k in range(len(worst))]
+                cells += [patch[..., 0, :] for patch in patches]
+            totals = [math.fsum(math.fsum(patch[..., k, 0].flat) for patch in patches) for k in range(len(worst))]
             return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
     # Integers that float64 cannot tell apart, or squares that it cannot hold.
     compared = []
     last = channel + len(lattices)
     for original, place in zip(originals, coordinates, strict=True):
         rows, columns, _ = original.points.shape
-        picture = np.empty((rows, columns, len(lattices)), original.points.dtype)
+        reconstruction = np.empty((rows, columns, len(lattices)), original.points.dtype)
         for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
-            store_values(lattice, (place[number, :, :columns], fraction), picture, number)
+            store_values(lattice, (place[number, :, :columns], fraction), reconstruction, number)
         chosen = slice(None) if original.counted is None else original.counted
-        compared.append((original.points[..., channel:last][chosen], picture[chosen]))
+        compared.append((original.points[..., channel:last][chosen], reconstruction[chosen]))
     if all(np.array_equal(*pair) for pair in compared):
         return [(0.0, 0.0)] * _kinds(len(lattices))
     if len(compared) == 1 and compared[0][0].ndim == 3:
-        points, picture = compared[0]
+        points, reconstruction = compared[0]
     else:
-        points, picture = (
+        points, reconstruction = (
             np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
         )
-    found = [distances(points, picture, len(lattices))]
+    found = [distances(points, reconstruction, len(lattices))]
     if len(lattices) > 1:
-        found += [distances(points[..., k], picture[..., k], 1) for k in range(len(lattices))]
+        found += [distances(points[..., k], reconstruction[..., k], 1) for k in range(len(lattices))]
     return found
 
 
@@ -215,7 +215,7 @@ def _kinds(channels: int) -> int:
 def _distances(
     original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64], channel: int
 ) -> NDArray[np.float64]:
-    """Sums and largest of the squared distances of one part, float64, shape (row, column, kind, 2).
+    """Sums and largest of the squared distances of one patch, float64, shape (row, column, kind, 2).
 
     See `kernels.square_distances`.
     """

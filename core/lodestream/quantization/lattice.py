@@ -81,7 +81,7 @@ def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Round float64 values into a dtype: integers to the nearest, clipped to the range of the type."""
     if dtype.kind == "f":
         if dtype.itemsize < 8:
-            # A picture on its way may overshoot the largest values of the surface.
+            # A reconstruction on its way may overshoot the largest values of the surface.
             values = np.clip(values, -float(np.finfo(dtype).max), float(np.finfo(dtype).max))
         return values.astype(dtype, copy=False)
     limits = np.iinfo(dtype)
@@ -197,7 +197,7 @@ def offset_lattice(values: NDArray[Any]) -> Lattice | None:
     """A lattice off which float32 values, shape (row, column), lie by as much as their neighbours do, or None.
 
     Its step divides most differences of neighbours in a row, but for their rounding. Lossy compressors that quantise
-    blocks of a raster leave such values: the lattice does not restore them, but `exactness` finds the offsets.
+    blocks of a raster leave such values: the lattice does not restore them, but `residual` finds the offsets.
     """
     if values.dtype != np.float32 or values.ndim != 2 or values.shape[1] < 2:
         return None

@@ -1,4 +1,4 @@
-"""Which lattice each channel of a surface gets, and what is left for the exactness section."""
+"""Which lattice each channel of a surface gets, and what is left for the residual section."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["DEFAULT_STEPS", "attribute_lattices", "channel_of", "choose_lattices
 
 #: Steps of the widest extent, unless something else is known to cost less.
 DEFAULT_STEPS = 2.0**20
-#: Sums and differences of pictures on their way to such values do not overflow.
+#: Sums and differences of reconstructions on their way to such values do not overflow.
 LARGEST_VALUE = 1e300
 
 

@@ -1,6 +1,6 @@
 """How finely to divide values that lie on no lattice: until dividing on costs more than storing the rest does.
 
-Each bit more of the lattice is one bit less of exactness for every value whose bits reach so far. On smooth surfaces
+Each bit more of the lattice is one bit less of residual for every value whose bits reach so far. On smooth surfaces
 the transform predicts it, and it costs less; on noisy ones it costs as much or a little more.
 """
 

@@ -1,4 +1,4 @@
-"""How far a picture is from the original: measured on the values as they are handed out."""
+"""How far a reconstruction is from the original: measured on the values as they are handed out."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["distances", "extent_of"]
 _ROWS = 256  # rows compared at a time, so that what is in between stays small
 
 
-def distances(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> tuple[float, float]:
+def distances(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> tuple[float, float]:
     """RMS and maximum distance between corresponding points.
 
     Parameters
     ----------
-    original, picture : array, shape (row, column) or (row, column, channel)
+    original, reconstruction : array, shape (row, column) or (row, column, channel)
         The distance is that of the first ``geometric`` channels; of heights it is the difference.
 
     Returns
@@ -27,21 +27,21 @@ def distances(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> 
     (float, float)
         In the surface's unit.
     """
-    total, worst = _squares(original, picture, geometric, 1.0)
+    total, worst = _squares(original, reconstruction, geometric, 1.0)
     unit = 1.0
     if not 1e-250 < worst < 1e250:
         # The squares are too small or too large for float64: measure in a unit of the differences' own size.
-        unit = _largest(original, picture, geometric)
+        unit = _largest(original, reconstruction, geometric)
         if unit == 0.0:
             return 0.0, 0.0
-        total, worst = _squares(original, picture, geometric, unit)
+        total, worst = _squares(original, reconstruction, geometric, unit)
     return unit * math.sqrt(total / (original.shape[0] * original.shape[1])), unit * math.sqrt(worst)
 
 
-def _squares(original: NDArray[Any], picture: NDArray[Any], geometric: int, unit: float) -> tuple[float, float]:
+def _squares(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int, unit: float) -> tuple[float, float]:
     """Sum and largest of the squared distances, in a unit; infinite where they are too large."""
     total, worst = 0.0, 0.0
-    for delta in _differences(original, picture, geometric):
+    for delta in _differences(original, reconstruction, geometric):
         if unit != 1.0:
             delta /= unit
         with np.errstate(over="ignore", under="ignore"):
@@ -51,13 +51,13 @@ def _squares(original: NDArray[Any], picture: NDArray[Any], geometric: int, unit
     return total, worst
 
 
-def _largest(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> float:
-    return max(float(np.abs(delta).max()) for delta in _differences(original, picture, geometric))
+def _largest(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> float:
+    return max(float(np.abs(delta).max()) for delta in _differences(original, reconstruction, geometric))
 
 
-def _differences(original: NDArray[Any], picture: NDArray[Any], geometric: int) -> Iterator[NDArray[np.float64]]:
+def _differences(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> Iterator[NDArray[np.float64]]:
     for start in range(0, original.shape[0], _ROWS):
-        a, b = original[start : start + _ROWS], picture[start : start + _ROWS]
+        a, b = original[start : start + _ROWS], reconstruction[start : start + _ROWS]
         if a.ndim == 3:
             a, b = a[..., :geometric], b[..., :geometric]
         yield _difference(a, b)

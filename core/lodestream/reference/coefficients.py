@@ -22,7 +22,7 @@ def quantiser_step(base: int, grid: Grid, level: int, share: Share) -> int:
     finest = len(grid.axes) - 1
     product = base
     for axis in (0, 1):
-        if grid.curve and axis == 1:
+        if grid.interface and axis == 1:
             steps = finest - lower
         else:
             steps = sum(grid.stepped(upper, axis) for upper in range(lower + 1, finest + 1))

@@ -1,4 +1,4 @@
-"""The file up to its metadata: sections, layers, pieces: sections 2, 6, 9 and 10 of docs/format.md."""
+"""The file up to its metadata: sections, layers, chunks: sections 2, 6, 9 and 10 of docs/format.md."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from .masks import Masks, no_holes, read_masks
 
 MAGIC = b"\xf5LODE\r\n"
 VERSION = 1
-HEADER, LAYER, EXACTNESS, METADATA, ROOT, MASKS, KEPT_MASKS, PAGES, OPTIONAL = 1, 2, 3, 4, 5, 6, 7, 8, 128
+HEADER, LAYER, RESIDUAL, METADATA, ROOT, MASKS, KEPT_MASKS, PAGES, OPTIONAL = 1, 2, 3, 4, 5, 6, 7, 8, 128
 METADATA_LIMIT = 65536
 
 
@@ -47,11 +47,11 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Exactness:
-    """The exactness section: remaining errors, and the pieces in order."""
+class Residual:
+    """The residual section: remaining errors, and the chunks in order."""
 
     errors: Errors
-    pieces: list[bytes]
+    chunks: list[bytes]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Container:
     """What has been read of a container.
 
     `header` (Header): the header; `masks` (Masks): holes; `layers` (list of Layer): those that are there, from the
-    first; `exactness` (Exactness or None): the exactness section, if there is one and it is there; `metadata` (dict or
+    first; `residual` (Residual or None): the residual section, if there is one and it is there; `metadata` (dict or
     None): the metadata, if they are there; `optional` (list of (int, bytes)): kind and payload of the optional sections
     before the metadata.
     """
@@ -67,7 +67,7 @@ class Container:
     header: Header
     masks: Masks
     layers: list[Layer]
-    exactness: Exactness | None
+    residual: Residual | None
     metadata: dict[str, Any] | None
     optional: list[tuple[int, bytes]]
 
@@ -158,10 +158,10 @@ def read_container(data: bytes) -> Container:
         if section.kind not in (MASKS, KEPT_MASKS):
             raise CorruptStreamError("no masks", section.offset)
         masks = read_masks(section.payload, section.offset, section.kind == KEPT_MASKS, sizes)
-    if masks.keep_any and not header.has_exactness:
-        raise CorruptStreamError("kept holes without exactness", section.offset)
+    if masks.keep_any and not header.has_residual:
+        raise CorruptStreamError("kept holes without residual", section.offset)
     layers: list[Layer] = []
-    exactness, metadata = None, None
+    residual, metadata = None, None
     optional: list[tuple[int, bytes]] = []
     remaining: dict[int, int] = {}
     try:
@@ -172,9 +172,9 @@ def read_container(data: bytes) -> Container:
                 optional.append((kind, section.payload))
             elif kind == LAYER and len(layers) < header.layers:
                 layers.append(read_layer(section, header, remaining))
-            elif kind == EXACTNESS and len(layers) == header.layers and header.has_exactness and exactness is None:
-                exactness = read_pieces(section, header, masks)
-            elif kind == METADATA and len(layers) == header.layers and header.has_exactness == (exactness is not None):
+            elif kind == RESIDUAL and len(layers) == header.layers and header.has_residual and residual is None:
+                residual = read_chunks(section, header, masks)
+            elif kind == METADATA and len(layers) == header.layers and header.has_residual == (residual is not None):
                 if len(section.payload) > METADATA_LIMIT:
                     raise CorruptStreamError("the metadata are too long", section.offset)
                 metadata = unpack_map(section.payload, section.offset)
@@ -182,12 +182,12 @@ def read_container(data: bytes) -> Container:
                 raise CorruptStreamError(f"a section of kind {kind} does not belong here", section.offset)
     except (CorruptStreamError, TruncatedStreamError):
         pass  # what came before stays
-    return Container(header, masks, layers, exactness, metadata, optional)
+    return Container(header, masks, layers, residual, metadata, optional)
 
 
 def windows_of(header: Header, masks: Masks) -> list[tuple[int, slice, slice, bool]]:
-    """List the windows of exactness in order: block, rows, columns, and whether it is for the kept holes."""
-    down, across = 1 << header.piece[0], 1 << header.piece[1]
+    """List the windows of residual in order: block, rows, columns, and whether it is for the kept holes."""
+    down, across = 1 << header.chunk[0], 1 << header.chunk[1]
     return [
         (number, slice(i, min(i + down, block.rows)), slice(j, min(j + across, block.columns)), kept)
         for number, block in enumerate(header.blocks)
@@ -197,15 +197,15 @@ def windows_of(header: Header, masks: Masks) -> list[tuple[int, slice, slice, bo
     ]
 
 
-def read_pieces(section: Section, header: Header, masks: Masks) -> Exactness:
-    """Read the exactness section."""
+def read_chunks(section: Section, header: Header, masks: Masks) -> Residual:
+    """Read the residual section."""
     fields = Fields(section.payload, section.offset)
     channels = len(header.types)
     errors = fields.errors(channels)
     count = channels * len(windows_of(header, masks))
     if count > fields.left:
-        raise fields.damaged("the exactness section ends within its lengths")
+        raise fields.damaged("the residual section ends within its lengths")
     lengths = [fields.varint() for _ in range(count)]
-    pieces = [fields.take(length) for length in lengths]
+    chunks = [fields.take(length) for length in lengths]
     fields.end()
-    return Exactness(errors, pieces)
+    return Residual(errors, chunks)

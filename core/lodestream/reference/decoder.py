@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from .bands import Band
 from .coefficients import quantiser_step, reconstructed
-from .container import Container, Exactness, Segment, windows_of
-from .exactness import restore
+from .container import Container, Residual, Segment, windows_of
 from .header import Header
 from .large_units import LargeUnit
 from .masks import Mask, Masks, no_holes
 from .reconstruction import places, plane_values, reconstruct, values_of
+from .residual import restore
 from .small_units import SmallUnit
 from .tiles import Parents, Tile
 
@@ -110,7 +110,7 @@ class Decoder:
 
         `channel` (int): number of the channel; `level` (int): the level that is made; `remaining` (list of int,
         optional): the state that is shown, as in the attribute, which stands in otherwise. A unit may have been decoded
-        further. Returns list of (h, w): the values of each block at the level, in the channel's type; exactness and
+        further. Returns list of (h, w): the values of each block at the level, in the channel's type; residual and
         holes are not looked at.
         """
         header = self.header
@@ -136,9 +136,9 @@ class Decoder:
         values = [values_of(q, whole < level, header.lattices[channel], dtype) for q in grids]
         blocks = []
         for number in range(len(header.blocks)):
-            lines, parts = places(header, number, level)
+            lines, patches = places(header, number, level)
             blocks.append(np.zeros([len(line) for line in lines], dtype))
-            for grid, index in parts:
+            for grid, index in patches:
                 blocks[-1][index] = values[grid]
         return blocks
 
@@ -155,12 +155,12 @@ class Decoder:
         return level
 
     def shown(
-        self, layers: int | None = None, *, level: int | None = None, exactness: Exactness | None = None
+        self, layers: int | None = None, *, level: int | None = None, residual: Residual | None = None
     ) -> list[Shown]:
         """Show the surface.
 
         `layers` (int, optional): after how many layers, at least 1; else as it is now; `level` (int, optional): the
-        level that is made; the finest one if it is not given; `exactness` (Exactness, optional): whose pieces are put
+        level that is made; the finest one if it is not given; `residual` (Residual, optional): whose chunks are put
         in; for the finest level after all layers. Returns list of Shown: one for each block. At coarser levels the
         points of a height field with a plane are heights alone.
         """
@@ -168,13 +168,13 @@ class Decoder:
         level = header.finest if level is None else level
         state = self.remaining if layers is None else self.states[layers - 1]
         channels = [self.channel(channel, level, state) for channel in range(len(header.types))]
-        if exactness is not None:
-            self._restore(channels, exactness.pieces)
+        if residual is not None:
+            self._restore(channels, residual.chunks)
         found = []
         for number in range(len(header.blocks)):
             stands = np.ix_(*places(header, number, level)[0])
             valid = self.masks.valid[number][stands]
-            filled = valid if exactness is None else valid | self.masks.kept[number]
+            filled = valid if residual is None else valid | self.masks.kept[number]
             values = [blocks[number] for blocks in channels]
             first = values[: header.channels]
             if header.plane is not None and level == header.finest:
@@ -189,14 +189,14 @@ class Decoder:
             found.append(Shown(arrays, valid))
         return found
 
-    def _restore(self, channels: list[list[NDArray[Any]]], pieces: list[bytes]) -> None:
-        """Put what the pieces of exactness give into the blocks of each channel."""
+    def _restore(self, channels: list[list[NDArray[Any]]], chunks: list[bytes]) -> None:
+        """Put what the chunks of residual give into the blocks of each channel."""
         windows = windows_of(self.header, self.masks)
         for number, (block, rows, columns, kept) in enumerate(windows):
             chosen = (self.masks.kept if kept else self.masks.valid)[block][rows, columns]
             for channel, blocks in enumerate(channels):
                 window = blocks[block][rows, columns]
-                window[chosen] = restore(pieces[number * len(channels) + channel], window[chosen])
+                window[chosen] = restore(chunks[number * len(channels) + channel], window[chosen])
 
 
 def decode(container: Container) -> Decoder:

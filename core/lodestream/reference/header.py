@@ -17,7 +17,9 @@ CODECS = 6  # numbers 1 to 6 are decoded here
 TYPES = list(map(np.dtype, ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")))
 
 Pair = tuple[bool, bool]  # of axis 0 and axis 1
-End = tuple[int, int]  # a curve, and 0 for its first point or 1 for its last; a curve of one point has one end, 0
+End = tuple[
+    int, int
+]  # an interface, and 0 for its first point or 1 for its last; an interface of one point has one end, 0
 
 
 class Block(NamedTuple):
@@ -28,23 +30,25 @@ class Block(NamedTuple):
     closed: Pair
 
 
-class Curve(NamedTuple):
-    """A curve of so many points."""
+class Interface(NamedTuple):
+    """An interface of so many points."""
 
     length: int
     stops: bool
     closed: bool
 
 
-class Part(NamedTuple):
-    """A part; its sides are the first row, last row, first column and last column, as it is stored."""
+class Patch(NamedTuple):
+    """A patch; its sides are the first row, last row, first column and last column, as it is stored."""
 
     block: int
     closed: Pair
     reverse: Pair
     stops: Pair
     clamped: tuple[bool, bool, bool, bool]
-    curves: tuple[tuple[int, bool] | None, ...]  # for each side the curve it comes from, and whether that is reversed
+    interfaces: tuple[
+        tuple[int, bool] | None, ...
+    ]  # for each side the interface it comes from, and whether that is reversed
     window: tuple[tuple[int, int], tuple[int, int]]  # first row, rows; first column, columns
 
 
@@ -62,19 +66,19 @@ class Header:
 
     flat: bool  # the points are arrays (H, W)
     exact: bool
-    has_exactness: bool
+    has_residual: bool
     has_masks: bool
     types: list[np.dtype[Any]]  # of each channel
     channels: int  # of the points, C
     layers: int
     tile: tuple[int, int]  # binary logarithms of the rows and columns of a tile
-    piece: tuple[int, int]  # and of a piece of exactness
+    chunk: tuple[int, int]  # and of a chunk of residual
     large: int  # the coarsest level whose units are large, 0 if none are
     base: int
     extent: float
     blocks: list[Block]
-    curves: list[Curve]
-    parts: list[Part]
+    interfaces: list[Interface]
+    patches: list[Patch]
     attributes: list[Attribute]
     plane: list[list[Any]] | None  # the rules of x and y
     joints: list[Any] | None
@@ -100,8 +104,8 @@ class Header:
 
     @cached_property
     def holders(self) -> dict[End, End]:
-        """For each end of a curve that another end holds, that one."""
-        return common_ends(self.curves, self.parts)
+        """For each end of an interface that another end holds, that one."""
+        return common_ends(self.interfaces, self.patches)
 
 
 def read_header(payload: bytes, offset: int = 0) -> Header:
@@ -116,17 +120,17 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         if codec > CODECS:
             raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
     flags, kind, channels, layers = fields.u8(), fields.u8(), fields.varint(), fields.varint()
-    tile, piece, large = _sizes(fields), _sizes(fields), fields.u8()
+    tile, chunk, large = _sizes(fields), _sizes(fields), fields.u8()
     base, extent = fields.varint(), fields.real()
     fields.require(kind < len(TYPES) and channels > 0 and layers > 0 and base < 1 << 24, "a field is out of range")
-    curves: list[Curve] = []
+    interfaces: list[Interface] = []
     if flags & 64:
-        blocks, curves, parts = _arrangement(fields)
+        blocks, interfaces, patches = _arrangement(fields)
     else:
         closed, no = _pair(flags, 0), (False, False)
         rows, columns = fields.varint(), fields.varint()
         blocks = [Block(rows, columns, closed)]
-        parts = [Part(0, closed, no, no, no + no, (None,) * 4, ((0, rows), (0, columns)))]
+        patches = [Patch(0, closed, no, no, no + no, (None,) * 4, ((0, rows), (0, columns)))]
     attributes, plane, joints = _extras(fields, blocks[0]) if flags & 128 else ([], None, None)
     single = channels == 1 and bool(flags & 4) and len(blocks) == 1
     fields.require(single if plane else channels == 1 or not flags & 4, "a plane, or an array (H, W), of other points")
@@ -137,13 +141,13 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         types += [attribute.dtype] * max(attribute.components, 1)
     points = sum(block.rows * block.columns for block in blocks)
     fields.require(points >= 2 and points * total < 1 << 63, f"{points} points of {total} channels")
-    for long in (tile, piece):
-        pieces = sum(max(1, b.rows >> long[0]) * max(1, b.columns >> long[1]) for b in blocks)
-        fields.require(pieces <= 64 + len(blocks) + (points >> max(long)), "tiles or pieces are too long")
+    for long in (tile, chunk):
+        chunks = sum(max(1, b.rows >> long[0]) * max(1, b.columns >> long[1]) for b in blocks)
+        fields.require(chunks <= 64 + len(blocks) + (points >> max(long)), "tiles or chunks are too long")
     lattices = [(fields.u8(), fields.real(), fields.real()) for _ in types]
     fields.require(all(rule < 2 and step > 0 for rule, _, step in lattices), "a lattice of no known rule, or no step")
     empty = [fields.varint() for _ in types]
-    grids = _grids(curves, parts)
+    grids = _grids(interfaces, patches)
     predictors = []
     for channel in range(len(types)):
         steps = fitted_steps(grids, channel < min(channels, 3))
@@ -152,7 +156,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
         fields.require(all(-128 not in pair for pair in predictors[-1].values()), "a predictor is out of range")
     fields.end()
     values: list[Any] = [*_pair(flags, 2), *_pair(flags, 4), types, channels, layers]
-    values += [tile, piece, large, base, extent, blocks, curves, parts, attributes, plane, joints]
+    values += [tile, chunk, large, base, extent, blocks, interfaces, patches, attributes, plane, joints]
     values += [lattices, empty, predictors, grids]
     return Header(*values)
 
@@ -164,20 +168,20 @@ def _pair(bits: int, first: int) -> Pair:
 def _sizes(fields: Fields) -> tuple[int, int]:
     byte = fields.u8()
     first, second = byte & 15, byte >> 4
-    fields.require(first > 0 and second > 0 and 8 <= first + second <= 16, "a size of tiles or pieces is out of range")
+    fields.require(first > 0 and second > 0 and 8 <= first + second <= 16, "a size of tiles or chunks is out of range")
     return first, second
 
 
-def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
-    blocks, curves, parts = [], [], []
+def _arrangement(fields: Fields) -> tuple[list[Block], list[Interface], list[Patch]]:
+    blocks, interfaces, patches = [], [], []
     for _ in range(fields.count(3)):
         rows, columns, bits = fields.varint(), fields.varint(), fields.u8()
         fields.require(rows > 0 and columns > 0 and bits < 4, "a block without points, or of unknown flags")
         blocks.append(Block(rows, columns, _pair(bits, 0)))
     for _ in range(fields.count()):
         value = fields.varint()
-        fields.require(value > 3, "a curve without points")
-        curves.append(Curve(value >> 2, bool(value & 2), bool(value & 1)))
+        fields.require(value > 3, "an interface without points")
+        interfaces.append(Interface(value >> 2, bool(value & 2), bool(value & 1)))
     for _ in range(fields.count(3)):
         number, flags, ends = fields.varint(), fields.u8(), fields.u8()
         fields.require(number < len(blocks) and flags < 128, "a part of no block, or of unknown flags")
@@ -188,46 +192,48 @@ def _arrangement(fields: Fields) -> tuple[list[Block], list[Curve], list[Part]]:
         told = [fields.varint() if ends & 16 << side else None for side in range(4)]
         sides = tuple(None if value is None else (value >> 1, bool(value & 1)) for value in told)
         clamped = (*_pair(ends, 0), *_pair(ends, 2))
-        parts.append(Part(number, _pair(flags, 0), _pair(flags, 2), _pair(flags, 4), clamped, sides, window))
-        _check_part(fields, parts[-1], block, curves)
-    fields.require({part.block for part in parts} == set(range(len(blocks))), "a block without a part")
-    return blocks, curves, parts
+        patches.append(Patch(number, _pair(flags, 0), _pair(flags, 2), _pair(flags, 4), clamped, sides, window))
+        _check_patch(fields, patches[-1], block, interfaces)
+    fields.require({patch.block for patch in patches} == set(range(len(blocks))), "a block without a patch")
+    return blocks, interfaces, patches
 
 
-def _check_part(fields: Fields, part: Part, block: Block, curves: list[Curve]) -> None:
+def _check_patch(fields: Fields, patch: Patch, block: Block, interfaces: list[Interface]) -> None:
     for axis, size in enumerate((block.rows, block.columns)):
-        first, count = part.window[axis]
+        first, count = patch.window[axis]
         # Cut once, an axis that wraps has its first line at both ends.
         fits = 0 < count <= size + block.closed[axis] and first + (0 if block.closed[axis] else count) <= size
         fields.require(fits, "a window beyond its block")
-        if part.closed[axis]:
-            free = not any(part.clamped[2 * axis : 2 * axis + 2])
+        if patch.closed[axis]:
+            free = not any(patch.clamped[2 * axis : 2 * axis + 2])
             fields.require(count == size and block.closed[axis] and free, "an axis wraps that cannot")
         along = 1 - axis
-        whole = part.window[along][1], part.stops[along], part.closed[along]
+        whole = patch.window[along][1], patch.stops[along], patch.closed[along]
         for side in (2 * axis, 2 * axis + 1):
-            if (source := part.curves[side]) is not None:
-                known = part.clamped[side] and source[0] < len(curves)
-                fields.require(known, "a side of no curve, or one that is not clamped")
-                curve = curves[source[0]]
-                fields.require(curve.length == 1 or curve == whole, "a curve unlike its side")
+            if (source := patch.interfaces[side]) is not None:
+                known = patch.clamped[side] and source[0] < len(interfaces)
+                fields.require(known, "a side of no interface, or one that is not clamped")
+                interface = interfaces[source[0]]
+                fields.require(interface.length == 1 or interface == whole, "an interface unlike its side")
 
 
-def _grids(curves: list[Curve], parts: list[Part]) -> list[Grid]:
-    axes = [(Axis(c.length, c.closed, (not c.closed, not c.closed)), Axis(1, False)) for c in curves]
+def _grids(interfaces: list[Interface], patches: list[Patch]) -> list[Grid]:
+    axes = [(Axis(c.length, c.closed, (not c.closed, not c.closed)), Axis(1, False)) for c in interfaces]
     axes += [
         (Axis(p.window[0][1], p.closed[0], p.clamped[:2]), Axis(p.window[1][1], p.closed[1], p.clamped[2:]))
-        for p in parts
+        for p in patches
     ]
-    chains = levels_of(axes, [(curve.stops, False) for curve in curves] + [part.stops for part in parts])
-    held = common_ends(curves, parts)
-    left_out: list[Any] = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(curves))]
-    left_out += [tuple(side is not None for side in part.curves) for part in parts]
-    return [Grid(n < len(curves), chain, out) for n, (chain, out) in enumerate(zip(chains, left_out, strict=True))]
+    chains = levels_of(
+        axes, [(interface.stops, False) for interface in interfaces] + [patch.stops for patch in patches]
+    )
+    held = common_ends(interfaces, patches)
+    left_out: list[Any] = [((n, 0) in held, (n, 1) in held, False, False) for n in range(len(interfaces))]
+    left_out += [tuple(side is not None for side in patch.interfaces) for patch in patches]
+    return [Grid(n < len(interfaces), chain, out) for n, (chain, out) in enumerate(zip(chains, left_out, strict=True))]
 
 
-def common_ends(curves: list[Curve], parts: list[Part]) -> dict[End, End]:
-    """Find the ends of curves that another end holds, and which does."""
+def common_ends(interfaces: list[Interface], patches: list[Patch]) -> dict[End, End]:
+    """Find the ends of interfaces that another end holds, and which does."""
     same: dict[End, End] = {}
 
     def first(end: End) -> End:
@@ -235,12 +241,12 @@ def common_ends(curves: list[Curve], parts: list[Part]) -> dict[End, End]:
             end = same[end]
         return end
 
-    for part, down, across in product(parts, (0, 1), (0, 1)):
+    for patch, down, across in product(patches, (0, 1), (0, 1)):
         met = []
-        for side, along in ((part.curves[down], across), (part.curves[2 + across], down)):
-            if side is not None and not any(part.closed):
-                curve, turned = side
-                met.append(first((curve, (along ^ turned) if curves[curve].length > 1 else 0)))
+        for side, along in ((patch.interfaces[down], across), (patch.interfaces[2 + across], down)):
+            if side is not None and not any(patch.closed):
+                interface, turned = side
+                met.append(first((interface, (along ^ turned) if interfaces[interface].length > 1 else 0)))
         if len(met) == 2 and met[0] != met[1]:
             same[max(met)] = min(met)
     return {end: first(end) for end in same}

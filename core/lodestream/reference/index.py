@@ -1,4 +1,4 @@
-"""Where all sections, segments and pieces stand: sections 11 and 12 of docs/format.md."""
+"""Where all sections, segments and chunks stand: sections 11 and 12 of docs/format.md."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ PAGE = 256
 
 @dataclass(frozen=True)
 class Entry:
-    """A segment or a piece.
+    """A segment or a chunk.
 
     `start`, `length` (int): where it stands in the container; `check` (int): the lower half of its CRC; `unit`,
-    `passes`, `top` (int): of a segment; 0 of a piece.
+    `passes`, `top` (int): of a segment; 0 of a chunk.
     """
 
     start: int
@@ -31,7 +31,7 @@ class Entry:
         """Take it out of a container; raises CorruptStreamError if its check does not fit."""
         found = data[self.start : self.start + self.length]
         if len(found) != self.length or (self.length and crc(found) & 0xFFFF != self.check):
-            raise CorruptStreamError("the CRC of a segment or piece is another one", self.start)
+            raise CorruptStreamError("the CRC of a segment or chunk is another one", self.start)
         return Segment(self.unit, self.passes, self.top, found)
 
 
@@ -40,14 +40,14 @@ class Index:
     """The index.
 
     `layer_errors`, `level_errors` (list of Errors): after each layer, and of each level; `segments` (list of list of
-    Entry): for each layer its segments by rising number of the unit; `pieces` (list of Entry): in the order of the
-    exactness section; `optional` (list of (int, int, int)): of each optional section its kind, offset and length.
+    Entry): for each layer its segments by rising number of the unit; `chunks` (list of Entry): in the order of the
+    residual section; `optional` (list of (int, int, int)): of each optional section its kind, offset and length.
     """
 
     layer_errors: list[Errors]
     level_errors: list[Errors]
     segments: list[list[Entry]]
-    pieces: list[Entry]
+    chunks: list[Entry]
     optional: list[tuple[int, int, int]]
 
 
@@ -100,7 +100,7 @@ def read_index(data: bytes, container: Container) -> Index:
     parts = [[_page(book, *entry) for entry in table] for table in tables]
     book.end()
     segments = _segments(parts[0], container, [ends[layer] - 4 for layer in range(header.layers)])
-    return Index(layer_errors, level_errors, segments, _pieces(parts[1], container, ends[-3] - 4), directory)
+    return Index(layer_errors, level_errors, segments, _chunks(parts[1], container, ends[-3] - 4), directory)
 
 
 def _page(book: Fields, length: int, told: int) -> Fields:
@@ -146,8 +146,8 @@ def _segments(pages: list[Fields], container: Container, ends: list[int]) -> lis
     return found
 
 
-def _pieces(pages: list[Fields], container: Container, end: int) -> list[Entry]:
-    """Read the pages of pieces; `end` is where the pieces end."""
+def _chunks(pages: list[Fields], container: Container, end: int) -> list[Entry]:
+    """Read the pages of chunks; `end` is where the chunks end."""
     count = len(windows_of(container.header, container.masks))
     found: list[Entry] = []
     place = end
@@ -162,5 +162,5 @@ def _pieces(pages: list[Fields], container: Container, end: int) -> list[Entry]:
             place += length
         fields.end()
     if place != end:
-        raise CorruptStreamError("pieces of the index do not fill their section", end)
+        raise CorruptStreamError("chunks of the index do not fill their section", end)
     return found

@@ -97,11 +97,11 @@ class LargeUnit:
         self.next = 0
         self.probabilities = np.array(STARTS, np.int64)
         self.counts = np.full(len(STARTS), COUNT, np.int64)
-        self.chances = self._chances()
+        self.scaled = self._scaled()
 
-    def _chances(self) -> list[int]:
-        chances: list[int] = np.maximum(self.probabilities >> 4, 1).tolist()
-        return chances
+    def _scaled(self) -> list[int]:
+        scaled: list[int] = np.maximum(self.probabilities >> 4, 1).tolist()
+        return scaled
 
     def decode(self, data: bytes, passes: int) -> None:
         """Decode the next passes from a segment."""
@@ -214,10 +214,10 @@ class LargeUnit:
     def read(self, contexts: list[int]) -> list[int]:
         """Read a decision in each of these contexts."""
         x, y = self.states
-        words, position, chances = self.words, self.next, self.chances
+        words, position, scaled = self.words, self.next, self.scaled
         bits = []
         for context in contexts:
-            q = chances[context]
+            q = scaled[context]
             r = x & 4095
             if r < q:
                 bits.append(1)
@@ -241,4 +241,4 @@ class LargeUnit:
         step = (65536 * t - k * self.probabilities) * ((1 << 17) // (2 * (self.counts + k) + 1))
         self.probabilities = self.probabilities + (step >> 16)
         self.counts = np.minimum(self.counts + k, 127)
-        self.chances = self._chances()
+        self.scaled = self._scaled()

@@ -45,14 +45,14 @@ class Axis:
 
 @dataclass(frozen=True)
 class Grid:
-    """One curve or part.
+    """One interface or patch.
 
-    `curve` (bool): it is a curve: its second axis has one sample; `axes` (list of (Axis, Axis)): both axes at every
-    level, from 0 to L; `left_out` ((bool, bool, bool, bool)): nodes of a coordinate that come from elsewhere: of a part
-    in its first row, last row, first column, last column; of a curve at level 0 its first and its last.
+    `interface` (bool): it is an interface: its second axis has one sample; `axes` (list of (Axis, Axis)): both axes at
+    every level, from 0 to L; `left_out` ((bool, bool, bool, bool)): nodes of a coordinate that come from elsewhere: of
+    a patch in its first row, last row, first column, last column; of an interface at level 0 its first and its last.
     """
 
-    curve: bool
+    interface: bool
     axes: list[tuple[Axis, Axis]]
     left_out: tuple[bool, bool, bool, bool] = field(default=(False, False, False, False))
 
@@ -68,7 +68,7 @@ class Grid:
     def kept(self, level: int, axis: int) -> tuple[int, int]:
         """Which nodes along an axis a coordinate's bands of a level hold: the first, and behind the last."""
         count = self.shape(max(level - 1, 0))[axis]
-        if self.curve and (level > 0 or axis == 1):
+        if self.interface and (level > 0 or axis == 1):
             return 0, count
         first, last = self.left_out[2 * axis : 2 * axis + 2]
         return int(first), max(count - last, int(first))
@@ -97,20 +97,20 @@ def levels_of(axes: list[tuple[Axis, Axis]], stops: list[tuple[bool, bool]]) -> 
             chain.append(lower)
 
 
-def fitted_steps(grids: list[Grid], curves: bool) -> list[tuple[int, int]]:
+def fitted_steps(grids: list[Grid], interfaces: bool) -> list[tuple[int, int]]:
     """List the steps for which a channel has predictors.
 
-    `grids` (list of Grid): all grids; `curves` (bool): whether those of curves count: for coordinates, not for
-    attributes. Returns list of (int, int): lower level of the step, and 0, 1 for the axes of parts, 2 for curves; in
-    the order of the header.
+    `grids` (list of Grid): all grids; `interfaces` (bool): whether those of interfaces count: for coordinates, not for
+    attributes. Returns list of (int, int): lower level of the step, and 0, 1 for the axes of patches, 2 for interfaces;
+    in the order of the header.
     """
-    kinds = [(0, False, 0), (1, False, 1)] + ([(2, True, 0)] if curves else [])
+    kinds = [(0, False, 0), (1, False, 1)] + ([(2, True, 0)] if interfaces else [])
     return [
         (level, kind)
         for level in range(len(grids[0].axes) - 1)
-        for kind, of_curves, axis in kinds
+        for kind, of_interfaces, axis in kinds
         if any(
-            grid.curve == of_curves and grid.stepped(level + 1, axis) and grid.axes[level + 1][axis].run >= 24
+            grid.interface == of_interfaces and grid.stepped(level + 1, axis) and grid.axes[level + 1][axis].run >= 24
             for grid in grids
         )
     ]

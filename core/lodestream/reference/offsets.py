@@ -1,4 +1,4 @@
-"""Pieces of exactness by offsets from multiples of a step: section 9.3 of docs/format.md."""
+"""Chunks of residual by offsets from multiples of a step: section 9.3 of docs/format.md."""
 
 from struct import Struct
 from typing import Any
@@ -37,7 +37,7 @@ def place_of(value: float) -> int:
 
 
 def read_offsets(values: NDArray[Any], fields: Fields, bits: int) -> NDArray[Any]:
-    """Restore the float32 values (n,) of a piece; `bits` is B, and `fields` stand behind the first byte."""
+    """Restore the float32 values (n,) of a chunk; `bits` is B, and `fields` stand behind the first byte."""
     step = fields.number("d")
     if not 0 < step < float("inf"):
         raise fields.damaged("a step of offsets is not above 0")
@@ -81,6 +81,6 @@ def read_offsets(values: NDArray[Any], fields: Fields, bits: int) -> NDArray[Any
         intervals.insert(0, (bottom, top))
         restored.append(place)
     if coder.surplus:
-        raise fields.damaged("a piece of offsets has more bytes than decoding reads")
+        raise fields.damaged("a chunk of offsets has more bytes than decoding reads")
     found = np.clip(np.array(restored, np.int64), -(1 << 31), (1 << 31) - 1)
     return np.where(found < 0, 0x80000000 | (-1 - found), found).astype(np.uint32).view(np.float32)

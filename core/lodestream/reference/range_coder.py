@@ -30,8 +30,8 @@ class RangeCoder:
         """Decode a bit in a context, which adapts."""
         probability = self.probabilities[context]
         count = self.counts[context]
-        chance = probability >> 4
-        bound = (self.width >> 16) * (32 if chance < 32 else chance if chance < 65504 else 65504)
+        scaled = probability >> 4
+        bound = (self.width >> 16) * (32 if scaled < 32 else scaled if scaled < 65504 else 65504)
         if self.low < bound:
             width = bound
             self.probabilities[context] = probability + ((1048575 - probability) * RATES[count] >> 16)

@@ -21,7 +21,7 @@ def reconstruct(
     `header` (Header): of the container; `channel` (int): number of the channel; `level` (int): the level that is made,
     K; `whole` (int): the largest level up to which all coefficients are known, F, at most K; `coefficients` (callable):
     gives those of a tile and channel, one int64 array for each share. Returns list of int64 (rows, columns): q of each
-    grid, in eighths if F < K; of an attribute's curves nothing of meaning.
+    grid, in eighths if F < K; of an attribute's interfaces nothing of meaning.
     """
     grids, coordinate = header.grids, channel < header.coordinates
     arrays = [np.zeros(grid.shape(level), np.int64) for grid in grids]
@@ -37,24 +37,24 @@ def reconstruct(
         _copy_ends(header, arrays)
     for upper in range(1, level + 1):
         for number, (grid, array) in enumerate(zip(grids, arrays, strict=True)):
-            if grid.curve and not coordinate:
+            if grid.interface and not coordinate:
                 continue
             nodes = grid.shape(upper - 1)
             if upper == whole + 1:
                 lower = array[: nodes[0], : nodes[1]]
                 lower[:] = 8 * np.clip(lower, -(1 << 24), 1 << 24)
-            if coordinate and not grid.curve:
+            if coordinate and not grid.interface:
                 _details_of_sides(header, channel, upper, number, arrays)
             rows, columns = grid.shape(upper)
             for axis in (1, 0):
                 if grid.stepped(upper, axis):
-                    part = array[:rows, :columns]
+                    patch = array[:rows, :columns]
                     line = grid.axes[upper][axis]
                     pair = _pair(header, channel, upper, number, axis)
                     if axis:
-                        part[:] = inverse(np.ascontiguousarray(part.T), line, pair).T
+                        patch[:] = inverse(np.ascontiguousarray(patch.T), line, pair).T
                     else:
-                        part[:] = inverse(part, line, pair)
+                        patch[:] = inverse(patch, line, pair)
     return arrays
 
 
@@ -63,11 +63,11 @@ def _pair(header: Header, channel: int, upper: int, number: int, axis: int) -> t
     grid = header.grids[number]
     if grid.axes[upper][axis].run < 24:
         return 16, 0
-    return header.predictors[channel][upper - 1, 2 if grid.curve else axis]
+    return header.predictors[channel][upper - 1, 2 if grid.interface else axis]
 
 
 def _copy_ends(header: Header, arrays: list[Array]) -> None:
-    """Copy points of level 0 from ends that hold them, and from curves to the sides of parts."""
+    """Copy points of level 0 from ends that hold them, and from interfaces to the sides of patches."""
     grids = header.grids
 
     def place(end: tuple[int, int]) -> int:
@@ -75,12 +75,12 @@ def _copy_ends(header: Header, arrays: list[Array]) -> None:
 
     for end, holder in sorted(header.holders.items()):
         arrays[end[0]][place(end), 0] = arrays[holder[0]][place(holder), 0]
-    for number, part in enumerate(header.parts, len(header.curves)):
+    for number, patch in enumerate(header.patches, len(header.interfaces)):
         rows, columns = grids[number].shape(0)
-        for side, source in enumerate(part.curves):
+        for side, source in enumerate(patch.interfaces):
             if source is not None:
-                curve, turned = source
-                points = arrays[curve][: grids[curve].shape(0)[0], 0]
+                interface, turned = source
+                points = arrays[interface][: grids[interface].shape(0)[0], 0]
                 target = (0, rows - 1, 0, columns - 1)[side]
                 line = points[::-1] if turned else points
                 if side < 2:
@@ -90,17 +90,17 @@ def _copy_ends(header: Header, arrays: list[Array]) -> None:
 
 
 def _details_of_sides(header: Header, channel: int, upper: int, number: int, arrays: list[Array]) -> None:
-    """Compute the details along the sides of a part that come from curves."""
+    """Compute the details along the sides of a patch that come from interfaces."""
     grid, array = header.grids[number], arrays[number]
     nodes, shape = grid.shape(upper - 1), grid.shape(upper)
-    for side, source in enumerate(header.parts[number - len(header.curves)].curves):
+    for side, source in enumerate(header.patches[number - len(header.interfaces)].interfaces):
         along = 1 if side < 2 else 0
         if source is None or not grid.stepped(upper, along):
             continue
-        curve, turned = source
+        interface, turned = source
         found: Array | int = 0
-        if header.curves[curve].length > 1:
-            points = arrays[curve][: shape[along]]
+        if header.interfaces[interface].length > 1:
+            points = arrays[interface][: shape[along]]
             points = points[::-1] if turned else points
             found = details(points, grid.axes[upper][along], _pair(header, channel, upper, number, along))[:, 0]
         target = nodes[1 - along] - 1 if side & 1 else 0
@@ -139,18 +139,18 @@ def to_type(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 def places(header: Header, block: int, level: int) -> tuple[list[NDArray[np.int64]], list[tuple[int, Any]]]:
     """Find where the nodes of a level stand in a block.
 
-    Returns `lines` (list of int64): the block's rows, and columns, at which nodes stand; `parts` (list of (int,
-    index)): number of each part's grid, and where its nodes lie in the block's grid of the level.
+    Returns `lines` (list of int64): the block's rows, and columns, at which nodes stand; `patches` (list of (int,
+    index)): number of each patch's grid, and where its nodes lie in the block's grid of the level.
     """
     sizes = header.blocks[block].rows, header.blocks[block].columns
     found = []
-    for number, part in enumerate(header.parts, len(header.curves)):
-        if part.block == block:
+    for number, patch in enumerate(header.patches, len(header.interfaces)):
+        if patch.block == block:
             stands = []
             for axis, size in enumerate(sizes):
-                first, count = part.window[axis]
+                first, count = patch.window[axis]
                 place = positions(header.grids[number], axis, level)
-                place = count - 1 - place if part.reverse[axis] else place
+                place = count - 1 - place if patch.reverse[axis] else place
                 stands.append((first + place) % size)
             found.append((number, stands))
     lines = [np.unique(np.concatenate([stands[axis] for _, stands in found])) for axis in (0, 1)]

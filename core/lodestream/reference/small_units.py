@@ -210,8 +210,8 @@ class SmallUnit:
                 continue
             while True:  # once for the bit, and once more for a sign
                 probability, count = probabilities[context], counts[context]
-                chance = probability >> 4
-                bound = (width >> 16) * (32 if chance < 32 else chance if chance < 65504 else 65504)
+                scaled = probability >> 4
+                bound = (width >> 16) * (32 if scaled < 32 else scaled if scaled < 65504 else 65504)
                 bit = low < bound
                 if bit:
                     width = bound

@@ -44,16 +44,16 @@ class Tile:
 
 
 def groups_of(grids: list[Grid], points: int) -> list[list[list[int]]]:
-    """Give the groups of grids of the levels 0 to L; `points` is the most that several parts may have together."""
+    """Give the groups of grids of the levels 0 to L; `points` is the most that several patches may have together."""
     above = [[number] for number in range(len(grids))]
     found = []
     for level in range(len(grids[0].axes) - 1, 0, -1):
         size = [int(np.prod(grid.shape(level), dtype=object)) for grid in grids]
         groups: list[list[int]] = []
         for group in above:
-            if groups and grids[group[0]].curve == grids[groups[-1][0]].curve:
+            if groups and grids[group[0]].interface == grids[groups[-1][0]].interface:
                 joined = groups[-1] + group
-                if grids[group[0]].curve or sum(size[number] for number in joined) <= points:
+                if grids[group[0]].interface or sum(size[number] for number in joined) <= points:
                     groups[-1] = joined
                     continue
             groups.append(group)
@@ -70,7 +70,7 @@ def tiles_of(grids: list[Grid], tile: tuple[int, int]) -> list[Tile]:
     for level, groups in enumerate(groups_of(grids, 1 << (sum(tile) + 2))):
         for group in groups if level else []:
             cuts = [whole, whole]
-            if len(group) == 1 and not grids[group[0]].curve:
+            if len(group) == 1 and not grids[group[0]].interface:
                 nodes = grids[group[0]].shape(level - 1)
                 cuts = [_cut(nodes[axis], 1 << tile[axis]) for axis in (0, 1)]
             for number in group:
@@ -100,7 +100,7 @@ def _shares(
     for attribute, shares in enumerate(found):
         for number in group:
             grid = grids[number]
-            if attribute and grid.curve:
+            if attribute and grid.interface:
                 continue
             for kind in ((0, 1), (1, 0), (1, 1)) if level else ((0, 0),):
                 spans = []
@@ -137,13 +137,13 @@ class Parents:
     def look(self, magnitude: NDArray[np.int32], plane: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Read the parents at a plane.
 
-        `magnitude` (int32 (rows, columns)): of the parent's share; `plane` (int): the plane of the pass. Returns `part`
-        (int32 (rows, columns)): the parents' part of section 7.4, for each coefficient of the share; `parent` (int32
-        (rows, columns)): the parents' magnitudes, shifted right by the plane.
+        `magnitude` (int32 (rows, columns)): of the parent's share; `plane` (int): the plane of the pass. Returns
+        `patch` (int32 (rows, columns)): the parents' patch of section 7.4, for each coefficient of the share; `parent`
+        (int32 (rows, columns)): the parents' magnitudes, shifted right by the plane.
         """
         near = np.pad(magnitude >> plane, 2)
-        part = 3 * np.minimum(near, 4)
+        patch = 3 * np.minimum(near, 4)
         around = near[1:-1, :-2] + near[1:-1, 2:] + near[:-2, 1:-1] + near[2:, 1:-1]
-        part[1:-1, 1:-1] += np.minimum(around, 12)
+        patch[1:-1, 1:-1] += np.minimum(around, 12)
         place = np.ix_(*self.index)
-        return part[place], near[place]
+        return patch[place], near[place]

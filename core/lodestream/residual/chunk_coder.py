@@ -1,6 +1,6 @@
-"""What the lattice leaves out: pieces that turn restored values into the original ones, bit for bit.
+"""What the lattice leaves out: chunks that turn restored values into the original ones, bit for bit.
 
-A piece follows the rule that takes the fewest bytes: the values themselves, differences on a line of whole numbers
+A chunk follows the rule that takes the fewest bytes: the values themselves, differences on a line of whole numbers
 (`number_line`, `differences`) by patterns or by decimals, or offsets that repeat (`offsets`).
 """
 
@@ -16,7 +16,7 @@ from .differences import code_differences, most_bits
 from .number_line import DECIMALS, MOST_DECIMALS, PATTERNS, common_zeros, decimal_places, from_line, to_line
 from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
-__all__ = ["agree", "decode_piece", "encode_piece"]
+__all__ = ["agree", "decode_chunk", "encode_chunk"]
 
 #: The rules beside those of the line.
 _RAW, _OFFSETS = 0, 3
@@ -24,7 +24,7 @@ _RAW, _OFFSETS = 0, 3
 _MOST_SPECIALS = 15
 
 
-def encode_piece(original: NDArray[Any], restored: NDArray[Any], step: float | None = None) -> bytes:
+def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | None = None) -> bytes:
     """What turns restored values into the original ones.
 
     Parameters
@@ -63,8 +63,8 @@ def agree(original: NDArray[Any], restored: NDArray[Any]) -> bool:
     return np.array_equal(original.view(unsigned), restored.view(unsigned))
 
 
-def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[Any]:
-    """Undo `encode_piece`; takes memory in proportion to ``restored``, shape (value,), whatever the data.
+def decode_chunk(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[Any]:
+    """Undo `encode_chunk`; takes memory in proportion to ``restored``, shape (value,), whatever the data.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
         return restored.copy()
     if len(data) > 1 + restored.nbytes:
         raise CorruptStreamError(
-            f"expected at most {1 + restored.nbytes} bytes of exactness for {restored.size} values, got {len(data)}",
+            f"expected at most {1 + restored.nbytes} bytes of residual for {restored.size} values, got {len(data)}",
             offset,
         )
     dtype = restored.dtype
@@ -89,14 +89,14 @@ def decode_piece(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
         return _decoded_offsets(restored, data, argument, offset)
     limit = 8 * dtype.itemsize - 1 if rule == PATTERNS else MOST_DECIMALS
     if rule == _RAW or argument > limit or (rule == DECIMALS and dtype.kind != "f"):
-        raise CorruptStreamError(f"expected a rule of exactness for {dtype} values, got {data[0]}", offset)
+        raise CorruptStreamError(f"expected a rule of residual for {dtype} values, got {data[0]}", offset)
     packed = int.from_bytes(data[1:3], "little")
     most, count = packed & 4095, packed >> 12
     first = 3 + count * dtype.itemsize
     length, start_of_coded = _read_length(data, first)
     end = start_of_coded + length
     if len(data) < end:
-        raise CorruptStreamError(f"expected exactness of at least {end} bytes, got {len(data)}", offset + len(data))
+        raise CorruptStreamError(f"expected residual of at least {end} bytes, got {len(data)}", offset + len(data))
     specials = np.frombuffer(data, unsigned, count, 3).astype(unsigned.newbyteorder("="))
     line, exponents = to_line(rule, argument, restored)
     differences, marks = np.empty(restored.size, np.int64), np.zeros(restored.size, np.uint8)
@@ -150,14 +150,14 @@ def _with_offsets(original: NDArray[Any], restored: NDArray[Any], step: float) -
 
 def _decoded_offsets(restored: NDArray[Any], data: bytes, bits: int, offset: int) -> NDArray[Any]:
     if restored.dtype != np.float32 or bits > MOST_BITS or len(data) < 9:
-        raise CorruptStreamError(f"expected a rule of exactness for {restored.dtype} values, got {data[0]}", offset)
+        raise CorruptStreamError(f"expected a rule of residual for {restored.dtype} values, got {data[0]}", offset)
     step = float(np.frombuffer(data, "<f8", 1, 1)[0])
     if not (np.isfinite(step) and step > 0):
         raise CorruptStreamError(f"expected a step above 0, got {step}", offset + 1)
     places = np.zeros(restored.size, np.int64)
     read = code_offsets(True, restored, step, bits, places, np.frombuffer(data[9:], np.uint8).copy())
     if len(data) - 9 > read:
-        raise CorruptStreamError(f"expected at most {9 + read} bytes of exactness, got {len(data)}", offset + 9 + read)
+        raise CorruptStreamError(f"expected at most {9 + read} bytes of residual, got {len(data)}", offset + 9 + read)
     return values_at(places)
 
 

@@ -39,7 +39,7 @@ def code_differences(
     line, exponents
         Of the restored values, as `number_line.to_line` gives them.
     marks : uint8 array of shape (value,)
-        For values that are on no line their number in the piece's list, from 1; else 0.
+        For values that are on no line their number in the chunk's list, from 1; else 0.
     most : int
         What `most_bits` says.
     specials : int

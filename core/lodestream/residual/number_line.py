@@ -1,6 +1,6 @@
 """Values as places on a line of whole numbers, in the order of what they stand for.
 
-By the rule of patterns these are their bit patterns, less the zeros at the end that all patterns of a piece have; by
+By the rule of patterns these are their bit patterns, less the zeros at the end that all patterns of a chunk have; by
 the rule of decimals, their number of units of so many decimal places.
 """
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["DECIMALS", "MOST_DECIMALS", "PATTERNS", "common_zeros", "decimal_places", "from_line", "to_line"]
 
-#: The rules, as a piece of exactness names them; their arguments are how many zeros, and how many decimal places.
+#: The rules, as a chunk of residual names them; their arguments are how many zeros, and how many decimal places.
 PATTERNS, DECIMALS = 1, 2
 MOST_DECIMALS = 15
 _LARGEST_WHOLE = 2.0**53

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["RangeDownload", "RangeRequest"]
 
 # The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
-# pictures come with them, and more where it is known that more is wanted. The last ones, some and a share of the file,
-# hold index and metadata of most. Where they do not, one more request brings the rest.
+# reconstructions come with them, and more where it is known that more is wanted. The last ones, some and a share of the
+# file, hold index and metadata of most. Where they do not, one more request brings the rest.
 _HEAD = 4096
 _FIRST = MIN_WINDOW
 _FIRST_MOST = MAX_CREDIT
@@ -64,7 +64,7 @@ class RangeDownload:
     """Receiving a surface over HTTP Range: requests out, parts of the file in.
 
     The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
-    body, in pieces of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
+    body, in chunks of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
     breaks, it continues with the next `request`.
 
     Parameters
@@ -187,7 +187,7 @@ class RangeDownload:
         self.reception.identify(tag[1] if tag else None, size)
 
     def receive(self, chunk: bytes) -> list[DownloadEvent]:
-        """Take a piece of the body of an answer; returns the views that it completes.
+        """Take a chunk of the body of an answer; returns the views that it completes.
 
         Raises
         ------

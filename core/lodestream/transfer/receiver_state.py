@@ -155,10 +155,10 @@ class Reception:
     ) -> None:
         # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
         from ..decoding.decoder import Decoder
-        from ..planning.selection import wish_of
+        from ..planning.selection import selection_of
 
         self.target = Target() if target is None else target
-        self.decoder: Decoder = Decoder(wish_of(self.target), max_vertices=max_vertices, level=self.target.level)
+        self.decoder: Decoder = Decoder(selection_of(self.target), max_vertices=max_vertices, level=self.target.level)
         self.held = RangeSet() if store is None else store.ranges.copy()
         self.container = container
         self.size = size
@@ -406,7 +406,7 @@ class Reception:
         from ..container import ByteRange, index_from
         from ..container.reader import INDEX_GROWTH
         from ..decoding.decoder import Decoder
-        from ..planning.selection import wish_of
+        from ..planning.selection import selection_of
 
         store = self._store
         if store is None or not self._service or not store.ranges.covers(*self._service[0]):
@@ -415,7 +415,7 @@ class Reception:
         header = self.decoder.header
         if header is None:
             scratch = Decoder(
-                wish_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
+                selection_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
             )
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from ..grid.axis import AxisStep
 from ..grid.layout import Grid, Layout
 
-__all__ = ["COEFFICIENT_BITS", "CURVES", "FIT_NODES", "FOUR_POINT", "default_predictors", "fitted_steps", "predictor"]
+__all__ = [
+    "COEFFICIENT_BITS",
+    "FIT_NODES",
+    "FOUR_POINT",
+    "INTERFACES",
+    "default_predictors",
+    "fitted_steps",
+    "predictor",
+]
 
 #: A coefficient has at most so many magnitude bits.
 COEFFICIENT_BITS = 28
@@ -16,14 +24,14 @@ COEFFICIENT_BITS = 28
 FOUR_POINT = (16, 0)
 #: Nodes that an axis needs for an (a, b) of its own.
 FIT_NODES = 24
-#: Beside axis 0 and axis 1 of the parts: the axis of the curves.
-CURVES = 2
+#: Beside axis 0 and axis 1 of the patches: the axis of the interfaces.
+INTERFACES = 2
 
 
 def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
     """(coarser level, axis) of every step with an (a, b) of its own: along an axis 0 or 1 that is long enough.
 
-    All parts have it in common; all curves have another in common, whose axis is `CURVES`.
+    All patches have it in common; all interfaces have another in common, whose axis is `INTERFACES`.
     """
     found = []
     for level in range(layout.levels):
@@ -31,21 +39,21 @@ def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
         for number, grid in enumerate(layout.grids):
             for axis, step in enumerate(layout.steps(number, level + 1)):
                 if _is_fitted(step):
-                    fitted.add(CURVES if grid.curve else axis)
+                    fitted.add(INTERFACES if grid.interface else axis)
         found += [(level, axis) for axis in sorted(fitted)]
     return found
 
 
 def default_predictors(layout: Layout) -> NDArray[np.int8]:
     """What no container carries: (0, 0) for every step; int8, shape (level, axis, 2)."""
-    return np.zeros((layout.levels, CURVES + 1, 2), np.int8)
+    return np.zeros((layout.levels, INTERFACES + 1, 2), np.int8)
 
 
 def predictor(predictors: NDArray[np.int8], grid: Grid, step: AxisStep, level: int, axis: int) -> tuple[int, int]:
     """The (a, b) of a grid's step along an axis from ``level`` to the level below."""
     if not _is_fitted(step):
         return FOUR_POINT
-    a, b = (int(x) for x in predictors[level - 1, CURVES if grid.curve else axis])
+    a, b = (int(x) for x in predictors[level - 1, INTERFACES if grid.interface else axis])
     return a, b
 
 

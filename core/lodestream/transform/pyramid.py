@@ -1,8 +1,8 @@
 """The whole hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder.
 
-A channel has an array for each grid of the layout, see `lodestream.grid.layout`. A part whose side comes from a curve
-holds that side's points at every level: level 0 copies them, and the details along the side that the inverse needs are
-made by a forward step of the curve's points. Curves are therefore stepped first.
+A channel has an array for each grid of the layout, see `lodestream.grid.layout`. A patch whose side comes from an
+interface holds that side's points at every level: level 0 copies them, and the details along the side that the inverse
+needs are made by a forward step of the interface's points. Interfaces are therefore stepped first.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .. import kernels
 from ..grid.axis import AxisStep
 from ..grid.layout import Layout, Source
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
-from .predictors import CURVES, FIT_NODES, FOUR_POINT, default_predictors, fitted_steps, predictor
+from .predictors import FIT_NODES, FOUR_POINT, INTERFACES, default_predictors, fitted_steps, predictor
 
 __all__ = [
     "PADDING",
@@ -67,7 +67,7 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     Parameters
     ----------
     arrays : int32, shape (row, column), from `allocate`, one for each grid
-        Magnitudes of at most 2**24. Sides that come from curves hold the same points as these.
+        Magnitudes of at most 2**24. Sides that come from interfaces hold the same points as these.
     layout : Layout
     fit : bool
         Choose the third step's (a, b) by size for each level and axis that is long enough; otherwise (0, 0) there.
@@ -75,19 +75,19 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     Returns
     -------
     int8, shape (level, axis, 2)
-        (a, b) of the step from ``level + 1`` to ``level`` along axis 0 and 1 of the parts, and of the curves.
+        (a, b) of the step from ``level + 1`` to ``level`` along axis 0 and 1 of the patches, and of the interfaces.
     """
     predictors = default_predictors(layout)
     fitted = set(fitted_steps(layout))
     for level in range(layout.levels, 0, -1):
         for axis in range(2):
             corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
-            for which in (axis, CURVES) if axis == 0 else (axis,):
+            for which in (axis, INTERFACES) if axis == 0 else (axis,):
                 if fit and (level - 1, which) in fitted:
                     lines = [
                         (corner if axis == 0 else corner.T, layout.steps(k, level)[axis])
                         for k, corner in enumerate(corners)
-                        if layout.grids[k].curve == (which == CURVES)
+                        if layout.grids[k].interface == (which == INTERFACES)
                     ]
                     predictors[level - 1, which] = _fit(lines)
             for k, grid in enumerate(layout.grids):
@@ -117,9 +117,9 @@ def inverse(
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
 
-    Of a channel that is no ``coordinate`` no side comes from a curve, and curves mean nothing.
+    Of a channel that is no ``coordinate`` no side comes from an interface, and interfaces mean nothing.
     """
-    numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.curve]
+    numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
     if coordinate:
         take_nodes(arrays, layout)
     for finer in range(1, level + 1):
@@ -177,13 +177,13 @@ def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: t
 
 
 def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from curves, in place: their common ends first, then the sides of parts."""
+    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches."""
     for k, grid in enumerate(layout.grids):
         rows, columns = layout.shape(k, 0)
         for side, source in enumerate(grid.sources):
             if source is None:
                 continue
-            if grid.curve:
+            if grid.interface:
                 last = layout.shape(source.grid, 0)[0] - 1
                 arrays[k][0 if side == 0 else rows - 1, 0] = arrays[source.grid][last if source.reversed else 0, 0]
             else:
@@ -193,17 +193,17 @@ def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
 
 
 def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source, level: int) -> NDArray[np.int32]:
-    """Points of a curve at a level, in the order of the side that takes them."""
+    """Points of an interface at a level, in the order of the side that takes them."""
     points = arrays[source.grid][: layout.shape(source.grid, level)[0], 0]
     return points[::-1] if source.reversed else points
 
 
 def take_details(
-    arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], part: int, level: int
+    arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], patch: int, level: int
 ) -> None:
-    """The details along a part's sides that come from curves, in place: curves are at ``level`` already."""
-    grid, steps = layout.grids[part], layout.steps(part, level)
-    if grid.curve:
+    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already."""
+    grid, steps = layout.grids[patch], layout.steps(patch, level)
+    if grid.interface:
         return
     rows, columns = (step.coarse for step in steps)
     for side, source in enumerate(grid.sources):
@@ -212,7 +212,7 @@ def take_details(
         if source is None or not step.midpoints:
             continue
         place = (0, rows - 1, 0, columns - 1)[side]
-        target = arrays[part][place, : step.length] if side < 2 else arrays[part][: step.length, place]
+        target = arrays[patch][place, : step.length] if side < 2 else arrays[patch][: step.length, place]
         points = _points(arrays, layout, source, level)
         if points.size == 1:
             target[step.coarse :] = 0  # a pole
@@ -233,24 +233,24 @@ class _Sample(NamedTuple):
     details: NDArray[np.int32]
     largest: int
 
-    def parts(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
+    def patches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
         """Factors and details, so many as a kernel takes at once."""
         for start in range(0, self.details.size, _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            yield self.first[part], self.second[part], self.details[part]
+            patch = slice(start, start + _AT_ONCE)
+            yield self.first[patch], self.second[patch], self.details[patch]
 
     def bits(self, a: int, b: int) -> float:
         """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
         total = np.zeros(1)
-        for part in self.parts():
-            kernels.predictor_bits(*part, self.largest, a, b, total)
+        for patch in self.patches():
+            kernels.predictor_bits(*patch, self.largest, a, b, total)
         return float(total[0])
 
     def moments(self, a: float, b: float, weighted: bool) -> list[float]:
         """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
         sums = np.zeros(5)
-        for part in self.parts():
-            kernels.predictor_moments(*part, a, b, weighted, sums)
+        for patch in self.patches():
+            kernels.predictor_moments(*patch, a, b, weighted, sums)
         found: list[float] = sums.tolist()
         return found
 
@@ -294,9 +294,9 @@ def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sam
     largest, height = 0, max(1, _AT_ONCE // width)
     for start in range(0, count, height):
         stop = min(start + height, count)
-        part = slice(start * width, stop * width)
+        patch = slice(start * width, stop * width)
         planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
-        largest = max(largest, kernels.predictor_factors(*planes, first[part], second[part], details[part]))
+        largest = max(largest, kernels.predictor_factors(*planes, first[patch], second[patch], details[patch]))
     return _Sample(first, second, details, largest)
 
 
@@ -317,7 +317,7 @@ def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
     """Squared norms of what one unit of a coefficient of a grid adds to the surface, in the middle of the grid.
 
-    What a curve adds reaches into the parts beside it, as their nodes do.
+    What an interface adds reaches into the patches beside it, as their nodes do.
 
     Returns
     -------
@@ -326,12 +326,12 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
     """
     lines = _line_norms(layout, predictors, number)
     norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
-    if layout.grids[number].curve:
-        for part, grid in enumerate(layout.grids):
+    if layout.grids[number].interface:
+        for patch, grid in enumerate(layout.grids):
             for side, source in enumerate(grid.sources):
-                if source is not None and source.grid == number and not grid.curve:
+                if source is not None and source.grid == number and not grid.interface:
                     across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
-                    return norms * points * _line_norms(layout, predictors, part)[across, :, 0][:, None, None]
+                    return norms * points * _line_norms(layout, predictors, patch)[across, :, 0][:, None, None]
     return norms
 
 

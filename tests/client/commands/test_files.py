@@ -204,7 +204,7 @@ def test_info_of_a_file_elsewhere_is_that_of_the_file_here(
     assert asyncio.run(client.describe_file(url)) == here
 
 
-def test_pull_by_either_road_writes_the_same(
+def test_pull_by_either_transport_writes_the_same(
     run: Run, surface: str, url: str, tmp_path: Path, terrain: Terrain
 ) -> None:
     found: list[dict[str, Any]] = []
@@ -241,8 +241,8 @@ def test_a_server_below_a_path_behind_a_proxy(terrain_file: Path, terrain: Terra
         nginx(tmp_path, tmp_path / "work", server) as front,
     ):
         url = sync.upload(f"{front}/maps", terrain_file).url
-        roads: tuple[Transport, ...] = ("ws", "http")
-        for transport in roads:
+        transports: tuple[Transport, ...] = ("ws", "http")
+        for transport in transports:
             with sync.connect(url, transport=transport) as stream:
                 views = list(stream)
             assert (stream.ended, stream.transport) == ("complete", transport)

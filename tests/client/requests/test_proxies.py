@@ -42,7 +42,7 @@ def test_a_proxy_that_knows_no_upgrade(
     assert stream.transport == "http"
     assert stream.ended == "complete"
     assert np.array_equal(views[-1].points, terrain)
-    assert proxy.handshakes == 1, "the other road is taken at once"
+    assert proxy.handshakes == 1, "the other transport is taken at once"
     assert proxy.passed >= 1
 
 

@@ -1,4 +1,4 @@
-"""The focus of a stream over real sockets, by either road, while the link breaks."""
+"""The focus of a stream over real sockets, by either transport, while the link breaks."""
 
 from __future__ import annotations
 

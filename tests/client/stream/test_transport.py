@@ -1,4 +1,4 @@
-"""Which road is tried next, and after how long."""
+"""Which transport is tried next, and after how long."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from websockets.http11 import Response
 import lodestream as ls
 from lodestream.errors import LodestreamError, RemoteError
 from lodestream_client.errors import SilenceError, UnreachableError
-from lodestream_client.stream.transport import Roads, Transport
+from lodestream_client.stream.transport import Transport, Transports
 
 ONE, FILE = "http://one/v1/surfaces/ab", "http://three/ab.lode"
 LOST = UnreachableError("no connection")
@@ -31,12 +31,12 @@ def without_chance(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("random.uniform", lambda least, most: most / 2)
 
 
-def road(made: Roads) -> str:
-    return made.road
+def transport(made: Transports) -> str:
+    return made.transport
 
 
-def met(url: str, deadline: float = 60.0) -> Roads:
-    made = Roads(url, "auto", deadline)
+def met(url: str, deadline: float = 60.0) -> Transports:
+    made = Transports(url, "auto", deadline)
     made.met = True
     made.start(0.0)
     return made
@@ -49,26 +49,26 @@ def test_waits_grow_until_something_comes() -> None:
     assert made.failed(LOST, 5.0, progressed=False) == 0.4
 
 
-def test_a_road_that_leads_nowhere_is_left_for_the_other() -> None:
+def test_a_transport_that_leads_nowhere_is_left_for_the_other() -> None:
     made = met(ONE)
     made.failed(LOST, 0.0, progressed=True)
-    assert road(made) == "ws"
+    assert transport(made) == "ws"
     made.failed(SilenceError("nothing"), 0.0, progressed=False)
-    assert road(made) == "http"
+    assert transport(made) == "http"
     made.failed(LOST, 0.0, progressed=False)
-    assert road(made) == "ws"
+    assert transport(made) == "ws"
 
 
-def test_only_the_roads_that_are_allowed() -> None:
+def test_only_the_transports_that_are_allowed() -> None:
     only: tuple[Transport, ...] = ("ws", "http")
-    for transport in only:
-        made = Roads(ONE, transport, 60.0)
+    for kind in only:
+        made = Transports(ONE, kind, 60.0)
         made.met = True
         for _ in range(3):
-            assert road(made) == transport
+            assert transport(made) == kind
             made.failed(LOST, 0.0, progressed=False)
-    made = Roads(FILE, "auto", 60.0)
-    assert road(made) == "http"
+    made = Transports(FILE, "auto", 60.0)
+    assert transport(made) == "http"
 
 
 def test_the_deadline_counts_from_the_loss() -> None:
@@ -85,15 +85,15 @@ def test_the_deadline_counts_from_the_loss() -> None:
 
 @pytest.mark.parametrize("body", [b"", b"<html>", b"[]"])
 def test_a_proxy_that_refuses_sockets_is_gone_around_at_once(body: bytes) -> None:
-    made = Roads(ONE, "auto", 60.0)
+    made = Transports(ONE, "auto", 60.0)
     assert made.failed(refused(501, body), 0.0, progressed=False) == 0
-    assert road(made) == "http"
+    assert transport(made) == "http"
     with pytest.raises(RemoteError, match=r"gone wrong \(and by WebSocket: no\)"):
         made.failed(RemoteError("odd", "gone wrong"), 0.0, progressed=False)
 
 
 def test_what_the_server_itself_says_is_final() -> None:
-    made = Roads(ONE, "auto", 60.0)
+    made = Transports(ONE, "auto", 60.0)
     with pytest.raises(RemoteError):
         made.failed(refused(403, b'{"code": "bad-token"}'), 0.0, progressed=False)
     made = met(ONE)
@@ -105,10 +105,10 @@ def test_a_handshake_that_breaks_tells_nothing_once_another_did_not() -> None:
     broken = caused(ls.RemoteError("x", "broke"), caused_by_end())
     made = met(ONE)
     made.failed(caused(UnreachableError("broke"), caused_by_end()), 0.0, progressed=True)
-    assert road(made) == "ws"
-    made = Roads(ONE, "auto", 60.0)
+    assert transport(made) == "ws"
+    made = Transports(ONE, "auto", 60.0)
     assert made.failed(broken, 0.0, progressed=False) == 0
-    assert road(made) == "http"
+    assert transport(made) == "http"
 
 
 def caused_by_end() -> Exception:
@@ -118,7 +118,7 @@ def caused_by_end() -> Exception:
 
 
 def test_before_anybody_answered_there_are_three_attempts() -> None:
-    made = Roads(ONE, "ws", 60.0)
+    made = Transports(ONE, "ws", 60.0)
     made.start(0.0)
     made.failed(LOST, 0.0, progressed=False)
     made.failed(LOST, 0.0, progressed=False)
@@ -129,7 +129,7 @@ def test_before_anybody_answered_there_are_three_attempts() -> None:
 def test_what_no_other_attempt_mends_is_final() -> None:
     for error in (ls.NotFoundError("not here"), ls.OptionError("no such level")):
         with pytest.raises(type(error)):
-            Roads(ONE, "ws", 60.0).failed(error, 0.0, progressed=False)
+            Transports(ONE, "ws", 60.0).failed(error, 0.0, progressed=False)
 
 
 @pytest.mark.parametrize("code", ["restarting", "idle", "busy", "too-many", "internal", "http-502", "http-503"])

@@ -74,7 +74,7 @@ def sections_of(data: bytes) -> list[tuple[int, int]]:
         serialized = headers.serialize_header(replace(index.header, masked=False, holes=(), mask_data=()))
         places = [(8, len(serialized)), (len(serialized), index.layers[0].offset)]
     places += [(layer.offset, layer.end) for layer in index.layers]
-    for place in (index.exactness, index.metadata):
+    for place in (index.residual, index.metadata):
         if place is not None:
             places.append((place.offset, place.end))
     _, root = sections.parse_footer(data[tail:], tail)

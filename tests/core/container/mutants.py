@@ -21,10 +21,10 @@ class Anatomy:
 
     Attributes
     ----------
-    parts : list of (kind, payload)
+    patches : list of (kind, payload)
         All sections but the pages and the root of the index.
     lengths : list of int
-        Those in the root: layers, start, exactness, metadata.
+        Those in the root: layers, start, residual, metadata.
     errors : list of bytes
         Those in the root, of layers and then of levels.
     optional : list of (kind, offset, length)
@@ -32,7 +32,7 @@ class Anatomy:
     pages : two lists of bytes
     """
 
-    parts: list[tuple[int, bytes]]
+    patches: list[tuple[int, bytes]]
     lengths: list[int]
     errors: list[bytes]
     optional: list[tuple[int, int, int]]
@@ -69,7 +69,7 @@ class Anatomy:
     def built(self) -> bytes:
         """The container again."""
         out, root = bytearray(sections.SIGNATURE), FieldWriter()
-        for kind, payload in self.parts:
+        for kind, payload in self.patches:
             out += sections.section(kind, payload)
         start = len(out)
         out += sections.section(sections.PAGES, b"".join(self.pages[0] + self.pages[1]))
@@ -105,18 +105,18 @@ class Anatomy:
 
     def follow(self, number: int, payload: bytes) -> None:
         """Give a section another payload, and the root its length."""
-        kind, old = self.parts[number]
+        kind, old = self.patches[number]
         more = len(sections.section(kind, payload)) - len(sections.section(kind, old))
-        self.parts[number] = kind, payload
+        self.patches[number] = kind, payload
         layers = len(self.lengths) - 3
-        before = [other for other, _ in self.parts[:number]]
+        before = [other for other, _ in self.patches[:number]]
         if kind == sections.LAYER:
             self._longer(before.count(sections.LAYER), more)
-        elif kind in (sections.EXACTNESS, sections.METADATA):
+        elif kind in (sections.RESIDUAL, sections.METADATA):
             self._longer(layers + (2 if kind == sections.METADATA else 1), more)
         elif kind < 128:
             self._longer(layers, more)
-        where = len(sections.SIGNATURE) + sum(len(sections.section(*part)) for part in self.parts[:number])
+        where = len(sections.SIGNATURE) + sum(len(sections.section(*patch)) for patch in self.patches[:number])
         self.optional = [
             (k, max(0, at + more * (at > where)), max(0, length + more * (k == kind and at == where)))
             for k, at, length in self.optional
@@ -134,10 +134,10 @@ def mutant(data: bytes, channels: int, chance: random.Random) -> bytes:
     anatomy = Anatomy.of(data, channels)
 
     def payload() -> None:
-        number = chance.randrange(len(anatomy.parts))
+        number = chance.randrange(len(anatomy.patches))
         if chance.random() < 0.5:  # those of which there are few
-            number = chance.choice([k for k, (kind, _) in enumerate(anatomy.parts) if kind != sections.LAYER])
-        anatomy.follow(number, mutate(anatomy.parts[number][1], chance))
+            number = chance.choice([k for k, (kind, _) in enumerate(anatomy.patches) if kind != sections.LAYER])
+        anatomy.follow(number, mutate(anatomy.patches[number][1], chance))
 
     def page() -> None:
         pages = anatomy.pages[chance.random() < 0.4] or anatomy.pages[0]
@@ -168,16 +168,16 @@ def mutant(data: bytes, channels: int, chance: random.Random) -> bytes:
         anatomy.optional[number] = entry[0], entry[1], entry[2]
 
     def exchanged() -> None:
-        one, other = (chance.randrange(len(anatomy.parts)) for _ in range(2))
-        anatomy.parts[one], anatomy.parts[other] = anatomy.parts[other], anatomy.parts[one]
+        one, other = (chance.randrange(len(anatomy.patches)) for _ in range(2))
+        anatomy.patches[one], anatomy.patches[other] = anatomy.patches[other], anatomy.patches[one]
 
     def repeated() -> None:
-        number = chance.randrange(len(anatomy.parts))
-        anatomy.parts.insert(number, anatomy.parts[number])
+        number = chance.randrange(len(anatomy.patches))
+        anatomy.patches.insert(number, anatomy.patches[number])
 
     def kind() -> None:
-        number = chance.randrange(len(anatomy.parts))
-        anatomy.parts[number] = chance.choice((1, 2, 3, 4, 6, 7, 128, 200)), anatomy.parts[number][1]
+        number = chance.randrange(len(anatomy.patches))
+        anatomy.patches[number] = chance.choice((1, 2, 3, 4, 6, 7, 128, 200)), anatomy.patches[number][1]
 
     changes: list[Callable[[], None]] = [payload] * 4 + [page] * 4 + [length, count, errors, optional] * 2
     for change in chance.choices([*changes, exchanged, repeated, kind], k=chance.choice((1, 1, 1, 2))):

@@ -19,7 +19,7 @@ from lodestream.container.capacity import Capacity, memory_limit
 from lodestream.container.model import Errors
 from lodestream.errors import TooLargeError
 from lodestream.grid.layout import Layout
-from lodestream.planning.selection import Wish
+from lodestream.planning.selection import Selection
 from lodestream.target import Target
 from lodestream.transfer.range_download import RangeDownload
 from lodestream.transfer.receiver_state import Reception
@@ -126,14 +126,14 @@ def test_attributes_count_by_their_bytes() -> None:
     with pytest.raises(TooLargeError):
         ls.decode(rich, max_vertices=enough - 1)
     # Of what is not wanted nothing is counted.
-    decoder = ls.Decoder(Wish(None, ("a3",)), max_vertices=120_000)
+    decoder = ls.Decoder(Selection(None, ("a3",)), max_vertices=120_000)
     decoder.feed(rich)
     assert decoder.complete
 
 
 def test_a_window_and_a_coarse_level_count_by_themselves() -> None:
     data = empty()
-    window = ls.Decoder(Wish(((0, 100), (0, 100))), max_vertices=1_000_000)
+    window = ls.Decoder(Selection(((0, 100), (0, 100))), max_vertices=1_000_000)
     window.feed(data)
     assert window.surface().points.shape == (100, 100)
     coarse = ls.Decoder(level=5, max_vertices=1_000_000)
@@ -201,7 +201,7 @@ def test_by_parts_of_a_file_too() -> None:
         serve()
 
 
-def test_pieces_that_nobody_can_use_are_bounded() -> None:
+def test_chunks_that_nobody_can_use_are_bounded() -> None:
     reception = Reception(max_vertices=1000)
     reception.decoder.capacity.bytes = 100_000
     reception.keep()

@@ -69,7 +69,7 @@ def lying_header(shape: tuple[int, int], channels: int = 1, **changes: Any) -> b
     out.varint(channels)
     out.varint(changes.get("layers", 1))
     out.byte(changes.get("tile", 7 | 7 << 4))
-    out.byte(changes.get("piece", 6 | 6 << 4))
+    out.byte(changes.get("chunk", 6 | 6 << 4))
     out.byte(changes.get("large", 0))
     out.varint(changes.get("base", 0))
     out.number(changes.get("extent", 1.0))
@@ -144,7 +144,7 @@ def test_random_access_refuses_what_is_damaged_or_cut(name: str) -> None:
         index_of(container + b"\0")
 
 
-@pytest.mark.parametrize("sizes", [{}, {"tile": 4 | 4 << 4, "piece": 8 | 8 << 4}, {"tile": 15 | 1 << 4}])
+@pytest.mark.parametrize("sizes", [{}, {"tile": 4 | 4 << 4, "chunk": 8 | 8 << 4}, {"tile": 15 | 1 << 4}])
 def test_a_header_that_does_not_lie_is_read(sizes: dict[str, int]) -> None:
     decoder = Decoder()
     decoder.feed(lying_header((5, 5), **sizes))
@@ -171,10 +171,10 @@ def test_a_header_that_does_not_lie_is_read(sizes: dict[str, int]) -> None:
         (lying_header((5, 5), tile=14), "expected tiles"),
         (lying_header((5, 5), tile=3 | 4 << 4), "expected tiles"),
         (lying_header((5, 5), tile=9 | 8 << 4), "expected tiles"),
-        (lying_header((5, 5), piece=12), "expected pieces"),
-        (lying_header((5, 5), piece=3 | 4 << 4), "expected pieces"),
-        (lying_header((5, 5), piece=9 | 8 << 4), "expected pieces"),
-        (lying_header((2**30, 1), piece=1 | 8 << 4), "expected pieces"),
+        (lying_header((5, 5), chunk=12), "expected chunks"),
+        (lying_header((5, 5), chunk=3 | 4 << 4), "expected chunks"),
+        (lying_header((5, 5), chunk=9 | 8 << 4), "expected chunks"),
+        (lying_header((2**30, 1), chunk=1 | 8 << 4), "expected chunks"),
         (lying_header((5, 5), rule=2), "expected a lattice"),
         (lying_header((5, 5), step=0.0), "expected a lattice"),
         (lying_header((5, 5), step=-1.0), "expected a lattice"),
@@ -353,7 +353,7 @@ def layer(*entries: sections.Entry, body: bytes | None = None, channels: int = 1
         [sections.section(sections.LAYER, b"\xff\xff\xff\xff" + bytes(5))],
         [sections.section(sections.LAYER, b"\x00\x00\xf0\x7f" + bytes(5))],
         [sections.section(sections.LAYER, b"")],
-        [sections.section(sections.EXACTNESS, b"too early")],
+        [sections.section(sections.RESIDUAL, b"too early")],
         [sections.section(sections.METADATA, b"\xc1")],
         [sections.section(sections.METADATA, b"\x93\x01\x02\x03")],
         [sections.section(sections.METADATA, b"\x81\x01\x02")],
@@ -412,7 +412,7 @@ def test_an_index_that_lies_is_corrupt() -> None:
         replace(index, header=replace(index.header, length=index.header.length + 1)),
         replace(index, optional=(OptionalSection(200, ByteRange(index.layers[1].offset + 1, 9)),)),
         replace(index, optional=(OptionalSection(9, ByteRange(index.layers[1].offset, 9)),)),
-        replace(index, exactness=None),
+        replace(index, residual=None),
         replace(index, metadata=replace(index.metadata, length=5)),
     ]
     for lie in lies:
@@ -441,7 +441,7 @@ def test_an_index_that_lies_is_corrupt() -> None:
 )
 def test_a_page_that_lies_is_corrupt(change: Callable[[bytes], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     container, index = contained("small")
-    for name in ("_segment_pages", "_piece_pages"):
+    for name in ("_segment_pages", "_chunk_pages"):
         honest = getattr(container_index, name)
         with monkeypatch.context() as patch:
             patch.setattr(container_index, name, lambda index, honest=honest: [change(*honest(index))])
@@ -510,16 +510,16 @@ def test_optional_sections_may_stand_anywhere_and_have_their_place_in_the_index(
     ]
 
 
-def test_a_bomb_in_place_of_exactness_is_corrupt() -> None:
+def test_a_bomb_in_place_of_residual_is_corrupt() -> None:
     container, index = contained("small")
-    assert index.exactness is not None
-    payload = sections.serialize_pieces(Errors(0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
-    bomb = sections.section(sections.EXACTNESS, payload)
+    assert index.residual is not None
+    payload = sections.serialize_chunks(Errors(0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
+    bomb = sections.section(sections.RESIDUAL, payload)
     decoder = Decoder()
-    views = decoder.feed(container[: index.exactness.offset] + bomb)
-    with pytest.raises(CorruptStreamError, match="exactness") as caught:
+    views = decoder.feed(container[: index.residual.offset] + bomb)
+    with pytest.raises(CorruptStreamError, match="residual") as caught:
         views[-1].points  # noqa: B018 - lazy: looking is the test
-    assert index.exactness.offset < caught.value.offset < index.exactness.offset + 30
+    assert index.residual.offset < caught.value.offset < index.residual.offset + 30
     assert views[-2].points.tobytes() == expected_views(container)[-2][1]
 
 

@@ -17,7 +17,7 @@ from lodestream.container import sections
 from lodestream.decoding.inspection import inspect
 from lodestream.errors import CorruptStreamError, LodestreamError, TruncatedStreamError
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 from lodestream.planning.window_errors import read_window_errors
 from lodestream.transfer.range_download import RangeDownload
 from lodestream.transfer.receiver_state import Reception
@@ -29,7 +29,7 @@ from .mutants import Anatomy, mutant
 
 MOST = 20_000
 REGION = (0, 5), (1, 4)
-#: With masks, kept holes, attributes, parts and curves, indices, large units, pieces of every rule.
+#: With masks, kept holes, attributes, parts and curves, indices, large units, chunks of every rule.
 NAMES = ("holes-closed", "infinite-plane", "cylinder-disc", "error-attributes", "large-sparse", "heights-decimal")
 
 
@@ -74,12 +74,12 @@ def read_window(data: bytes) -> None:
     target = ls.Target(region=REGION)
     reception = Reception(target, max_vertices=MOST)
     File(data).serve(RangeDownload(reception))
-    decoder = ls.Decoder(wish_of(target), max_vertices=MOST)
+    decoder = ls.Decoder(selection_of(target), max_vertices=MOST)
     decoder.feed(data)
     decoder.surface()
 
 
-ROADS: list[Callable[[bytes], Any]] = [
+TRANSPORTS: list[Callable[[bytes], Any]] = [
     read_whole,
     read_in_chunks,
     read_index,
@@ -101,9 +101,9 @@ def test_every_fault_is_told(name: str) -> None:
     chance, refused = random.Random(name), 0
     for number in range(120):
         changed = mutant(data, channels, chance)
-        road = ROADS[number % len(ROADS)]
+        transport = TRANSPORTS[number % len(TRANSPORTS)]
         try:
-            road(changed)
+            transport(changed)
         except LodestreamError as error:
             refused += 1
             told = str(error)
@@ -115,9 +115,9 @@ def test_every_fault_is_told(name: str) -> None:
 def test_nothing_stands_before_the_header() -> None:
     data = (FOLDER / "two-points.lode").read_bytes()
     changed = data[:8] + sections.section(200, b"anything") + data[8:]
-    for road in ROADS:
+    for transport in TRANSPORTS:
         with pytest.raises(LodestreamError, match="expected"):
-            road(changed)
+            transport(changed)
     bytewise = ls.Decoder()
     bytewise.feed(changed[:8])
     with pytest.raises(CorruptStreamError, match="expected the header section first, got kind 200"):

@@ -51,10 +51,10 @@ def written(seed: int, attribute: bool) -> bytes:
                 left, begins = left - passes, False
     pairs = ((0.5, 1.0),) * header.channels if header.channels > 1 else ()
     errors = [Errors(LAYERS - k, 2.0 * LAYERS, pairs) for k in range(LAYERS)]
-    pieces = [rng.bytes(int(rng.choice([0, 1, 200]))) for _ in range(count_windows(header) * header.channels)]
+    chunks = [rng.bytes(int(rng.choice([0, 1, 200]))) for _ in range(count_windows(header) * header.channels)]
     coded = [CodedLayer(error, own) for error, own in zip(errors, layers, strict=True)]
     levels = [errors[0]] * header.levels + [errors[-1]]
-    return write_container(header, coded, levels, pieces, {}, exact=False, optional={200: b"more", 201: b""})
+    return write_container(header, coded, levels, chunks, {}, exact=False, optional={200: b"more", 201: b""})
 
 
 @pytest.mark.parametrize("attribute", [False, True])
@@ -80,9 +80,9 @@ def test_an_index_of_several_pages_comes_back(seed: int, attribute: bool, monkey
             assert sections.check_of(found.data) == segment.check
             assert found.unit == entry.unit == segment.tile * channels + segment.channel
             assert (found.passes, entry.top) == (segment.passes, segment.top) == (entry.passes, segment.top)
-    pieces = [data[piece.range.offset : piece.range.end] for piece in index.pieces]
-    assert told.exactness is not None
-    assert pieces == told.exactness.pieces == [entry.take(data).data for entry in known.pieces]
+    chunks = [data[chunk.range.offset : chunk.range.end] for chunk in index.chunks]
+    assert told.residual is not None
+    assert chunks == told.residual.chunks == [entry.take(data).data for entry in known.chunks]
 
 
 def test_pages_that_contradict_each_other_are_corrupt(monkeypatch: pytest.MonkeyPatch) -> None:

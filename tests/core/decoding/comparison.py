@@ -65,7 +65,7 @@ def agree_on(data: bytes, layer: int, level: int) -> None:
     assert (container.header.finest, len(container.layers)) == (decoder.header.levels, decoder.header.layer_count)
     layer, level = layer % len(container.layers), level % (container.header.finest + 1)
     _shows(decoder.layers[layer].surface(), other.shown(layer + 1))
-    _shows(decoder.surface(), other.shown(exactness=container.exactness))
+    _shows(decoder.surface(), other.shown(residual=container.residual))
     if level < container.header.finest:
         # The page does not say what x and y of a coarser level of heights are.
         _shows(decoder.surface(level), other.shown(level=level), heights=container.header.plane is not None)

@@ -1,4 +1,4 @@
-"""The picture of a window is what the picture of the whole has there, in every state."""
+"""The reconstruction of a window is what the reconstruction of the whole has there, in every state."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.decoding.crop import crop_axis, window_picture
-from lodestream.decoding.reconstruction import channel_picture
+from lodestream.decoding.crop import crop_axis, reconstruct_window
+from lodestream.decoding.reconstruction import reconstruct_channel
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.entropy.tiles import Tiles, TileTable, gather
 from lodestream.grid.axis import axis_step
 from lodestream.grid.layout import Layout
 from lodestream.grid.support import needed_tiles
-from lodestream.planning.selection import Wish
+from lodestream.planning.selection import Selection
 from lodestream.target import Region
 from lodestream.transform.pyramid import allocate, forward
 
@@ -82,8 +82,8 @@ def test_a_window_of_any_state(
         state[:] = rng.choice([0, 1, 2, 7, 16, 31, UNANNOUNCED], state.size)
     state[~needed_tiles(layout, region)] = 0
     header = cast("Header", SimpleNamespace(layout=layout, predictors=[predictors], geometric=1))
-    window, fraction = window_picture(header, 0, tiles, state, region)
-    whole, expected = channel_picture(header, 0, tiles, state, layout.levels)
+    window, fraction = reconstruct_window(header, 0, tiles, state, region)
+    whole, expected = reconstruct_channel(header, 0, tiles, state, layout.levels)
     assert fraction == expected
     np.testing.assert_array_equal(window, whole[0][slice(*region[0]), slice(*region[1])])
 
@@ -145,7 +145,7 @@ def test_every_view_of_a_window_is_cut_out_of_the_whole(kind: str) -> None:
 
 
 def test_a_window_of_holes_alone_is_refused() -> None:
-    decoder = ls.Decoder(Wish(((95, 105), (95, 105))))
+    decoder = ls.Decoder(Selection(((95, 105), (95, 105))))
     decoder.feed(contained("bands"))
     with pytest.raises(ls.InputError):
         decoder.surface()

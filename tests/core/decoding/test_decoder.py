@@ -41,7 +41,7 @@ def test_every_layer_has_exactly_the_recorded_errors(name: str) -> None:
     container, index = contained(name)
     views = states(container)
     records = [(r.number, r.level, r.end, r.rms, r.max_error) for r in index.layers]
-    if index.exactness:
+    if index.residual:
         left = index.levels[-1]
         records.append((len(records), index.header.levels, index.surface_end, left.rms, left.max_error))
     assert [figures(view)[:5] for view in views] == records
@@ -164,8 +164,8 @@ def test_every_plan_leads_to_the_state_that_it_says(name: str) -> None:
         for view in views:
             assert_measured(name, view)
         expected = told(views)
-        pieces = (1, 7, 64, 1000)[number // 2 % 4]  # of two targets in turn, one in either order
-        again, same = follow(container, made, pieces)
+        chunks = (1, 7, 64, 1000)[number // 2 % 4]  # of two targets in turn, one in either order
+        again, same = follow(container, made, chunks)
         assert told(same) == expected
         assert again.metadata == {"name": name}
         if target == Target() or target == Target(order="level"):

@@ -19,7 +19,7 @@ from lodestream.container.capacity import Capacity
 from lodestream.decoding.inspection import inspect
 from lodestream.encoding import preparation
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import Wish
+from lodestream.planning.selection import Selection
 from lodestream.reference.small_units import SmallUnit
 from lodestream.target import Target, Tolerance
 from tests.torture.targets import TARGETS, mutate
@@ -40,10 +40,10 @@ NAMES = (
 )
 
 
-def fed(data: bytes, pieces: int = 2**62, wish: Wish | None = None) -> ls.Decoder:
-    decoder = ls.Decoder(wish)
-    for start in range(0, len(data), pieces):
-        decoder.feed(data[start : start + pieces])
+def fed(data: bytes, chunks: int = 2**62, selection: Selection | None = None) -> ls.Decoder:
+    decoder = ls.Decoder(selection)
+    for start in range(0, len(data), chunks):
+        decoder.feed(data[start : start + chunks])
     return decoder
 
 
@@ -69,11 +69,11 @@ def test_windows_are_the_same(name: str) -> None:
     assert fast.header is not None
     rows, columns = fast.header.shape
     region = (rows // 4, rows // 2), (columns // 3, columns)
-    wish = Wish(region)
-    wanted = [fast.layers[0].window(region), fast.view().window(region), fed(data, wish=wish).surface()]
+    selection = Selection(region)
+    wanted = [fast.layers[0].window(region), fast.view().window(region), fed(data, selection=selection).surface()]
     with without_kernels():
         slow = fed(data)
-        found = [slow.layers[0].window(region), slow.view().window(region), fed(data, wish=wish).surface()]
+        found = [slow.layers[0].window(region), slow.view().window(region), fed(data, selection=selection).surface()]
     for one, other in zip(found, wanted, strict=True):
         assert_same(one, other)
 
@@ -141,9 +141,9 @@ def test_some_attributes_alone_are_the_same() -> None:
     data = (GOLDEN / "attributes-types.lode").read_bytes()
     first, *others = fed(data).surface().blocks[0].attributes
     assert others
-    wanted = fed(data, wish=Wish(attributes=(first,))).surface()
+    wanted = fed(data, selection=Selection(attributes=(first,))).surface()
     with without_kernels():
-        assert_same(fed(data, wish=Wish(attributes=(first,))).surface(), wanted)
+        assert_same(fed(data, selection=Selection(attributes=(first,))).surface(), wanted)
 
 
 @settings(max_examples=12)
@@ -156,18 +156,18 @@ def test_the_reference_and_the_kernels_agree(
 
 @settings(max_examples=12)
 @given(st.tuples(st.integers(2, 40), st.integers(2, 130)), st.booleans(), st.integers(0, 2**32), st.integers(0))
-def test_they_agree_on_tiles_and_pieces_of_any_size(
+def test_they_agree_on_tiles_and_chunks_of_any_size(
     shape: tuple[int, int], floats: bool, seed: int, layer: int
 ) -> None:
     rng = np.random.default_rng(seed)
     heights = np.cumsum(rng.normal(size=shape), axis=1)
-    tile, piece = ((short, 8 + int(rng.integers(0, 3)) - short) for short in map(int, rng.integers(1, 7, 2)))
+    tile, chunk = ((short, 8 + int(rng.integers(0, 3)) - short) for short in map(int, rng.integers(1, 7, 2)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(preparation, "tile_exponents", lambda *_: tile)
-        patch.setattr(preparation, "piece_exponents", lambda *_: [piece])
+        patch.setattr(preparation, "chunk_exponents", lambda *_: [chunk])
         data = ls.encode(heights.astype(np.float32) if floats else np.rint(9 * heights).astype(np.int16))
     header = index_of(data).header
-    assert (header.tile, header.piece) == (tile, piece)
+    assert (header.tile, header.chunk) == (tile, chunk)
     agree_on(data, layer, header.levels)
 
 
@@ -221,7 +221,7 @@ def test_encoding_and_inspecting_are_refused_before_anything_is_done() -> None:
 
 def test_plain_python_takes_more_memory_and_a_window_as_much_as_its_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     data = (GOLDEN / "several-tiles.lode").read_bytes()
-    window = Wish(((0, 9), (0, 9)))
+    window = Selection(((0, 9), (0, 9)))
     monkeypatch.setattr(capacity, "memory_limit", lambda: 2**30)
     usual = Capacity().bytes
     ls.Decoder(window, max_vertices=100_000).feed(data)

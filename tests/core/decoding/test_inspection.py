@@ -155,11 +155,11 @@ def test_an_index_that_says_something_else(exact: bytes, near: bytes) -> None:
             replace(index, segments=(replace(first, top=first.top + 1), *index.segments[1:])),
             replace(index, segments=index.segments[1:]),
         ]
-        if index.pieces:
-            number = next(k for k, piece in enumerate(index.pieces) if piece.range.length)
-            pieces = list(index.pieces)
-            pieces[number] = replace(pieces[number], check=pieces[number].check ^ 1)
-            others.append(replace(index, pieces=tuple(pieces)))
+        if index.chunks:
+            number = next(k for k, chunk in enumerate(index.chunks) if chunk.range.length)
+            chunks = list(index.chunks)
+            chunks[number] = replace(chunks[number], check=chunks[number].check ^ 1)
+            others.append(replace(index, chunks=tuple(chunks)))
         for other in others:
             with pytest.raises(ls.CorruptStreamError, match=f"at byte {index.index.offset}|expected"):
                 inspected(rewritten(data, unchanged, other))
@@ -209,16 +209,16 @@ def test_a_forged_extent_or_number_of_holes(exact: bytes, near: bytes) -> None:
 
 def test_sections_in_another_order_or_twice(exact: bytes) -> None:
     index = index_of(exact)
-    parts = [exact[a:b] for a, b in sections_of(exact)]
+    patches = [exact[a:b] for a, b in sections_of(exact)]
     footer = exact[index.index.end :]
     for order in (
-        [0, 1, *range(3, len(parts)), 2],
-        [0, 0, *range(1, len(parts))],
-        [0, 1, 2, *range(2, len(parts))],
-        [*range(len(parts) - 2), len(parts) - 2, len(parts) - 2, len(parts) - 1],
-        [1, 0, *range(2, len(parts))],
+        [0, 1, *range(3, len(patches)), 2],
+        [0, 0, *range(1, len(patches))],
+        [0, 1, 2, *range(2, len(patches))],
+        [*range(len(patches) - 2), len(patches) - 2, len(patches) - 2, len(patches) - 1],
+        [1, 0, *range(2, len(patches))],
     ):
-        data = exact[:8] + b"".join(parts[k] for k in order) + footer
+        data = exact[:8] + b"".join(patches[k] for k in order) + footer
         with pytest.raises(ls.StreamError):
             inspected(data)
     optional = sections.section(200, b"more")

@@ -46,7 +46,7 @@ def decoded(name: str) -> tuple[Container, Decoder]:
 @functools.cache
 def surface_of(name: str) -> list[Shown]:
     container, decoder = decoded(name)
-    return decoder.shown(exactness=container.exactness)
+    return decoder.shown(residual=container.residual)
 
 
 def index_of(name: str) -> Index:
@@ -72,7 +72,7 @@ def test_the_header_says_what_the_surface_is(name: str) -> None:
         assert dict(zip(names, map(kind, attributes), strict=True)) == expected["attributes"]
         assert list(block.closed) == expected["closed"]
         assert int((~shown.valid).sum()) == expected["holes"]
-    assert (container.exactness is not None) == header.has_exactness
+    assert (container.residual is not None) == header.has_residual
     assert any((~mask).any() for mask in container.masks.valid) == header.has_masks
 
 
@@ -89,16 +89,16 @@ def test_every_layer_gives_its_reconstruction(name: str) -> None:
     container, decoder = decoded(name)
     expected = EXPECTED[name]["layers"]
     last = len(container.layers)
-    assert last == container.header.layers == len(expected) - (container.exactness is not None)
+    assert last == container.header.layers == len(expected) - (container.residual is not None)
     for layer, wanted in zip(container.layers, expected, strict=False):
         assert (layer.end, layer.errors.rms, layer.errors.maximum) == (wanted["bytes"], wanted["rms"], wanted["max"])
     afforded = max(2, AFFORDED // values_of(name))
     for count in sorted({round(1 + k * (last - 1) / (afforded - 1)) for k in range(afforded)}):
-        shown = decoder.shown(count) if count < last or container.exactness else surface_of(name)
+        shown = decoder.shown(count) if count < last or container.residual else surface_of(name)
         assert digests(shown) == expected[count - 1]["sha256"], f"layer {count}"
     assert digests(surface_of(name)) == expected[-1]["sha256"]
-    if container.exactness is not None:
-        assert container.exactness.errors[:2] == (expected[-1]["rms"], expected[-1]["max"])
+    if container.residual is not None:
+        assert container.residual.errors[:2] == (expected[-1]["rms"], expected[-1]["max"])
 
 
 @golden
@@ -114,21 +114,21 @@ def test_every_level_gives_its_grids(name: str) -> None:
 def test_the_index_finds_every_segment_of_the_layers(name: str) -> None:
     container, index = decoded(name)[0], index_of(name)
     assert index.layer_errors == [layer.errors for layer in container.layers]
-    complete = container.exactness or container.layers[-1]
+    complete = container.residual or container.layers[-1]
     assert index.level_errors[-1] == complete.errors
     for layer, entries in zip(container.layers, index.segments, strict=True):
         for segment, entry in zip(layer.segments, entries, strict=True):
             found = entry.take(file_of(name))  # which checks the segment's CRC
             assert (found.unit, found.passes, found.data) == (segment.unit, segment.passes, segment.data)
             assert segment.top in (None, found.top)
-    pieces = [piece.take(file_of(name)).data for piece in index.pieces]
-    assert pieces == ([] if container.exactness is None else container.exactness.pieces)
+    chunks = [chunk.take(file_of(name)).data for chunk in index.chunks]
+    assert chunks == ([] if container.residual is None else container.residual.chunks)
 
 
-def test_the_files_have_pieces_of_every_rule() -> None:
+def test_the_files_have_chunks_of_every_rule() -> None:
     containers = [read_container(file_of(name)) for name in EXPECTED]
-    pieces = [piece for container in containers if container.exactness for piece in container.exactness.pieces if piece]
-    assert {piece[0] & 3 for piece in pieces} == {0, 1, 2, 3}
+    chunks = [chunk for container in containers if container.residual for chunk in container.residual.chunks if chunk]
+    assert {chunk[0] & 3 for chunk in chunks} == {0, 1, 2, 3}
 
 
 @small

@@ -1,4 +1,4 @@
-"""Quantisation in a closed loop: what the encoder takes for the reader's picture is the reader's, on every surface."""
+"""Quantisation in a closed loop: the encoder's reconstruction is the reader's, on every surface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CLOSED = st.tuples(st.booleans(), st.booleans())
 
 
 def check(surface: ls.Surface, base: int) -> None:
-    """What the loop leaves in its pictures is what a reader makes of the indices."""
+    """What the loop leaves in its reconstructions is what a reader makes of the indices."""
     prepared = Preparation(surface, (None, {}), Tolerance(0.01, relative=True))
     fine = prepared.fine_lattices()
     assert fine is not None
@@ -36,18 +36,18 @@ def check(surface: ls.Surface, base: int) -> None:
     steps, rules = table.steps(quantiser), feedback_rules(table, quantiser)
     for number, lattice in enumerate(fine[0][: prepared.geometric]):
         _, predictors = encoding._transform(number, lattice)
-        pictures = [allocate(grid.shape) for grid in layout.grids]
-        for picture in pictures:
-            picture[...] = 77  # of another try
-        indices = encoding._loops[number].indices(steps, rules, pictures)
+        reconstructions = [allocate(grid.shape) for grid in layout.grids]
+        for reconstruction in reconstructions:
+            reconstruction[...] = 77  # of another try
+        indices = encoding._loops[number].indices(steps, rules, reconstructions)
         tiles = Tiles(table, quantiser)
         tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
         grids = [allocate(grid.shape) for grid in layout.grids]
         tiles.spread_levels(layout.levels, np.zeros(len(layout.tiles), np.int8), grids, layout.levels)
         inverse(grids, layout, predictors, layout.levels, layout.levels)
-        for picture, grid in zip(pictures, grids, strict=True):
-            assert np.array_equal(picture, grid)
-        distance = np.abs(pictures[-1] - prepared.coordinates(number, lattice)[-1]).max()
+        for reconstruction, grid in zip(reconstructions, grids, strict=True):
+            assert np.array_equal(reconstruction, grid)
+        distance = np.abs(reconstructions[-1] - prepared.coordinates(number, lattice)[-1]).max()
         assert distance < 8 * base + 8  # of the last part: the two belong to each other
 
 

@@ -176,7 +176,7 @@ def test_errors_never_rise_from_layer_to_layer_and_end_at_nothing(name: str) -> 
     assert 1 <= len(index.layers) <= 24
     if index.header.exact:
         assert (index.levels[-1].rms, index.levels[-1].max_error) == (0.0, 0.0)
-        assert index.exactness is not None or rms[-1] == 0.0
+        assert index.residual is not None or rms[-1] == 0.0
     else:
         assert name == "precision"
 
@@ -312,7 +312,7 @@ def test_a_precision_leaves_attributes_as_they_are() -> None:
 
 
 def test_pictures_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
-    """Their coefficients and nodes reach what pictures in eighths of a step are kept within."""
+    """Their coefficients and nodes reach what reconstructions in eighths of a step are kept within."""
     rng = np.random.default_rng(8)
     points = rng.choice([-(2**23), 0, 1, 2**23 - 1], (70, 90), p=[0.45, 0.05, 0.05, 0.45])
     assert index_of(assert_comes_back(points)).header.lattices[0].step == 1

@@ -117,8 +117,8 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
                 assert (costs == 8 * ends).all()
                 assert (len(whole), sorted(ends, reverse=True)) == (ends[0], list(ends))
                 starts = [0 if first == passes - 1 else ends[first + 1] for first, *_ in units[unit]]
-                pieces = [whole[start : ends[last]] for start, (_, last, _) in zip(starts, units[unit], strict=True)]
-                assert [piece or b"\0" for piece in pieces] == [data for *_, data in units[unit]]
+                chunks = [whole[start : ends[last]] for start, (_, last, _) in zip(starts, units[unit], strict=True)]
+                assert [chunk or b"\0" for chunk in chunks] == [data for *_, data in units[unit]]
             read_plainly(expected, table, unit, units[unit])
         reader = read(table, units, budget)
         check_alike(reader, expected)

@@ -131,7 +131,7 @@ def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
     header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
     assert header.quantiser is not None
     payload = serialize_header(header)[10:-4]
-    place, own = 10, FieldWriter()  # after two codecs, flags, type, channels, layers, tile, piece, large
+    place, own = 10, FieldWriter()  # after two codecs, flags, type, channels, layers, tile, chunk, large
     own.varint(header.quantiser.base)
     assert payload[place : place + len(own.data)] == own.data
     other = FieldWriter()

@@ -1,4 +1,4 @@
-"""Files of very many small parts, one maker for each kind of part: ``maker(folder, count)`` gives the file."""
+"""Files of very many small patches, one maker for each kind of patch: ``maker(folder, count)`` gives the file."""
 
 from __future__ import annotations
 
@@ -122,10 +122,10 @@ def plot3d_blocks(folder: Path, count: int) -> Path:
 
 
 def _png(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    parts = [
+    patches = [
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
     ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(patches)
 
 
 _PNG_HEAD = (b"IHDR", struct.pack(">IIBBBBB", 2, 2, 8, 0, 0, 0, 0))
@@ -256,7 +256,7 @@ def vts_attributes(folder: Path, count: int) -> Path:
 
 
 def vts_attribute(folder: Path, count: int) -> Path:
-    """A .vts of one very long attribute, of a kilobyte for each part."""
+    """A .vts of one very long attribute, of a kilobyte for each patch."""
     return _written(folder, "attribute.vts", _vts("0 1 0 1 0 0", "", f' a="{" " * 1024 * count}"'))
 
 
@@ -406,7 +406,7 @@ def square_patches(folder: Path, count: int) -> Path:
 
 def _directories(folder: Path, count: int, kind: int) -> Path:
     """A TIFF of so many directories, of whose images all but the first are of a kind (tag 254)."""
-    parts = []
+    patches = []
     for place in range(count):
         entries = [
             *((254, 4, _long(kind if place else 0)), (256, 4, _long(2)), (257, 4, _long(2)), (258, 3, _short(8))),
@@ -414,8 +414,8 @@ def _directories(folder: Path, count: int, kind: int) -> Path:
             *((278, 4, _long(2)), (279, 4, _long(4))),
         ]
         one = _tiff(entries)[8:-4]
-        parts.append(one + _long(8 + (len(one) + 4) * (place + 1) if place + 1 < count else 0))
-    return _written(folder, "directories.tif", b"II*\0" + _long(8) + b"".join(parts))
+        patches.append(one + _long(8 + (len(one) + 4) * (place + 1) if place + 1 < count else 0))
+    return _written(folder, "directories.tif", b"II*\0" + _long(8) + b"".join(patches))
 
 
 def geotiff_images(folder: Path, count: int) -> Path:

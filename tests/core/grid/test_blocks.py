@@ -104,7 +104,7 @@ def test_a_seam_and_poles_stay_closed() -> None:
     assert_watertight(ls.Surface(ball, (False, True)))
     index = index_of(ls.encode(ball, "1e-6d"))
     assert index.header.arrangement is not None
-    assert sorted(curve.length for curve in index.header.arrangement.curves)[:2] == [1, 1]
+    assert sorted(interface.length for interface in index.header.arrangement.interfaces)[:2] == [1, 1]
 
 
 def test_the_edge_of_a_cylinder_is_shared_with_a_disc() -> None:

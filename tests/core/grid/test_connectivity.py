@@ -22,43 +22,43 @@ DATA = Path(__file__).parents[4] / "shared" / "data"
 @given(layouts())
 def test_any_layout_is_watertight_at_every_level(blocks: list[LatticeBlock]) -> None:
     arrangement = checked(blocks)
-    assert {part.block for part in arrangement.parts} == set(range(len(blocks)))
+    assert {patch.block for patch in arrangement.patches} == set(range(len(blocks)))
 
 
 @given(st.integers(1, 20), st.integers(0, 2**32))
-def test_a_sphere_of_six_blocks_has_twelve_curves(faces: int, seed: int) -> None:
+def test_a_sphere_of_six_blocks_has_twelve_interfaces(faces: int, seed: int) -> None:
     arrangement = checked(cube(np.random.default_rng(seed), faces))
-    assert len(arrangement.parts) == 6
-    assert len(arrangement.curves) == 12
-    assert all(all(part.sides) for part in arrangement.parts)
+    assert len(arrangement.patches) == 6
+    assert len(arrangement.interfaces) == 12
+    assert all(all(patch.sides) for patch in arrangement.patches)
 
 
 @given(overlapping())
 def test_blocks_may_overlap(blocks: list[LatticeBlock]) -> None:
-    assert len(checked(blocks).parts) >= len(blocks)
+    assert len(checked(blocks).patches) >= len(blocks)
 
 
 @given(tubes())
 def test_rims_agree_or_are_cut_open(blocks: list[LatticeBlock]) -> None:
-    assert len(checked(blocks).parts) >= len(blocks)
+    assert len(checked(blocks).patches) >= len(blocks)
 
 
 @given(layouts(), st.integers(1, 3))
 def test_what_splits_too_much_is_given_up_and_the_rest_still_fits(blocks: list[LatticeBlock], limit: int) -> None:
-    with patch.object(cuts, "PARTS", 8 * limit), patch.object(cuts, "PARTS_OF_BLOCK", 8):
+    with patch.object(cuts, "PATCHES", 8 * limit), patch.object(cuts, "PATCHES_OF_BLOCK", 8):
         arrangement = checked(blocks, complete=False)
-    assert len(arrangement.parts) <= 8 * (len(blocks) + limit)
+    assert len(arrangement.patches) <= 8 * (len(blocks) + limit)
 
 
-@pytest.mark.parametrize(("name", "blocks", "curves"), [("m6_small", 9, 16), ("uneven_sphere_large", 6, 12)])
-def test_real_files_share_as_many_sides_as_they_are_known_to(name: str, blocks: int, curves: int) -> None:
+@pytest.mark.parametrize(("name", "blocks", "interfaces"), [("m6_small", 9, 16), ("uneven_sphere_large", 6, 12)])
+def test_real_files_share_as_many_sides_as_they_are_known_to(name: str, blocks: int, interfaces: int) -> None:
     path = DATA / f"{name}.fmt"
     if not path.exists():
         pytest.skip(f"{path.name} is not here")
     found = plot3d(path)
     arrangement = checked(found)
-    assert (len(found), len(arrangement.parts), len(arrangement.curves)) == (blocks, blocks, curves)
-    assert not any(curve.stops for curve in arrangement.curves)
+    assert (len(found), len(arrangement.patches), len(arrangement.interfaces)) == (blocks, blocks, interfaces)
+    assert not any(interface.stops for interface in arrangement.interfaces)
 
 
 def plot3d(path: Path) -> list[LatticeBlock]:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.encoding.preparation import piece_exponents, tile_exponents
+from lodestream.encoding.preparation import chunk_exponents, tile_exponents
 from lodestream.entropy.tiles import TileTable, gather
 from lodestream.errors import InputError
 from lodestream.grid.layout import Layout, tile_bounds
@@ -126,7 +126,7 @@ def test_tiles_of_narrow_surfaces_are_long(shape: tuple[int, int], tile: tuple[i
 
 
 @pytest.mark.parametrize(
-    ("shape", "pieces"),
+    ("shape", "chunks"),
     [
         ((5000, 5000), [(6, 6), (8, 8)]),
         ((33, 4000), [(6, 6), (6, 10)]),
@@ -134,13 +134,13 @@ def test_tiles_of_narrow_surfaces_are_long(shape: tuple[int, int], tile: tuple[i
         ((900, 1), [(11, 1), (15, 1)]),
     ],
 )
-def test_pieces_of_narrow_surfaces_are_long(shape: tuple[int, int], pieces: list[tuple[int, int]]) -> None:
-    assert piece_exponents(shape) == pieces
+def test_chunks_of_narrow_surfaces_are_long(shape: tuple[int, int], chunks: list[tuple[int, int]]) -> None:
+    assert chunk_exponents(shape) == chunks
 
 
 def test_small_surfaces_take_small_tiles_where_points_have_many_bytes() -> None:
     assert tile_exponents((512, 512), 11) == (5, 6)
-    assert piece_exponents((512, 512), small=True) == [(5, 5), (6, 6), (8, 8)]
+    assert chunk_exponents((512, 512), small=True) == [(5, 5), (6, 6), (8, 8)]
     noise = np.random.default_rng(4).normal(size=(70, 150)).astype(np.float32)
     for values, tile in ((noise, (5, 6)), (np.rint(100 * noise), (6, 6)), (noise > 0, (6, 6))):
         container = ls.encode(values.astype(np.float32 if values.dtype == bool else values.dtype))

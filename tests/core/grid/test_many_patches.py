@@ -1,4 +1,4 @@
-"""Files of very many small parts: what a reader does is in proportion to them, or it refuses them at once."""
+"""Files of very many small patches: what a reader does is in proportion to them, or it refuses them at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from . import many_patches
 
 Maker = Callable[[Path, int], Path]
 
-#: Of four times the parts: what is in proportion takes four times as long, what goes with their square sixteen times.
+#: Of four times the patches: what is in proportion takes four times as long, what goes with their square sixteen times.
 TIMES, MORE = 8, 4
 
 #: A processor's seconds that a short reading may differ from another one by.
@@ -29,7 +29,7 @@ NOISE = 0.5
 #: How long a file that is refused by a limit may take.
 AT_ONCE = 5.0
 
-#: Each with a number of parts, of which four times as many are read.
+#: Each with a number of patches, of which four times as many are read.
 READ: list[tuple[Maker, int]] = [
     (many_patches.hdf5_chunks, 8_000),
     (many_patches.hdf5_attributes, 1_000),
@@ -58,7 +58,7 @@ READ: list[tuple[Maker, int]] = [
     (many_patches.square_patches, 250),
 ]
 
-#: Each with a number of parts that is too large, and words of the reason.
+#: Each with a number of patches that is too large, and words of the reason.
 REFUSED: list[tuple[Maker, int, type[InputError], str]] = [
     (many_patches.npz_members, 25_000, TooLargeError, "at most 1000 arrays"),
     (many_patches.netcdf_variables, 5_000, FormatError, "one variable over a surface"),
@@ -95,7 +95,7 @@ def seconds(path: Path) -> float:
 
 
 @pytest.mark.parametrize(("maker", "count"), READ, ids=name_of)
-def test_four_times_the_parts_take_about_four_times_as_long(maker: Maker, count: int, tmp_path: Path) -> None:
+def test_four_times_the_patches_take_about_four_times_as_long(maker: Maker, count: int, tmp_path: Path) -> None:
     folders = [tmp_path / name for name in ("least", "few", "many")]
     for folder in folders:
         folder.mkdir()
@@ -107,7 +107,7 @@ def test_four_times_the_parts_take_about_four_times_as_long(maker: Maker, count:
 
 
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)
-def test_a_limit_refuses_very_many_parts_at_once(
+def test_a_limit_refuses_very_many_patches_at_once(
     maker: Maker, count: int, error: type[InputError], reason: str, tmp_path: Path
 ) -> None:
     path = maker(tmp_path, count)

@@ -173,9 +173,9 @@ def corners() -> ls.Surface:
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0), [0.0], indexing="ij"), -1)[:, :, 0]
     grid[..., 2] = np.sin(grid[..., 0]) * np.cos(grid[..., 1])
     pieces = grid[:5, :5], grid[4:, 4:], grid[4:, :3] + [0, 0, 1], grid[:5, 4:][:, ::-1]
-    curve = np.stack([np.arange(8.0, 15), np.full(7, 8.0), np.zeros(7)], -1)
-    curve[0] = grid[8, 8]
-    return ls.Surface(blocks=[*map(ls.Block, pieces), ls.Block(curve[:, None])])
+    interface = np.stack([np.arange(8.0, 15), np.full(7, 8.0), np.zeros(7)], -1)
+    interface[0] = grid[8, 8]
+    return ls.Surface(blocks=[*map(ls.Block, pieces), ls.Block(interface[:, None])])
 
 
 def cut_sphere() -> ls.Surface:
@@ -277,17 +277,17 @@ def test_a_seam_that_repeats_in_the_file_is_joined_to_its_block_at_every_layer(t
 
     points = torus().points.astype(np.float64)
     ring = np.concatenate([points, points[:, :1]], axis=1)
-    rings = [np.concatenate([part, part[:1]]) for part in (ring[:, :19], ring[:, 18:])]
+    rings = [np.concatenate([patch, patch[:1]]) for patch in (ring[:, :19], ring[:, 18:])]
     rings = [rings[0], ring[:, 18:] + 0.0, ring[:8, :5] + 7.0]
     rings[1] = np.concatenate([rings[1], rings[1][:1]])
-    surface = merge(ls.Surface(blocks=[ls.Block(part) for part in rings]))
+    surface = merge(ls.Surface(blocks=[ls.Block(patch) for patch in rings]))
     assert surface.metadata["seam"] == ["rows", "rows", ""]
     expected = topologies(surface)
     for view in decoded(surface).layers:
         assert topologies(view.surface()) == expected
 
 
-def test_a_window_has_the_faces_of_its_part() -> None:
+def test_a_window_has_the_faces_of_its_patch() -> None:
     surface = sphere()
     decoder = decoded(surface)
     region = (0, 9), (3, 14)
@@ -297,7 +297,7 @@ def test_a_window_has_the_faces_of_its_part() -> None:
     assert expected["obj"] == (9 * 11, expected["obj"][1])
 
 
-def test_curves_that_meet_share_the_vertex() -> None:
+def test_interfaces_that_meet_share_the_vertex() -> None:
     line = np.stack([np.arange(5.0), np.zeros(5), np.sin(np.arange(5.0))], -1)[:, None]
     blocks = [ls.Block(line), ls.Block(line[-1] + line[:, 0][:, None] - line[0, 0])]
     surface = ls.Surface(blocks=blocks)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.container import Header
 from lodestream.grid.connectivity import LatticeBlock
-from lodestream.grid.patches import part_positions
+from lodestream.grid.patches import patch_positions
 from lodestream.mesh import weld
 
 from ..mesh.meshes import drawn
@@ -61,29 +61,29 @@ def header_of(decoder: ls.Decoder) -> Header:
 
 
 def sides_at(decoder: ls.Decoder, level: int) -> dict[int, list[NDArray[np.generic]]]:
-    """The points that parts show of each curve at a level, in the order of the curve."""
+    """The points that patches show of each interface at a level, in the order of the interface."""
     header = header_of(decoder)
     found: dict[int, list[NDArray[np.generic]]] = {}
-    count = len(header.parts)
+    count = len(header.patches)
     grids = decoder.surface(level).blocks
-    for number, part in enumerate(header.parts):
-        shape = header.blocks[part.block][0]
-        of_block = [np.unique(places) for places in _places(header, level, part.block)]
-        rows, columns = part_positions(part, header.layout, level, number, count, shape)
-        grid = grids[part.block].points[
+    for number, patch in enumerate(header.patches):
+        shape = header.blocks[patch.block][0]
+        of_block = [np.unique(places) for places in _places(header, level, patch.block)]
+        rows, columns = patch_positions(patch, header.layout, level, number, count, shape)
+        grid = grids[patch.block].points[
             np.ix_(np.searchsorted(of_block[0], rows), np.searchsorted(of_block[1], columns))
         ]
-        for side, line in zip(part.sides, (grid[0], grid[-1], grid[:, 0], grid[:, -1]), strict=True):
+        for side, line in zip(patch.sides, (grid[0], grid[-1], grid[:, 0], grid[:, -1]), strict=True):
             if side is not None:
-                found.setdefault(side.curve, []).append(line[::-1] if side.reversed else line)
+                found.setdefault(side.interface, []).append(line[::-1] if side.reversed else line)
     return found
 
 
 def _places(header: Header, level: int, block: int) -> list[NDArray[np.int64]]:
     places: list[list[NDArray[np.int64]]] = [[], []]
-    for number, part in enumerate(header.parts):
-        if part.block == block:
-            found = part_positions(part, header.layout, level, number, len(header.parts), header.blocks[block][0])
+    for number, patch in enumerate(header.patches):
+        if patch.block == block:
+            found = patch_positions(patch, header.layout, level, number, len(header.patches), header.blocks[block][0])
             for axis in range(2):
                 places[axis].append(found[axis])
     return [np.concatenate(axis) for axis in places]

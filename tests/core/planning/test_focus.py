@@ -23,7 +23,7 @@ from lodestream.decoding.view import View
 from lodestream.errors import OptionError
 from lodestream.planning.byte_ranges import RangeSet
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import Wish
+from lodestream.planning.selection import Selection
 from lodestream.protocol.messages import MAX_DATA, MAX_HELD, End, Layer, MessageError, Open, Segments, Stop
 from lodestream.protocol.wire import parse, serialize
 from lodestream.target import Region
@@ -130,7 +130,7 @@ def check_end(reception: Reception, kind: str, target: ls.Target) -> None:
     assert reception.received == chosen.bytes
     view = reception.decoder.view()
     assert (view.bytes, view.rms, view.max_error) == (chosen.bytes, chosen.rms, chosen.max_error)
-    expected = ls.Decoder(Wish(target.region))
+    expected = ls.Decoder(Selection(target.region))
     for place in chosen.slices:
         expected.feed_at(place.offset, container(kind)[place.offset : place.end])
     assert np.array_equal(view.surface(target.level).points, expected.surface(target.level).points, equal_nan=True)
@@ -182,7 +182,7 @@ def test_what_the_region_needs_comes_within_the_credit_that_is_outstanding(kind:
     before = link.reception.data_bytes
     link.focus(NEAR)
     link.run()
-    near = Wish(NEAR).tiles(index(kind).header)
+    near = Selection(NEAR).tiles(index(kind).header)
     wanted = RangeSet((s.range.offset, s.range.length) for s in index(kind).segments if near[s.tile])
     chosen = plan(index(kind), target)
     planned = RangeSet((place.offset, place.length) for place in chosen.ranges)
@@ -256,7 +256,7 @@ def figures(views: Sequence[View]) -> list[tuple[float, ...]]:
 
 def test_a_window_of_a_view_is_what_a_receiver_of_that_region_sees() -> None:
     target = ls.Target(region=FAR)
-    decoder = ls.Decoder(Wish(FAR))
+    decoder = ls.Decoder(Selection(FAR))
     for place in plan(index("holes"), target).slices:
         decoder.feed_at(place.offset, container("holes")[place.offset : place.end])
     whole = ls.Decoder()
@@ -290,15 +290,15 @@ def test_what_the_server_says_of_layers_is_what_the_client_sees(target: ls.Targe
 def test_a_view_does_not_look_again_for_the_tiles_of_the_region(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
 
-    def counted(wish: Wish, header: Header) -> NDArray[np.bool_]:
-        looked.append(wish)
-        return tiles(wish, header)
+    def counted(selection: Selection, header: Header) -> NDArray[np.bool_]:
+        looked.append(selection)
+        return tiles(selection, header)
 
-    tiles = Wish.tiles
+    tiles = Selection.tiles
     link = Link("integers", ls.Target(), 2000)
     link.focus(NEAR)
     link.run(until=60_000)
-    monkeypatch.setattr(Wish, "tiles", counted)
+    monkeypatch.setattr(Selection, "tiles", counted)
     views = len(link.views)
     link.run()
     assert len(link.views) > views + 3
@@ -410,7 +410,7 @@ def test_what_is_sent_again_and_again_is_remembered_once() -> None:
     data = container("integers")
     name = hashlib.sha256(data).hexdigest()
     server = Sender(index("integers"), name)
-    pieces = []
+    chunks = []
     for _ in range(5):
         server.receive(serialize(Open(ls.Target(order="level"), 20_000, container=name)))
         wanted: ByteRange | None = None
@@ -420,9 +420,9 @@ def test_what_is_sent_again_and_again_is_remembered_once() -> None:
                 wanted = None
         server.receive(serialize(Stop()))
         assert parse(server.next_message() or b"") == End("stopped")
-        pieces.append(server.pieces)
+        chunks.append(server.pieces)
     assert server.sent == 5 * 20_000
-    assert len(set(pieces)) == 1
+    assert len(set(chunks)) == 1
 
 
 def test_a_focus_after_the_end_does_nothing() -> None:

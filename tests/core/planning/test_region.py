@@ -17,7 +17,7 @@ from lodestream.encoding import preparation
 from lodestream.grid.layout import Layout
 from lodestream.grid.support import needed_tiles
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 from lodestream.transform.lifting import CLAMP
 from lodestream.transform.pyramid import allocate, forward, inverse
 
@@ -31,7 +31,7 @@ def index_of(container: bytes) -> Index:
 def received(container: bytes, target: ls.Target) -> ls.Decoder:
     """What a receiver has that got just what the plan says."""
     chosen = plan(index_of(container), target)
-    decoder = ls.Decoder(wish_of(target))
+    decoder = ls.Decoder(selection_of(target))
     held = 0
     views = []
     for place in (*chosen.before, *chosen.ranges, *chosen.after):
@@ -93,7 +93,7 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
         assert np.array_equal(found, wanted, equal_nan=True)
     assert decoder.complete
     assert decoder.max_error == 0
-    whole = ls.Decoder(wish_of(ls.Target(region=region)))
+    whole = ls.Decoder(selection_of(ls.Target(region=region)))
     whole.feed(container)
     assert np.array_equal(whole.surface().points, window.points, equal_nan=True)
     assert all(math.isnan(view.rms) for view in decoder.layers[:-1])
@@ -109,17 +109,17 @@ FEWER = [((0, 20), (0, 30)), ((30, 60), (200, 259)), ((79, 80), (0, 270)), ((0, 
 SIZES = [((4, 4), (4, 4)), ((1, 7), (9, 7)), ((3, 6), (7, 1)), ((8, 8), (5, 3))]
 
 
-@pytest.mark.parametrize(("tile", "piece"), SIZES, ids=repr)
+@pytest.mark.parametrize(("tile", "chunk"), SIZES, ids=repr)
 @pytest.mark.parametrize("kind", ["integers", "floats", "holes"])
-def test_tiles_and_pieces_of_any_size_are_read(
-    kind: str, tile: tuple[int, int], piece: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+def test_tiles_and_chunks_of_any_size_are_read(
+    kind: str, tile: tuple[int, int], chunk: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preparation, "tile_exponents", lambda *_: tile)
-    monkeypatch.setattr(preparation, "piece_exponents", lambda *_: [piece])
+    monkeypatch.setattr(preparation, "chunk_exponents", lambda *_: [chunk])
     surface = surface_of(kind, 80, 270)
     container = ls.encode(surface)
     header = index_of(container).header
-    assert (header.tile, header.piece) == (tile, piece)
+    assert (header.tile, header.chunk) == (tile, chunk)
     assert np.array_equal(ls.decode(container).points, surface.points, equal_nan=True)
     for region in FEWER:
         window = received(container, ls.Target(region=region)).surface()
@@ -198,7 +198,7 @@ def test_what_is_not_there_is_refused(target: ls.Target) -> None:
     with pytest.raises(ls.OptionError, match="expected"):
         plan(index_of(container), target)
     with pytest.raises(ls.OptionError, match="expected"):
-        ls.Decoder(wish_of(target)).feed(container)
+        ls.Decoder(selection_of(target)).feed(container)
 
 
 @pytest.mark.parametrize("region", [((5, 5), (0, 3)), ((-1, 4), (0, 3)), ((4, 2), (0, 3))])

@@ -56,26 +56,28 @@ def test_distances_are_those_of_the_picture(dtype: str) -> None:
         step = 3 if min(shape) > kernels.PART_ROWS else 1
         for number, fraction in itertools.product(range(0, len(LATTICES), step), (0, 4)):
             lattices = (LATTICES[number:] + LATTICES[:number])[:geometric]
-            picture = np.zeros((*shape, geometric), dtype)
+            reconstruction = np.zeros((*shape, geometric), dtype)
             for channel, lattice in enumerate(lattices):
-                store_values(lattice, (numbers[channel, :, : shape[1]], fraction), picture, channel)
-            original = np.roll(picture, 1, axis=1)
+                store_values(lattice, (numbers[channel, :, : shape[1]], fraction), reconstruction, channel)
+            original = np.roll(reconstruction, 1, axis=1)
             found = coordinate_distances([Original(original, None)], lattices, [numbers], [fraction] * geometric)
             assert len(found) == (1 if geometric == 1 else 1 + geometric)
-            assert found[0] == pytest.approx(distances(original, picture, geometric), rel=1e-12, abs=0)
+            assert found[0] == pytest.approx(distances(original, reconstruction, geometric), rel=1e-12, abs=0)
             for channel, pair in enumerate(found[1:]):
-                expected = distances(original[..., channel], picture[..., channel], 1)
+                expected = distances(original[..., channel], reconstruction[..., channel], 1)
                 assert pair == pytest.approx(expected, rel=1e-12, abs=1e-150 * found[0][1])
-            same = coordinate_distances([Original(picture, None)], lattices, [numbers], [fraction] * geometric)
+            same = coordinate_distances([Original(reconstruction, None)], lattices, [numbers], [fraction] * geometric)
             assert same == [(0.0, 0.0)] * len(found)
 
 
-def plain_distances(original: NDArray[Any], picture: NDArray[Any], counted: NDArray[np.bool_]) -> tuple[float, float]:
+def plain_distances(
+    original: NDArray[Any], reconstruction: NDArray[Any], counted: NDArray[np.bool_]
+) -> tuple[float, float]:
     """RMS and largest distance, their sums taken in the order of the kernel."""
     with np.errstate(over="ignore"):
         squares = np.zeros(original.shape[:2])
-        for channel in range(picture.shape[2]):
-            delta = original[..., channel].astype(np.float64) - picture[..., channel].astype(np.float64)
+        for channel in range(reconstruction.shape[2]):
+            delta = original[..., channel].astype(np.float64) - reconstruction[..., channel].astype(np.float64)
             squares += delta * delta
     squares[~counted] = 0.0
     totals = []

@@ -140,7 +140,7 @@ def test_values_that_the_sample_misses_count() -> None:
         np.array([1e-45, 1e-40], np.float32),
     ],
 )
-def test_subnormals_and_extremes_are_restored_or_left_to_exactness(values: NDArray[Any]) -> None:
+def test_subnormals_and_extremes_are_restored_or_left_to_residual(values: NDArray[Any]) -> None:
     lattice = find_lattice(values)
     if lattice is not None:
         with np.errstate(over="ignore"):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lodestream.errors import CorruptStreamError, StreamError
 from lodestream.quantization.lattice import offset_lattice
-from lodestream.reference import exactness as reference
-from lodestream.residual.chunk_coder import decode_piece, encode_piece
+from lodestream.reference import residual as reference
+from lodestream.residual.chunk_coder import decode_chunk, encode_chunk
 from lodestream.residual.number_line import PATTERNS, from_line
 
 Values = NDArray[Any]
@@ -37,9 +37,9 @@ def on_lattice(values: Values, step: float) -> Values:
 
 
 def assert_comes_back(original: Values, restored: Values) -> bytes:
-    data = encode_piece(original, restored)
+    data = encode_chunk(original, restored)
     assert len(data) <= original.nbytes + 1
-    assert_same_bits(decode_piece(restored, data, 0), original)
+    assert_same_bits(decode_chunk(restored, data, 0), original)
     return data
 
 
@@ -88,12 +88,12 @@ def test_a_difference_whose_magnitude_has_64_bits_comes_back() -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_equal_values_need_nothing(dtype: str) -> None:
     values = np.arange(12).astype(dtype)
-    assert encode_piece(values, values.copy()) == b""
-    assert_same_bits(decode_piece(values, b"", 0), values)
+    assert encode_chunk(values, values.copy()) == b""
+    assert_same_bits(decode_chunk(values, b"", 0), values)
 
 
 def test_a_negative_zero_needs_something() -> None:
-    assert encode_piece(np.array([-0.0]), np.array([0.0]))
+    assert encode_chunk(np.array([-0.0]), np.array([0.0]))
 
 
 @pytest.mark.parametrize(("dtype", "step"), [("float32", 2.0**-18), ("float32", 1e-5), ("float64", 2.0**-18)])
@@ -115,13 +115,13 @@ def planes(original: Values, restored: Values) -> int:
 def test_noise_costs_less_than_a_general_compressor_needs(dtype: str) -> None:
     values = normal(dtype, 20000)
     restored = on_lattice(values, 2.0**-17)
-    assert len(encode_piece(values, restored)) < 0.95 * planes(values, restored)
+    assert len(encode_chunk(values, restored)) < 0.95 * planes(values, restored)
 
 
 def test_zeros_at_the_end_of_all_patterns_cost_nothing() -> None:
     single, restored = normal("float32"), on_lattice(normal("float32"), 1e-5)
     double = assert_comes_back(single.astype(np.float64), on_lattice(single.astype(np.float64), 1e-5))
-    assert len(double) < 1.02 * len(encode_piece(single, restored)) + 20
+    assert len(double) < 1.02 * len(encode_chunk(single, restored)) + 20
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -138,7 +138,7 @@ def test_values_that_repeat_cost_next_to_nothing() -> None:
 def test_a_few_holes_in_an_attribute_cost_little() -> None:
     values = normal("float32", 20000)
     restored = on_lattice(values, 1e-5)
-    usual = len(encode_piece(values, restored))
+    usual = len(encode_chunk(values, restored))
     values[300:400] = np.nan
     assert len(assert_comes_back(values, restored)) < usual + 40
 
@@ -163,37 +163,37 @@ def test_offsets_that_repeat_cost_little(step: float) -> None:
     assert lattice is not None
     assert lattice.step == pytest.approx(step, rel=1e-6)
     restored = lattice.values(lattice.coordinates(values), values.dtype).ravel()
-    data = encode_piece(values.ravel(), restored, lattice.step)
-    assert_same_bits(decode_piece(restored, data, 0), values.ravel())
-    assert len(data) < 0.35 * len(encode_piece(values.ravel(), restored))
+    data = encode_chunk(values.ravel(), restored, lattice.step)
+    assert_same_bits(decode_chunk(restored, data, 0), values.ravel())
+    assert len(data) < 0.35 * len(encode_chunk(values.ravel(), restored))
     for cut in range(9, len(data), 97):
-        assert decode_piece(restored, data[:cut], 0).shape == restored.shape
+        assert decode_chunk(restored, data[:cut], 0).shape == restored.shape
     with pytest.raises(CorruptStreamError, match="at most"):
-        decode_piece(restored, data + bytes(9), 0)
+        decode_chunk(restored, data + bytes(9), 0)
 
 
-def test_offsets_of_damaged_pieces_are_those_of_the_reference() -> None:
+def test_offsets_of_damaged_chunks_are_those_of_the_reference() -> None:
     rng, step = np.random.default_rng(3), 0.02
     offsets = np.repeat(rng.normal(size=16) * 100 * (np.arange(16) % 4 > 0), 64)
     original = (np.rint(9 * rng.normal(size=offsets.size)) * step + offsets).astype(np.float32)
     restored = (np.rint(original.astype(np.float64) / step) * step).astype(np.float32)
-    piece = encode_piece(original, restored, step)
-    assert piece[0] & 3 == 3
+    chunk = encode_chunk(original, restored, step)
+    assert chunk[0] & 3 == 3
     assert np.count_nonzero(original == 0), "the place of 0 is sought"
-    for changed in range(9, len(piece), 3):
-        damaged = bytearray(piece)
+    for changed in range(9, len(chunk), 3):
+        damaged = bytearray(chunk)
         damaged[changed] ^= 85
         try:
             values = reference.restore(bytes(damaged), restored)
         except StreamError:
             continue  # the damaged string ends sooner
-        assert values.tobytes() == decode_piece(restored, bytes(damaged), 0).tobytes()
+        assert values.tobytes() == decode_chunk(restored, bytes(damaged), 0).tobytes()
 
 
 def test_a_step_without_offsets_changes_nothing() -> None:
     values = normal("float32")
     restored = on_lattice(values, 1e-4)
-    assert encode_piece(values, restored, 1e-4) == encode_piece(values, restored)
+    assert encode_chunk(values, restored, 1e-4) == encode_chunk(values, restored)
 
 
 @given(
@@ -205,7 +205,7 @@ def test_any_bytes_are_values_or_refused(data: bytes, rule: int, dtype: str) -> 
     restored = normal("float64", 40).astype(dtype)
     payload = bytes([rule]) + data
     try:
-        values = decode_piece(restored, payload, 1000)
+        values = decode_chunk(restored, payload, 1000)
     except CorruptStreamError as error:
         values, offset = restored, error.offset
     else:
@@ -218,22 +218,22 @@ def test_any_bytes_are_values_or_refused(data: bytes, rule: int, dtype: str) -> 
 
 def test_the_values_themselves_take_no_argument() -> None:
     values = normal("float32", 40)
-    data = encode_piece(values, on_lattice(values, 1e-4))
+    data = encode_chunk(values, on_lattice(values, 1e-4))
     for argument in (1, 63):
-        with pytest.raises(CorruptStreamError, match="rule of exactness") as error:
-            decode_piece(values, bytes([argument << 2]) + data[1:], 7)
+        with pytest.raises(CorruptStreamError, match="rule of residual") as error:
+            decode_chunk(values, bytes([argument << 2]) + data[1:], 7)
         assert error.value.offset == 7
 
 
 def test_every_prefix_is_refused() -> None:
     values = normal("float32", 500)
     restored = on_lattice(values, 1e-4)
-    data = encode_piece(values, restored)
+    data = encode_chunk(values, restored)
     for cut in range(1, len(data)):
         with pytest.raises(CorruptStreamError):
-            decode_piece(restored, data[:cut], 0)
+            decode_chunk(restored, data[:cut], 0)
     with pytest.raises(CorruptStreamError, match="lower bits"):
-        decode_piece(restored, data + b"\0", 0)
+        decode_chunk(restored, data + b"\0", 0)
 
 
 def samples() -> list[tuple[Values, Values]]:
@@ -251,10 +251,10 @@ def samples() -> list[tuple[Values, Values]]:
 def test_the_reference_reads_the_same() -> None:
     rules = set()
     for values, restored in samples():
-        piece = encode_piece(values, restored, 0.02)
-        assert reference.restore(piece, restored).tobytes() == values.tobytes()
-        assert decode_piece(restored, piece, 0).tobytes() == values.tobytes()
-        rules.add(piece[0] & 3)
+        chunk = encode_chunk(values, restored, 0.02)
+        assert reference.restore(chunk, restored).tobytes() == values.tobytes()
+        assert decode_chunk(restored, chunk, 0).tobytes() == values.tobytes()
+        rules.add(chunk[0] & 3)
     assert rules == {1, 3}
 
 

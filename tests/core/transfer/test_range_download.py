@@ -1,4 +1,4 @@
-"""The road of HTTP Range without I/O: few requests, nothing twice, and whatever a web server may answer."""
+"""The transport of HTTP Range without I/O: few requests, nothing twice, and whatever a web server may answer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lodestream.container import Index
 from lodestream.decoding.view import View
 from lodestream.errors import OptionError, RemoteError, RemoteProtocolError, TruncatedStreamError
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import wish_of
+from lodestream.planning.selection import selection_of
 from lodestream.protocol.messages import MAX_CREDIT, MIN_WINDOW
 from lodestream.transfer.download import Download
 from lodestream.transfer.range_download import RangeDownload, RangeRequest
@@ -85,7 +85,7 @@ def large() -> bytes:
 
 @pytest.mark.parametrize("target", TARGETS, ids=repr)
 @pytest.mark.parametrize("name", SAMPLES)
-def test_both_roads_lead_to_the_same_surface(name: str, target: ls.Target) -> None:
+def test_both_transports_lead_to_the_same_surface(name: str, target: ls.Target) -> None:
     container, index = contained(name)
     too_small = target.region is not None and min(index.header.shape) < 6
     if too_small or (target.level or 0) > index.header.levels:
@@ -99,7 +99,7 @@ def test_both_roads_lead_to_the_same_surface(name: str, target: ls.Target) -> No
     assert (reception.planned, reception.received) == (chosen.bytes, chosen.bytes)
     assert decoder.metadata is not None
     assert decoder.metadata["name"] == name
-    other = ls.Decoder(wish_of(target))
+    other = ls.Decoder(selection_of(target))
     for place in chosen.slices:
         other.feed_at(place.offset, container[place.offset : place.end])
     assert np.array_equal(decoder.surface().points, other.surface().points, equal_nan=True)
@@ -154,7 +154,7 @@ def test_whatever_is_held_is_not_asked_for(large: bytes, target: ls.Target) -> N
     target=st.sampled_from(TARGETS),
     schedule=st.lists(st.tuples(st.booleans(), st.integers(0, 9000)), max_size=8),
 )
-def test_the_roads_may_change_at_any_byte(target: ls.Target, schedule: list[tuple[bool, int]]) -> None:
+def test_the_transports_may_change_at_any_byte(target: ls.Target, schedule: list[tuple[bool, int]]) -> None:
     container, index = contained("heights")
     sha256 = hashlib.sha256(container).hexdigest()
     reception = Reception(target)

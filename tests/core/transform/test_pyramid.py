@@ -154,12 +154,12 @@ def test_bits_and_moments_are_those_of_numpy(count: int, bits: int, a: int, b: i
     for weighted in (0, 1):
         moments, weight = np.full(5, 0.25), 1 / (1 + weighted * np.abs(d - (a * u + b * w) / 256))
         kernels.predictor_moments(first, second, details, a, b, weighted, moments)
-        parts = [weight * x for x in (u * u, u * w, w * w, u * d, w * d)]
-        for moment, part in zip(moments, parts, strict=True):
-            assert moment == pytest.approx(0.25 + part.sum(), abs=1e-12 * (1 + np.abs(part).sum()))
+        patches = [weight * x for x in (u * u, u * w, w * w, u * d, w * d)]
+        for moment, patch in zip(moments, patches, strict=True):
+            assert moment == pytest.approx(0.25 + patch.sum(), abs=1e-12 * (1 + np.abs(patch).sum()))
 
 
-def test_a_sample_in_parts_is_the_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_in_patches_is_the_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     values = [smooth((80, 60), 2**20), grid((300, 200), 2**10), smooth((60, 500), 2**24) + grid((60, 500), 9)]
     fits = []
     for at_once in (1 << 22, 1000):
@@ -167,8 +167,8 @@ def test_a_sample_in_parts_is_the_sample(monkeypatch: pytest.MonkeyPatch) -> Non
         for one in values:
             layout = Layout.single((one.shape[0], one.shape[1]), (False, True), (7, 7))
             fits.append(forward([load(one)], layout))
-    for whole, parts in zip(fits[:3], fits[3:], strict=True):
-        np.testing.assert_array_equal(whole, parts)
+    for whole, patches in zip(fits[:3], fits[3:], strict=True):
+        np.testing.assert_array_equal(whole, patches)
 
 
 def test_samples_that_do_not_fit_are_refused() -> None:

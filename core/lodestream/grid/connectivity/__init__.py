@@ -1,18 +1,18 @@
-"""Sides that blocks share: where blocks are split, which way their axes run, which curves are coded once.
+"""Sides that blocks share: where blocks are split, which way their axes run, which interfaces are coded once.
 
 Blocks that meet along points of their sides must keep these points the same at every level. So a shared side becomes a
-*curve*, coded once, and every block that has it is *clamped* at all its open ends (``docs/mathematics.md``, section 6):
-then a side's points at a coarser level follow from the side's points alone, whatever lies beside them. For that, a
-curve must be the whole side of every part that uses it, and be coarsened the same way from all of them:
+*interface*, coded once, and every block that has it is *clamped* at all its open ends (``docs/mathematics.md``, section
+6): then a side's points at a coarser level follow from the side's points alone, whatever lies beside them. For that, a
+interface must be the whole side of every patch that uses it, and be coarsened the same way from all of them:
 
 - `find_contacts` finds where sides run through the same points of the lattice;
 - `find_cuts` splits blocks where a contact ends amid a side, as far as the cut goes;
-- `arrange` finds the parts, matches their sides, and turns the parts round so that gaps lie at the same end.
+- `arrange` finds the patches, matches their sides, and turns the patches round so that gaps lie at the same end.
 """
 
 from __future__ import annotations
 
 from .arrange import arrange
-from .model import Arrangement, Curve, LatticeBlock, Part, Side, assemble, stored, whole_part
+from .model import Arrangement, Interface, LatticeBlock, Patch, Side, assemble, stored, whole_patch
 
-__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "arrange", "assemble", "stored", "whole_part"]
+__all__ = ["Arrangement", "Interface", "LatticeBlock", "Patch", "Side", "arrange", "assemble", "stored", "whole_patch"]

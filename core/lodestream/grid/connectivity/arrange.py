@@ -1,4 +1,4 @@
-"""From blocks to parts and the curves that they share."""
+"""From blocks to patches and the interfaces that they share."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ..axis import axis_lengths
 from .contacts import find_links, line_of
 from .cuts import Cuts, Turn, find_cuts
-from .model import Arrangement, Curve, LatticeBlock, Part, Side
+from .model import Arrangement, Interface, LatticeBlock, Patch, Side
 
 __all__ = ["arrange"]
 
 _Window = tuple[int, int]
-#: A part and one of its two axes.
-_PartAxis = tuple[int, int]
+#: A patch and one of its two axes.
+_PatchAxis = tuple[int, int]
 _SIDES = range(4)  # first row, last row, first column, last column
 
 
@@ -39,8 +39,8 @@ def arrange(blocks: Sequence[LatticeBlock], geometric: int) -> Arrangement:
     Returns
     -------
     Arrangement
-        Every side of every part is one curve from end to end or touches no other side; sides of equal points are on
-        one curve. The exception are contacts given up because of the number of parts, see `find_cuts`.
+        Every side of every patch is one interface from end to end or touches no other side; sides of equal points are
+        on one interface. The exception are contacts given up because of the number of patches, see `find_cuts`.
     """
     cuts = _cuts(blocks, geometric)
     drafts = [draft for number, block in enumerate(blocks) for draft in _drafts(number, block, cuts)]
@@ -59,13 +59,13 @@ def _cuts(blocks: Sequence[LatticeBlock], geometric: int) -> Cuts:
 
 @dataclass(frozen=True)
 class _Draft:
-    """A part before its open axes have directions; closed axes are turned already."""
+    """A patch before its open axes have directions; closed axes are turned already."""
 
     block: int
     windows: tuple[_Window, _Window]
     closed: tuple[bool, bool]
     flipped: tuple[bool, bool]
-    place: tuple[int, int]  # among the parts of its block
+    place: tuple[int, int]  # among the patches of its block
 
     def along(self, axis: int) -> NDArray[np.intp]:
         """Indices in the source block, not yet modulo its length."""
@@ -105,13 +105,13 @@ class _Matching:
     Attributes
     ----------
     sides : dict of (int, int) to (int, bool)
-        Number of a draft and of one of its sides, to the curve and whether it runs against it.
+        Number of a draft and of one of its sides, to the interface and whether it runs against it.
     users : list of list of (int, int)
-        Of each curve, such sides.
+        Of each interface, such sides.
     poles : set of (int, int)
         Sides of a single point.
     lengths : list of int
-        Of each curve.
+        Of each interface.
     closed : list of bool
     """
 
@@ -141,23 +141,25 @@ class _Matching:
                 lengths[key] = len(line)
         shared = {key: users for key, users in found.items() if len(users) > 1}
         self.users = [[user for user, _ in users] for users in shared.values()]
-        self.sides = {user: (curve, against) for curve, users in enumerate(shared.values()) for user, against in users}
+        self.sides = {
+            user: (interface, against) for interface, users in enumerate(shared.values()) for user, against in users
+        }
         self.lengths = [lengths[key] for key in shared]
         self.closed = [key[0] for key in shared]
 
 
 @dataclass(frozen=True)
 class _Directions:
-    flipped: set[_PartAxis]
-    stops: set[_PartAxis]
+    flipped: set[_PatchAxis]
+    stops: set[_PatchAxis]
 
 
 def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
     """Turn open axes so that shared sides run the same way, wherever it matters and can be done."""
     # Opposite sides are one axis; what a shared side says of two axes is whether they run against each other.
-    related: dict[_PartAxis, list[tuple[_PartAxis, bool]]] = {}
+    related: dict[_PatchAxis, list[tuple[_PatchAxis, bool]]] = {}
 
-    def relate(one: _PartAxis, other: _PartAxis, against: bool) -> None:
+    def relate(one: _PatchAxis, other: _PatchAxis, against: bool) -> None:
         related.setdefault(one, []).append((other, against))
         related.setdefault(other, []).append((one, against))
 
@@ -173,9 +175,9 @@ def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
             neighbour = numbers.get((draft.block, *place))
             if neighbour is not None:
                 relate((number, along), (neighbour, along), False)
-    flipped: set[_PartAxis] = set()
-    stops: set[_PartAxis] = set()
-    met: dict[_PartAxis, bool] = {}
+    flipped: set[_PatchAxis] = set()
+    stops: set[_PatchAxis] = set()
+    met: dict[_PatchAxis, bool] = {}
     for root in related:
         if root in met:
             continue
@@ -203,8 +205,8 @@ def _has_direction(length: int) -> bool:
 
 
 def _finished(drafts: Sequence[_Draft], matching: _Matching, directions: _Directions) -> Arrangement:
-    ahead: dict[int, bool] = {}  # of each curve, whether its first user runs against the order it was matched in
-    parts, curves = [], []
+    ahead: dict[int, bool] = {}  # of each interface, whether its first user runs against the order it was matched in
+    patches, interfaces = [], []
     for number, draft in enumerate(drafts):
         flips = [(number, axis) in directions.flipped for axis in (0, 1)]
         # As stored, the first side of an axis that is flipped is what was its last.
@@ -215,13 +217,13 @@ def _finished(drafts: Sequence[_Draft], matching: _Matching, directions: _Direct
             if found is None:
                 sides.append(None)
                 continue
-            curve, against = found
+            interface, against = found
             runs_against = against != flips[1 - side // 2]
-            sides.append(Side(curve, ahead.setdefault(curve, runs_against) != runs_against))
+            sides.append(Side(interface, ahead.setdefault(interface, runs_against) != runs_against))
         shares = any(sides)
         clamped = [not draft.closed[side // 2] and (shares or (number, side) in matching.poles) for side in order]
-        parts.append(
-            Part(
+        patches.append(
+            Patch(
                 draft.block,
                 *draft.windows,
                 draft.closed,
@@ -232,5 +234,5 @@ def _finished(drafts: Sequence[_Draft], matching: _Matching, directions: _Direct
             )
         )
     for users, length, closed in zip(matching.users, matching.lengths, matching.closed, strict=True):
-        curves.append(Curve(length, closed, (users[0][0], 1 - users[0][1] // 2) in directions.stops))
-    return Arrangement(tuple(parts), tuple(curves))
+        interfaces.append(Interface(length, closed, (users[0][0], 1 - users[0][1] // 2) in directions.stops))
+    return Arrangement(tuple(patches), tuple(interfaces))

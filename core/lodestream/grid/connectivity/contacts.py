@@ -140,7 +140,7 @@ def _edges(points: NDArray[np.intp], valid: NDArray[np.bool_], offsets: NDArray[
     inside = side[1:] == side[:-1]
     position = np.arange(len(points)) - offsets[side]
     firm = valid[1:] & valid[:-1] & (points[1:] != points[:-1])
-    return _Edges(*(part[inside] for part in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
+    return _Edges(*(patch[inside] for patch in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
 
 
 def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) -> list[Link]:

@@ -1,4 +1,4 @@
-"""Where blocks are split, so that every side of every part is shared whole or not at all.
+"""Where blocks are split, so that every side of every patch is shared whole or not at all.
 
 A contact that ends amid a side splits the block there, right through to the opposite side; what is linked with that
 side at the cut is split too, and so on. A rim (a side along a closed axis) shared whole needs no cut: the axes of all
@@ -15,10 +15,10 @@ from .contacts import Axis, Link
 
 __all__ = ["Cuts", "Turn", "find_cuts"]
 
-#: Parts that any surface may be split into, and as many more for each of its blocks. Blocks that meet at corners stay
-#: whole; brick walls of 32 x 32 blocks come to 32 parts a block; what goes beyond are contacts by chance, and axes that
-#: wind round and round, where parts would be too small to be worth coding.
-PARTS, PARTS_OF_BLOCK = 64, 32
+#: Patches that any surface may be split into, and as many more for each of its blocks. Blocks that meet at corners stay
+#: whole; brick walls of 32 x 32 blocks come to 32 patches a block; what goes beyond are contacts by chance, and axes
+#: that wind round and round, where patches would be too small to be worth coding.
+PATCHES, PATCHES_OF_BLOCK = 64, 32
 #: Where that is exceeded, so many times fewer must do for contacts that split anything.
 _SPARING = 8
 
@@ -60,9 +60,9 @@ class Cuts:
 
 
 def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis], links: Sequence[Link]) -> Cuts:
-    """Find where blocks must be split so that all contacts end at ends of parts.
+    """Find where blocks must be split so that all contacts end at ends of patches.
 
-    Where that makes more than 64 + 32 ``blocks`` parts, contacts are taken one by one, the longest first, and those
+    Where that makes more than 64 + 32 ``blocks`` patches, contacts are taken one by one, the longest first, and those
     given up that lead to more than 8 + 4 ``blocks``: there, sides that touch are coded separately.
 
     Parameters
@@ -80,9 +80,9 @@ def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]
     -------
     Cuts
     """
-    limit = PARTS + PARTS_OF_BLOCK * len(lengths) // 2
+    limit = PATCHES + PATCHES_OF_BLOCK * len(lengths) // 2
     contacts = _Seams(lengths, closed, sides).contacts(links)
-    # Every contact is at least one of the four sides of a part.
+    # Every contact is at least one of the four sides of a patch.
     if len(contacts) <= 4 * limit:
         splitting = _Splitting(lengths, closed, sides, limit)
         if splitting.add(contacts):
@@ -167,12 +167,12 @@ class _Splitting:
         self.cuts = Cuts(lengths, closed)
         self._sides = sides
         self._limit = limit
-        self._parts = len(lengths) // 2
+        self._patches = len(lengths) // 2
         self._links: dict[Axis, list[Link]] = defaultdict(list)
 
     def add(self, contacts: Sequence[_Contact]) -> bool:
-        """Split for these contacts; if that makes too many parts, leave everything as it was and say no."""
-        parts, turns, made = self._parts, self.cuts.turns, list[_Place]()
+        """Split for these contacts; if that makes too many patches, leave everything as it was and say no."""
+        patches, turns, made = self._patches, self.cuts.turns, list[_Place]()
         pending: list[_Place] = []
         for contact in contacts:
             pending.extend(contact.ends)
@@ -189,7 +189,7 @@ class _Splitting:
             for contact in contacts:
                 for link in contact.links:
                     self._links[self._sides[link.source]].remove(link)
-            self._parts, self.cuts.turns = parts, turns
+            self._patches, self.cuts.turns = patches, turns
         return fits
 
     def _images(self, link: Link, place: int) -> list[_Place]:
@@ -200,7 +200,7 @@ class _Splitting:
         return [(self._sides[link.target], link.at(place))] if link.first <= place <= link.last else []
 
     def _split(self, pending: list[_Place], made: list[_Place]) -> bool:
-        """Cut axes, and all that is linked with them there; False as soon as there are too many parts."""
+        """Cut axes, and all that is linked with them there; False as soon as there are too many patches."""
         while pending:
             axis, place = pending.pop()
             length = self.cuts.lengths[axis]
@@ -213,8 +213,8 @@ class _Splitting:
             pieces = self.cuts.pieces(axis)
             self.cuts.at[axis].add(place)
             made.append((axis, place))
-            self._parts += (self.cuts.pieces(axis) - pieces) * self.cuts.pieces((axis[0], 1 - axis[1]))
-            if self._parts > self._limit:
+            self._patches += (self.cuts.pieces(axis) - pieces) * self.cuts.pieces((axis[0], 1 - axis[1]))
+            if self._patches > self._limit:
                 return False
             for link in self._links[axis]:
                 pending.extend(self._images(link, place))

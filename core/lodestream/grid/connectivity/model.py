@@ -1,4 +1,4 @@
-"""Parts of blocks: what they are, cut out of a block and put together again."""
+"""Patches of blocks: what they are, cut out of a block and put together again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrangement", "Curve", "LatticeBlock", "Part", "Side", "assemble", "stored", "whole_part"]
+__all__ = ["Arrangement", "Interface", "LatticeBlock", "Patch", "Side", "assemble", "stored", "whole_patch"]
 
 
 @dataclass(frozen=True)
@@ -34,23 +34,23 @@ class LatticeBlock:
 
 @dataclass(frozen=True)
 class Side:
-    """A side of a part that is a curve.
+    """A side of a patch that is an interface.
 
     Attributes
     ----------
-    curve : int
+    interface : int
     reversed : bool
-        The part's stored order along the side runs against the curve's. Only where both orders are coarsened to the
-        same nodes: at lengths of which every level down to the last is odd, and where the axis `stops`. Never on a
-        closed curve.
+        The patch's stored order along the side runs against the interface's. Only where both orders are coarsened to
+        the same nodes: at lengths of which every level down to the last is odd, and where the axis `stops`. Never on a
+        closed interface.
     """
 
-    curve: int
+    interface: int
     reversed: bool
 
 
 @dataclass(frozen=True)
-class Part:
+class Patch:
     """What is coded as one block: a window of a source block, perhaps turned round.
 
     Attributes
@@ -58,7 +58,7 @@ class Part:
     block : int
         Number of the source block.
     rows, columns : (int, int)
-        First and past-the-last index in the source block. Neighbouring parts share the row or column of points at a
+        First and past-the-last index in the source block. Neighbouring patches share the row or column of points at a
         cut. Along a closed axis of N samples indices count modulo N: a closed axis that was not cut may begin anywhere,
         (s, s + N); one with a single cut at s is (s, s + N + 1), its last points being its first ones.
     closed : (bool, bool)
@@ -68,7 +68,7 @@ class Part:
     sides : four of Side or None
         First row, last row, first column, last column, as stored. None: not shared, or no side (a closed axis).
     clamped : four bools
-        The same order: the points of that side are kept when the axis across it is coarsened. All open ends of a part
+        The same order: the points of that side are kept when the axis across it is coarsened. All open ends of a patch
         that shares any side; of others, poles.
     stops : (bool, bool)
         The axis is not coarsened further once its length is even, for want of a consistent direction.
@@ -90,15 +90,15 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Points that are a side of at least two parts, or twice of one.
+class Interface:
+    """Points that are a side of at least two patches, or twice of one.
 
     Attributes
     ----------
     length : int
         Number of points.
     closed : bool
-        The rim of parts that are closed along it; otherwise the curve is clamped at both ends.
+        The rim of patches that are closed along it; otherwise the interface is clamped at both ends.
     stops : bool
         It is not coarsened further once its length is even.
     """
@@ -110,25 +110,25 @@ class Curve:
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Parts of all blocks (block by block, row by row), and the curves that they share (in the order of first use)."""
+    """Patches of all blocks (block by block, row by row), and the interfaces that they share, by first use."""
 
-    parts: tuple[Part, ...]
-    curves: tuple[Curve, ...]
+    patches: tuple[Patch, ...]
+    interfaces: tuple[Interface, ...]
 
 
-def whole_part(block: int, shape: tuple[int, int], closed: tuple[bool, bool]) -> Part:
-    """A block as its only part, which shares no side."""
+def whole_patch(block: int, shape: tuple[int, int], closed: tuple[bool, bool]) -> Patch:
+    """A block as its only patch, which shares no side."""
     none = (None, None, None, None)
     free = (False, False, False, False)
-    return Part(block, (0, shape[0]), (0, shape[1]), closed, (False, False), none, free, (False, False))
+    return Patch(block, (0, shape[0]), (0, shape[1]), closed, (False, False), none, free, (False, False))
 
 
-def stored(part: Part, values: NDArray[Any]) -> NDArray[Any]:
-    """A part as it is stored: its window of the source block, turned round where it is flipped.
+def stored(patch: Patch, values: NDArray[Any]) -> NDArray[Any]:
+    """A patch as it is stored: its window of the source block, turned round where it is flipped.
 
     Parameters
     ----------
-    part : Part
+    patch : Patch
     values : array, shape (H, W, ...)
         Of the source block at full resolution: points, mask, attributes.
 
@@ -139,15 +139,15 @@ def stored(part: Part, values: NDArray[Any]) -> NDArray[Any]:
     """
     rows, columns = (
         np.arange(*(window[::-1] if flipped else window), -1 if flipped else 1) - flipped
-        for window, flipped in zip((part.rows, part.columns), part.flipped, strict=True)
+        for window, flipped in zip((patch.rows, patch.columns), patch.flipped, strict=True)
     )
     return values[np.ix_(rows % values.shape[0], columns % values.shape[1])]
 
 
 def assemble(
-    closed: Sequence[tuple[bool, bool]], parts: Sequence[Part], grids: Sequence[NDArray[Any]]
+    closed: Sequence[tuple[bool, bool]], patches: Sequence[Patch], grids: Sequence[NDArray[Any]]
 ) -> list[NDArray[Any]]:
-    """Put the grids of parts at one level together into grids of the source blocks.
+    """Put the grids of patches at one level together into grids of the source blocks.
 
     At full resolution that undoes `stored`. At a coarser level, a closed axis begins at the node nearest in number to
     the source's first sample.
@@ -156,27 +156,27 @@ def assemble(
     ----------
     closed : sequence of (bool, bool)
         Of each source block.
-    parts : sequence of Part
-        All parts of all blocks, in the order of the `Arrangement`.
+    patches : sequence of Patch
+        All patches of all blocks, in the order of the `Arrangement`.
     grids : sequence of arrays, shape (rows, columns, ...)
-        Of each part at that level, as stored.
+        Of each patch at that level, as stored.
 
     Returns
     -------
     list of arrays, shape (rows, columns, ...)
     """
-    found: list[list[tuple[Part, NDArray[Any]]]] = [[] for _ in closed]
-    for part, grid in zip(parts, grids, strict=True):
-        turned = grid[:: -1 if part.flipped[0] else 1, :: -1 if part.flipped[1] else 1]
-        found[part.block].append((part, turned))
+    found: list[list[tuple[Patch, NDArray[Any]]]] = [[] for _ in closed]
+    for patch, grid in zip(patches, grids, strict=True):
+        turned = grid[:: -1 if patch.flipped[0] else 1, :: -1 if patch.flipped[1] else 1]
+        found[patch.block].append((patch, turned))
     return [_assembled(closed[block], pieces) for block, pieces in enumerate(found)]
 
 
-def _assembled(closed: tuple[bool, bool], pieces: list[tuple[Part, NDArray[Any]]]) -> NDArray[Any]:
+def _assembled(closed: tuple[bool, bool], pieces: list[tuple[Patch, NDArray[Any]]]) -> NDArray[Any]:
     first, last = pieces[0][0], pieces[-1][0]
     bands: dict[tuple[int, int], list[NDArray[Any]]] = {}
-    for part, grid in pieces:
-        bands.setdefault(part.rows, []).append(grid)
+    for patch, grid in pieces:
+        bands.setdefault(patch.rows, []).append(grid)
     whole = _joined([_joined(band, 1) for band in bands.values()], 0)
     for axis, (start, stop) in enumerate(((first.rows[0], last.rows[1]), (first.columns[0], last.columns[1]))):
         if not closed[axis]:

@@ -1,4 +1,4 @@
-"""Pieces of exactness, the last bits of values: sections 9 to 9.2 of docs/format.md."""
+"""Chunks of residual, the last bits of values: sections 9 to 9.2 of docs/format.md."""
 
 from typing import Any
 
@@ -14,18 +14,18 @@ CONTEXTS = SHORTER + 256
 MASK = (1 << 64) - 1
 
 
-def restore(piece: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]:
-    """Restore the values of a piece.
+def restore(chunk: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]:
+    """Restore the values of a chunk.
 
-    `piece` (bytes): the piece; `values` ((n,)): what the complete layers give, in the channel's type; `offset` (int):
-    where it begins in the container. Returns (n,): the values, of the same type. Raises CorruptStreamError if the piece
+    `chunk` (bytes): the chunk; `values` ((n,)): what the complete layers give, in the channel's type; `offset` (int):
+    where it begins in the container. Returns (n,): the values, of the same type. Raises CorruptStreamError if the chunk
     is damaged.
     """
-    if not piece:
+    if not chunk:
         return values.copy()
-    fields = Fields(piece, offset)
-    if not len(values) or len(piece) > 1 + values.nbytes:
-        raise fields.damaged("a piece is longer than its values")
+    fields = Fields(chunk, offset)
+    if not len(values) or len(chunk) > 1 + values.nbytes:
+        raise fields.damaged("a chunk is longer than its values")
     first = fields.u8()
     rule, argument = first & 3, first >> 2
     floats = values.dtype.kind == "f"
@@ -52,9 +52,9 @@ def restore(piece: bytes, values: NDArray[Any], offset: int = 0) -> NDArray[Any]
     try:
         differences, special = _differences(places, limits, count, RangeCoder(coded, new_contexts(CONTEXTS)), stored)
     except IndexError:
-        raise fields.damaged("the stored bits of a piece end too early") from None
+        raise fields.damaged("the stored bits of a chunk end too early") from None
     except ValueError:
-        raise fields.damaged("a piece has more stored bits than are taken") from None
+        raise fields.damaged("a chunk has more stored bits than are taken") from None
     restored = _values(places + differences, values.dtype, rule, argument)
     chosen = special >= 0
     restored[chosen] = patterns[special[chosen]]
