@@ -3,7 +3,7 @@
 The queue is on disk: it consists of the records whose state is queued. What can happen to a build:
 
 ======================================  ================================================================================
-the reader rejects the file             the surface is failed, for good
+the reader rejects the file             the surface is failed, for good, once that is recorded
 the surface is deleted                  its process is killed
 the process dies, or lacks memory       one more attempt in another process, then the surface waits
 the process gets SIGTERM                another attempt, at most `_ENDINGS` in all: a service is being stopped
@@ -443,8 +443,11 @@ class Builder:
             return await self._postpone(record, problem)
         if record.info is not None:
             return await self._postpone(record, f"it was ready before, and cannot be built again: {reason}")
+        try:
+            await asyncio.to_thread(self._storage.failed, record.id, reason)
+        except OSError as error:
+            return await self._postpone(record, f"{reason}; that could not be recorded: {_not_now(error).reason}")
         _log.info("%s failed: %s", record.id, reason)
-        await asyncio.to_thread(self._storage.failed, record.id, reason)
         return "failed"
 
     async def _damage(self, record: Record) -> str | None:

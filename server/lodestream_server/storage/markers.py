@@ -7,8 +7,10 @@ elsewhere.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import secrets
+from dataclasses import dataclass
 from pathlib import Path
 
 from lodestream.errors import LodestreamError
@@ -22,10 +24,32 @@ __all__ = ["MARKER", "adopt", "establish", "fault", "identity"]
 #: Name of the marker in each folder.
 MARKER = "identity"
 
-# Beside the folders while they are being marked for the first time, so that a start that was cut short is finished.
+# Beside the folders while they are being marked, so that a marking that was cut short is finished by the next start.
 _MARKING = "marking"
 
 _IDENTITY = re.compile(rb"[0-9a-f]{32}\n")
+_NOTE = re.compile(rb"([0-9a-f]{32})\n((?:[a-z]+ (?:none|[0-9a-f]{64})\n)*)")
+
+
+@dataclass(frozen=True)
+class _Marking:
+    """What the note beside the folders says.
+
+    Attributes
+    ----------
+    number : str
+        What every marker will hold.
+    found : dict of str or None
+        Of folders that are adopted: by name, the SHA-256 of the marker that was there, None where there was none.
+        Empty in a folder that is marked for the first time.
+    """
+
+    number: str
+    found: dict[str, str | None]
+
+    def to_bytes(self) -> bytes:
+        lines = (f"{name} {before or 'none'}\n" for name, before in self.found.items())
+        return f"{self.number}\n{''.join(lines)}".encode()
 
 
 def establish(at: Folders) -> str:
@@ -43,19 +67,20 @@ def establish(at: Folders) -> str:
     OSError
         If the folders cannot be read or written.
     """
-    marking = _read(at.root / _MARKING)
+    marking = _marking(at)
     problem = fault(at)
     if problem is not None:
         raise LodestreamError(
             f"{problem}. Is a disk not mounted? Nothing was changed. If the folders were moved here on purpose, run "
             f"`lodestream fsck --adopt {at.root}`"
         )
-    found = identity(at.records)
-    if marking is None and found is not None and all(identity(folder) for folder in at.kept):
-        return found
-    chosen = marking or secrets.token_hex(16)
-    _mark(at, chosen)
-    return chosen
+    if marking is None:
+        found = identity(at.records)
+        if found is not None and all(identity(folder) for folder in at.kept):
+            return found
+        marking = _Marking(secrets.token_hex(16), {})
+    _mark(at, marking)
+    return marking.number
 
 
 def identity(folder: Path) -> str | None:
@@ -68,14 +93,20 @@ def identity(folder: Path) -> str | None:
     OSError
         If it cannot be read.
     """
-    return _read(folder / MARKER)
+    path = folder / MARKER
+    data = _contents(path)
+    if data is not None and not _IDENTITY.fullmatch(data):
+        raise LodestreamError(f"expected 32 hexadecimal digits and the end of the line in {path}, got {data[:40]!a}")
+    return None if data is None else data.decode().strip()
 
 
 def fault(at: Folders) -> str | None:
     """The reason why a server would not start in a folder; None if it would."""
-    marking = _read(at.root / _MARKING)
+    marking = _marking(at)
+    if marking is not None and marking.found:
+        return _fault_of_adopted(at, marking)
     found = {folder: identity(folder) for folder in at.kept}
-    known = {mark for mark in (*found.values(), marking) if mark is not None}
+    known = {mark for mark in (*found.values(), marking and marking.number) if mark is not None}
     if len(known) > 1:
         told = ", ".join(f"{folder.name}/ {mark or 'none'}" for folder, mark in found.items())
         return f"expected the same marker in each folder of {at.root}, got {told}"
@@ -90,15 +121,27 @@ def fault(at: Folders) -> str | None:
 def adopt(at: Folders) -> None:
     """Mark the folders as belonging together, whatever their markers say; missing folders are created.
 
+    If this ends between two markers, the next start finishes it.
+
     Raises
     ------
     OSError
         If the folders cannot be read or written.
     """
     for folder in at.kept:
-        remove(folder / MARKER)
-    remove(at.root / _MARKING)
-    _mark(at, secrets.token_hex(16))
+        folder.mkdir(exist_ok=True)
+    _mark(at, _Marking(secrets.token_hex(16), {folder.name: _hash(folder) for folder in at.kept}))
+
+
+def _fault_of_adopted(at: Folders, marking: _Marking) -> str | None:
+    # Whoever asked for it spoke of the folders that were there: not of what is mounted in their places since.
+    for folder in at.kept:
+        before = marking.found.get(folder.name)
+        if not folder.is_dir() or (_hash(folder) != before and identity(folder) != marking.number):
+            return (
+                f"expected the {folder.name}/ of {at.root} that were being adopted when that was cut short, got others"
+            )
+    return None
 
 
 def _fault_of_unmarked(at: Folders) -> str | None:
@@ -135,21 +178,34 @@ def _needed(at: Folders) -> dict[Path, int]:
     return {folder: count for folder, count in needed.items() if count}
 
 
-def _mark(at: Folders, mark: str) -> None:
-    data = f"{mark}\n".encode()
-    write_file(at.root / _MARKING, data)
+def _mark(at: Folders, marking: _Marking) -> None:
+    write_file(at.root / _MARKING, marking.to_bytes())
     for folder in at.kept:
         folder.mkdir(exist_ok=True)
-        write_file(folder / MARKER, data)
+        write_file(folder / MARKER, f"{marking.number}\n".encode())
     remove(at.root / _MARKING)
     sync_folder(at.root)
 
 
-def _read(path: Path) -> str | None:
+def _marking(at: Folders) -> _Marking | None:
+    path = at.root / _MARKING
+    data = _contents(path)
+    if data is None:
+        return None
+    parts = _NOTE.fullmatch(data)
+    if parts is None:
+        raise LodestreamError(f"expected the number of a marker, and of those before, in {path}, got {data[:40]!a}")
+    lines = (line.split() for line in parts[2].decode().splitlines())
+    return _Marking(parts[1].decode(), {name: None if before == "none" else before for name, before in lines})
+
+
+def _hash(folder: Path) -> str | None:
+    data = _contents(folder / MARKER)
+    return None if data is None else hashlib.sha256(data).hexdigest()
+
+
+def _contents(path: Path) -> bytes | None:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return None
-    if not _IDENTITY.fullmatch(data):
-        raise LodestreamError(f"expected 32 hexadecimal digits and the end of the line in {path}, got {data[:40]!a}")
-    return data.decode().strip()

@@ -332,27 +332,29 @@ class Storage:
     def failed(self, surface: str, reason: str) -> None:
         """Record that a reader rejected the files of a surface; they stay until the surface is deleted.
 
-        Where that cannot be recorded the surface waits: what is told as failed stays so, after a restart too.
+        Raises
+        ------
+        OSError
+            If that cannot be recorded; the surface is then as before, because nobody may be told what a restart could
+            take back.
         """
-        self._stop(surface, "failed", reason)
+        with self._lock:
+            record = self._catalog.find(surface)
+            if record is not None:
+                self._write(_stopped(record, "failed", reason))
 
     def postpone(self, surface: str, reason: str) -> None:
         """Record that a surface could not be built now; it waits for a retry."""
-        self._stop(surface, "waiting", reason)
-
-    def _stop(self, surface: str, state: State, reason: str) -> None:
         with self._lock:
             record = self._catalog.find(surface)
             if record is None:
                 return
-            made = replace(record, state=state, reason=reason, attempts=0)
+            made = _stopped(record, "waiting", reason)
             try:
                 self._write(made)
             except OSError as error:
                 # What this says is found out again after a restart.
                 _log.error("%s: the record could not be written: %s", surface, error)
-                if state == "failed":
-                    made = replace(made, state="waiting", reason=f"{reason} (this could not be recorded: {error})")
                 self._catalog.put(made)
 
     def retry(self, surface: str) -> Record:
@@ -451,6 +453,10 @@ class Storage:
         kept = replace(record, state="queued", reason=None) if record.state == "missing" else record
         write_file(self._at.record(record.id), serialize(kept))
         self._catalog.put(record)
+
+
+def _stopped(record: Record, state: State, reason: str) -> Record:
+    return replace(record, state=state, reason=reason, attempts=0)
 
 
 def _may_be(known: Record, record: Record) -> bool:

@@ -196,11 +196,20 @@ def test_other_values_of_iblank_are_kept(tmp_path: Path) -> None:
     assert surface.attributes["iblank"].tolist() == [[1, 1], [0, 2], [-3, 1], [1, 1]]
 
 
-@pytest.mark.parametrize(("word", "value"), [("7e30", 2**31 - 1), ("-7e30", -(2**31)), ("1e99", 2**31 - 1)])
-def test_values_of_iblank_beyond_32_bits_are_the_nearest_ones(tmp_path: Path, word: str, value: int) -> None:
+@pytest.mark.parametrize("word", ["7e30", "-7e30", "2147483648", "0.5", "nan", "inf", "-inf"])
+def test_text_whose_iblank_is_no_integer_of_32_bits_is_refused(tmp_path: Path, word: str) -> None:
     path = tmp_path / "grid.fmt"
-    numbers = " ".join(f"{value}.5" for value in range(24))
-    path.write_text(f"2 4\n {numbers[: numbers.index('16.5')]} 1 1 0 2 -3 1 1 {word}\n")
+    numbers = " ".join(f"{value}.5" for value in range(16))
+    path.write_text(f"2 4\n {numbers} 1 1 0 2 -3 1 1 {word}\n")
+    with pytest.raises(FormatError, match=f"IBLANK of integers of 32 bits, got {float(word):g}".replace("+", r"\+")):
+        formats.read(path, dimensions="2")
+
+
+@pytest.mark.parametrize("value", [-(2**31), 2**31 - 1])
+def test_text_has_any_iblank_of_32_bits(tmp_path: Path, value: int) -> None:
+    path = tmp_path / "grid.fmt"
+    numbers = " ".join(f"{value}.5" for value in range(16))
+    path.write_text(f"2 4\n {numbers} 1 1 0 2 -3 1 1 {value}\n")
     surface = formats.read(path, dimensions="2")
     assert surface.attributes["iblank"].tolist() == [[1, 1], [0, 2], [-3, 1], [1, value]]
 

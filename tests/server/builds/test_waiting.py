@@ -5,18 +5,21 @@ from __future__ import annotations
 import argparse
 import errno
 import json
+import logging
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
-from lodestream_server.builds import worker
+from lodestream_server.builds import jobs, worker
 from lodestream_server.commands.fsck import register
+from lodestream_server.storage.records import Record
 from lodestream_server.storage.storage import Storage
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
-from tests.server.helpers import hills, npy, problem, push, settled, upload_of
+from tests.server.helpers import eventually, hills, npy, problem, push, settled, upload_of
 
 BODY = npy(hills(seed=5))
 
@@ -62,6 +65,47 @@ def test_bytes_that_are_no_surface_are_refused_for_good(tmp_path: Path) -> None:
         assert (upload_of(data, surface) / "0").read_bytes() == BODY[:-1]
         assert http.delete(surface["url"]).status_code == 204
         assert not (data / "uploads" / surface["id"]).exists()
+
+
+@pytest.mark.parametrize(("number", "state"), [(errno.ENOSPC, "queued"), (errno.EIO, "waiting")])
+def test_nobody_is_told_of_a_failure_that_a_restart_could_take_back(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    number: int,
+    state: str,
+) -> None:
+    """A record that cannot be written says after a restart that the surface is queued."""
+    caplog.set_level(logging.INFO, "lodestream_server")
+    write = Storage._write
+
+    def broken(storage: Storage, record: Record) -> None:
+        if record.state == "failed":
+            raise OSError(number, os.strerror(number))
+        write(storage, record)
+
+    monkeypatch.setattr(Storage, "_write", broken)
+    monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
+    with running(tmp_path / "data") as http:
+        location = http.post("/v1/surfaces", content=BODY[:-1]).headers["location"]
+
+        def reason() -> str | None:
+            said: dict[str, Any] = http.get(location).json()
+            assert said["state"] in ("queued", "building", state)
+            return said.get("reason") if said["state"] == state else None
+
+        told = eventually(reason, "a reason")
+        assert not [record for record in caplog.records if " failed: " in record.getMessage()]
+        assert 'state="failed"' not in http.get("/metrics").text
+        monkeypatch.undo()
+        if state == "queued":
+            assert told == "waits for space on the server's disk"
+        else:
+            assert "that could not be recorded: the server's disk: Input/output error" in told
+            assert http.post(f"{location}/retry").status_code == 202
+        assert settled(http, location)["state"] == "failed"
+    with running(tmp_path / "data") as http:
+        assert http.get(location).json()["state"] == "failed"
 
 
 def test_it_waits_over_a_restart_and_is_built_when_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

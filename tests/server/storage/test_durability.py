@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import itertools
 import logging
@@ -16,7 +15,7 @@ from lodestream_server.storage import durable
 from lodestream_server.storage.records import Record
 from lodestream_server.storage.storage import Storage
 from lodestream_server.storage.uploads import Upload
-from tests.server.storage.disks import LosingDisk
+from tests.server.storage.disks import FullDisk, LosingDisk
 
 UPLOADS = {"a" * 20: b"first" * 100, "b" * 20: b"second" * 100}
 CONTAINER = b"container" * 1000
@@ -135,18 +134,18 @@ def test_a_surface_has_not_failed_until_that_is_recorded(tmp_path: Path, monkeyp
     surface = next(iter(UPLOADS))
     storage = Storage(tmp_path / "data")
     take(storage, surface)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(storage, "_write", full)
-        storage.failed(surface, "no surface")
-    record = storage.get(surface)
-    assert record.state == "waiting"
-    assert record.reason is not None
-    assert record.reason.startswith("no surface (this could not be recorded: ")
-    storage.failed(surface, "no surface")
+    before = storage.get(surface)
+    for step in itertools.count():
+        disk = FullDisk(step)
+        monkeypatch.setattr(durable, "disk", disk)
+        try:
+            storage.failed(surface, "no surface")
+        except OSError:
+            assert storage.get(surface) == before
+        else:
+            break
+    assert step == len(disk.steps) > 3
+    monkeypatch.undo()
     storage.close()
     again = Storage(tmp_path / "data")
     assert again.get(surface).state == "failed"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import itertools
 import json
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import httpx
 import pytest
@@ -17,10 +20,11 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.commands.fsck import register
-from lodestream_server.storage.durable import write_file
-from lodestream_server.storage.markers import MARKER
+from lodestream_server.storage.durable import Disk, write_file
+from lodestream_server.storage.folders import Folders
+from lodestream_server.storage.markers import MARKER, adopt
 from lodestream_server.storage.storage import Storage
-from tests.server.helpers import hills, npy, push, upload_of
+from tests.server.helpers import hills, npy, push, settled, upload_of
 
 FOLDERS = ("records", "uploads", "containers")
 
@@ -161,6 +165,135 @@ def test_marking_that_was_cut_short_is_finished(
     monkeypatch.undo()
     assert served(data) == surfaces
     assert not (data / "marking").exists()
+
+
+def cut_short(data: Path, after: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adopt the folders, and let the file after so many others not be written."""
+    written: list[Path] = []
+
+    def cut(path: Path, content: bytes) -> None:
+        if len(written) == after:
+            raise OSError("the machine stops here")
+        written.append(path)
+        write_file(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lodestream_server.markers.write_file", cut)
+        with pytest.raises(OSError, match="stops here"):
+            adopt(Folders(data))
+
+
+@pytest.mark.parametrize("after", range(4))
+@pytest.mark.parametrize("markers", ["of one server", "none", "no markers"])
+def test_adopting_that_was_cut_short_is_finished(
+    data: Path, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, after: int, markers: str
+) -> None:
+    if markers == "none":
+        unmark(data)
+    elif markers == "no markers":
+        for name in FOLDERS:
+            (data / name / MARKER).write_bytes(b"\xff\x00")
+    cut_short(data, after, monkeypatch)
+    if markers == "no markers" and after == 0:  # nothing was begun
+        with pytest.raises(LodestreamError, match="expected 32 hexadecimal digits"):
+            Storage(data)
+        return
+    assert served(data) == surfaces
+    assert len({(data / name / MARKER).read_text() for name in FOLDERS}) == 1
+    assert not (data / "marking").exists()
+
+
+class Stale(Disk):
+    """A disk on which one step goes wrong."""
+
+    def __init__(self, step: int) -> None:
+        self.left = step
+
+    def _ask(self) -> None:
+        self.left -= 1
+        if self.left == -1:
+            raise OSError(errno.ESTALE, "Stale file handle")
+
+    def create(self, path: Path) -> BinaryIO:
+        self._ask()
+        return super().create(path)
+
+    def write(self, file: BinaryIO, data: bytes) -> None:
+        self._ask()
+        super().write(file, data)
+
+    def sync(self, handle: int, path: Path) -> None:
+        self._ask()
+        super().sync(handle, path)
+
+    def rename(self, source: Path, target: Path) -> None:
+        self._ask()
+        super().rename(source, target)
+
+    def unlink(self, path: Path) -> None:
+        self._ask()
+        super().unlink(path)
+
+
+def test_a_server_starts_after_adopting_that_an_error_has_ended_anywhere(
+    data: Path, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for step in itertools.count():
+        with monkeypatch.context() as patch:
+            disk = Stale(step)
+            patch.setattr("lodestream_server.durable.disk", disk)
+            with suppress(OSError):
+                adopt(Folders(data))
+        storage = Storage(data)
+        assert {record.id for record in storage.records()} == {surface["id"] for surface in surfaces}
+        storage.close()
+        if disk.left >= 0:
+            break
+    assert step > 15
+    assert served(data) == surfaces
+
+
+def test_adopting_without_records_that_was_cut_short_is_finished(
+    data: Path, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.rmtree(data / "records")
+    cut_short(data, 1, monkeypatch)
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        for surface in surfaces:
+            assert settled(http, surface["url"]) == surface
+
+
+@pytest.mark.parametrize("instead", ["nothing", "an empty folder", "another server's"])
+def test_adopting_is_not_finished_with_other_folders(
+    data: Path, surfaces: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, instead: str
+) -> None:
+    cut_short(data, 2, monkeypatch)
+    Storage(tmp_path / "other").close()
+    for name in ("uploads", "records"):  # without its new marker, and with it
+        (data / name).rename(tmp_path / name)
+        if instead == "an empty folder":
+            (data / name).mkdir()
+        elif instead == "another server's":
+            (tmp_path / "other" / name).rename(data / name)
+        there = contents(data)
+        with pytest.raises(LodestreamError, match=rf"expected the {name}/ of .* Nothing was changed"):
+            Storage(data)
+        assert contents(data) == there
+        if (data / name).exists():
+            shutil.rmtree(data / name)
+        (tmp_path / name).rename(data / name)
+    assert served(data) == surfaces
+
+
+def test_a_note_of_adopting_that_cannot_be_read_is_replaced_by_adopting_again(
+    data: Path, surfaces: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut_short(data, 2, monkeypatch)
+    (data / "marking").write_bytes(b"records none\n")
+    with pytest.raises(LodestreamError, match="expected the number of a marker, and of those before"):
+        Storage(data)
+    adopt(Folders(data))
+    assert served(data) == surfaces
 
 
 def test_adopting_what_was_moved(

@@ -60,7 +60,13 @@ class Numbers(Protocol):
         """Read integers; None where there are none."""
 
     def array(self, place: int, count: int, layout: Layout, kind: str) -> NDArray[Any]:
-        """Give numbers of kind ``f`` or ``i``; a binary file's are not copied."""
+        """Give numbers of kind ``f`` or ``i``; a binary file's are not copied.
+
+        Raises
+        ------
+        FormatError
+            When those of kind ``i`` are no integers of 32 bits.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +178,10 @@ class _Text:
         if kind == "f":
             return values
         limits = np.iinfo(np.int32)
-        return np.clip(np.nan_to_num(values), limits.min, limits.max).astype(np.int32)
+        wrong = ~((values == np.trunc(values)) & (values >= limits.min) & (values <= limits.max))
+        if wrong.any():
+            raise FormatError(f"expected IBLANK of integers of 32 bits, got {values[wrong][0]:g}")
+        return values.astype(np.int32)
 
 
 class _Binary:
