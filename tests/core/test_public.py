@@ -43,8 +43,8 @@ def modules() -> list[str]:
 def test_every_module_says_what_it_is_and_what_it_exports(name: str) -> None:
     module = importlib.import_module(name)
     assert module.__doc__
-    if hasattr(module, "__path__") and not hasattr(module, "__all__"):
-        return  # a package without names of its own
+    if (hasattr(module, "__path__") and not hasattr(module, "__all__")) or name.startswith("lodestream.reference."):
+        return  # a package without names of its own; a page as a program, of which only the package exports anything
     for each in module.__all__:
         # An alias of types may be there for type checkers only.
         assert hasattr(module, each) or f"    {each}: TypeAlias = " in Path(str(module.__file__)).read_text()

@@ -350,9 +350,9 @@ def test_what_builds_and_levels_import_is_there_before_they_begin(tmp_path: Path
     program = """
 import sys
 from pathlib import Path
-from lodestream_server import forkserver, worker
+from lodestream_server.builds import forkserver, worker
 worker.preload()
-from lodestream_server.levels import LevelJob, MadeLevel, make_level
+from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 before = set(sys.modules)
 job = worker.Job((Path("a.npy"),), "a.npy", None, "0.1", None, "auto", {}, 10_000, Path("built"))
 assert isinstance(worker.build(job), worker.Built)

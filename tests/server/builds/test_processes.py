@@ -175,7 +175,7 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
     program = (
         "import asyncio, pathlib, sys\n"
         "from lodestream_server.builds.processes import Allowed, Call, ForkServer, Pool\n"
-        "from tests.server import slow\n"
+        "from tests.server.builds import slow\n"
         "begun = pathlib.Path(sys.argv[1])\n"
         "asyncio.run(Pool(1, ForkServer()).run(Call(slow.sleep, (begun,), allowed=Allowed(write=begun.parent))))\n"
     )

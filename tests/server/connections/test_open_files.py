@@ -27,7 +27,7 @@ from tests.server.helpers import eventually, hills, npy, push
 # `serve` under a small limit.
 SCRIPT = """
 import argparse, resource, sys
-from lodestream_server.command import register
+from lodestream_server.commands.serve import register
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[1])))
     parser = argparse.ArgumentParser()

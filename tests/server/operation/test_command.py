@@ -30,7 +30,7 @@ from tests.server.helpers import PATIENCE, hills, npy, push
 
 SCRIPT = """
 import argparse, sys
-from lodestream_server.command import register
+from lodestream_server.commands.serve import register
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     register(parser.add_subparsers())

@@ -241,7 +241,7 @@ def test_an_error_keeps_its_traceback() -> None:
 
 SCRIPT = """
 import argparse, sys
-from lodestream_server.command import register
+from lodestream_server.commands.serve import register
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     register(parser.add_subparsers())

@@ -178,7 +178,7 @@ def cut_short(data: Path, after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         write_file(path, content)
 
     with monkeypatch.context() as patch:
-        patch.setattr("lodestream_server.markers.write_file", cut)
+        patch.setattr("lodestream_server.storage.markers.write_file", cut)
         with pytest.raises(OSError, match="stops here"):
             adopt(Folders(data))
 
@@ -241,7 +241,7 @@ def test_a_server_starts_after_adopting_that_an_error_has_ended_anywhere(
     for step in itertools.count():
         with monkeypatch.context() as patch:
             disk = Stale(step)
-            patch.setattr("lodestream_server.durable.disk", disk)
+            patch.setattr("lodestream_server.storage.durable.disk", disk)
             with suppress(OSError):
                 adopt(Folders(data))
         storage = Storage(data)
