@@ -25,7 +25,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from lodestream_server.builds import forkserver, jobs, processes, worker
+from lodestream_server.builds import fork_control, forkserver, jobs, worker
 
 __all__ = ["DIED", "main"]
 
@@ -103,7 +103,7 @@ class _Forked:
         return code
 
 
-class _ForkServer(processes.ForkServer):
+class _ForkServer(fork_control.ForkServer):
     """Has one fork server already; when that has died, it starts another as it always does."""
 
     def __init__(self, preload: Callable[[], object] | None, forked: _Forked) -> None:
@@ -112,7 +112,7 @@ class _ForkServer(processes.ForkServer):
 
     def _start(self) -> Any:
         forked, self._forked = self._forked, None
-        return super()._start() if forked is None else processes._Started(forked, forked.control)
+        return super()._start() if forked is None else fork_control.Started(forked, forked.control)
 
 
 def main() -> None:
@@ -124,7 +124,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     # A fork server that is started anew belongs to the shim, too.
-    shim: Any = processes
+    shim: Any = fork_control
     shim._ENVIRONMENT += ("LODE_FAULT_CONTROL", "LODE_FAULT_CALLS")
     # What shim.c asks for: from which lines a call comes. The processes of builds keep this file open, and no other.
     faulthandler.register(signal.SIGUSR2, ctypes.CDLL(None).lode_calls(), all_threads=False)

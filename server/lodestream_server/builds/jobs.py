@@ -50,7 +50,10 @@ from ..storage.records import Record, State
 from ..storage.storage import Storage
 from ..storage.uploads import check_upload
 from . import results, worker
-from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError, reason_of
+from .answers import ProcessDiedError, UnforeseenError, reason_of
+from .fork_control import ForkServer
+from .forkserver import Allowed
+from .processes import Call, Pool
 from .shares import Turns
 
 __all__ = ["Builder"]
