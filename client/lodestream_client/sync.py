@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.target import Tolerance
 
@@ -23,6 +23,9 @@ from .requests.answers import Answer, Incoming
 from .requests.api import Description, Flow, Identity, Progress
 from .requests.bodies import Asked, Closure, Source, opened, prepared
 from .stream.sync_stream import Stream, connect
+
+if TYPE_CHECKING:
+    import httpx
 
 __all__ = [
     "Stream",
@@ -174,29 +177,44 @@ def fetch_range(url: str, offset: int, length: int, *, token: str | None = None,
 def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
     import httpx
 
-    answer: Answer | None = None
     with httpx.Client(**api.client_options(url, timeout)) as client:
-        while True:
-            try:
-                step = flow.send(answer)
-            except StopIteration as end:
-                result: T = end.value
-                return result
-            if isinstance(step, api.Pause):
-                time.sleep(step.seconds)
-                answer = None
-                continue
-            content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
-            try:
-                with client.stream(content=content, **api.request_options(step, url, token)) as response:
-                    incoming = Incoming(response, step.most, step.url, url, token)
-                    if not (step.partial and response.status_code == 200):
-                        for piece in response.iter_raw():
-                            if not incoming.take(piece):
-                                break
-                answer = incoming.answer()
-            except httpx.HTTPError as error:
-                raise problems.from_connection(error, url) from error
+        return run(client, flow, url, token)
+
+
+def run(client: httpx.Client, flow: Flow[T], url: str, token: str | None) -> T:
+    """Carry out the calls of a flow of `requests.api` on a client that is kept; returns the flow's result.
+
+    Raises
+    ------
+    LodestreamError
+        Whatever the flow raises.
+    UnreachableError
+        If there is no connection.
+    """
+    import httpx
+
+    answer: Answer | None = None
+    while True:
+        try:
+            step = flow.send(answer)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        if isinstance(step, api.Pause):
+            time.sleep(step.seconds)
+            answer = None
+            continue
+        content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
+        try:
+            with client.stream(content=content, **api.request_options(step, url, token)) as response:
+                incoming = Incoming(response, step.most, step.url, url, token)
+                if not (step.partial and response.status_code == 200):
+                    for piece in response.iter_raw():
+                        if not incoming.take(piece):
+                            break
+            answer = incoming.answer()
+        except httpx.HTTPError as error:
+            raise problems.from_connection(error, url) from error
 
 
 list = list_surfaces

@@ -29,6 +29,8 @@ __all__ = [
     "add_target_options",
     "add_token_option",
     "parse_pair",
+    "parse_pictures",
+    "parse_port",
     "parse_precision",
     "parse_rate",
     "parse_seconds",
@@ -117,6 +119,19 @@ def _count(text: str) -> int:
     if not re.fullmatch("[0-9]{1,18}", text) or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a number of 1 or more, got {text!r}")
     return int(text)
+
+
+def parse_port(text: str) -> int:
+    """Read a port of TCP; 0 for any free one."""
+    if not text.isascii() or not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"expected a port of 0 to 65535, got {text!r}")
+    return int(text)
+
+
+def parse_pictures(text: str) -> tuple[tuple[str, int | None], ...]:
+    """Read a list such as ``1kB,20kB,all``: each size as it was written, and in bytes (None: all)."""
+    words = [word.strip() for word in text.split(",")]
+    return tuple((word, None if word == "all" else parse_size(word)) for word in words)
 
 
 def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:

@@ -7,16 +7,19 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import OptionError
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 from .arguments import Subparsers, add_command, add_json_option, add_surface_options, precisions, surface_options
-from .inputs import input_files
+from .inputs import Inputs, input_files
 
-__all__ = ["register", "run"]
+if TYPE_CHECKING:
+    from lodestream.surface import Surface
+
+__all__ = ["read_surface", "register", "run"]
 
 
 def register(subparsers: Subparsers) -> None:
@@ -53,10 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     started = time.monotonic()
     with input_files(args.parser, args.files) as files:
-        first, *more = files.paths
-        surface = ls.read(first, *more, closed=args.closed, filename=files.filename, **_format_options(options))
-    if args.name:
-        surface.metadata["name"] = args.name
+        surface = read_surface(args, files, options)
     with progress_bar() as progress:
         task = progress.add_task("encoding", total=1.0, figures="")
         container = ls.encode(
@@ -92,6 +92,23 @@ def run(args: argparse.Namespace) -> int:
         share = len(container) / raw
         note(f"{size} points, {human_size(len(container))} ({share:.1%} of the arrays) in {seconds:.1f} s")
     return 0
+
+
+def read_surface(args: argparse.Namespace, files: Inputs, options: dict[str, str]) -> Surface:
+    """The surface of one or several files, read as the surface options say.
+
+    Raises
+    ------
+    OptionError, FormatError, TooLargeError
+        See `lodestream.read`.
+    """
+    import lodestream as ls
+
+    first, *more = files.paths
+    surface = ls.read(first, *more, closed=args.closed, filename=files.filename, **_format_options(options))
+    if args.name:
+        surface.metadata["name"] = args.name
+    return surface
 
 
 def _format_options(options: dict[str, str]) -> dict[str, Any]:

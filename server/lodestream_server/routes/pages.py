@@ -6,12 +6,15 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
 
 import lodestream
+from lodestream import page
+from lodestream.errors import NotFoundError
 
 from ..access.scopes import needs
 from . import examples
 from .documentation import render
 from .html_page import html_page
-from .routing import Parts, readable
+from .routing import Parts, matches, readable
+from .sending import SentFile
 
 __all__ = ["router"]
 
@@ -28,14 +31,25 @@ lodestream pull URL out.npy --until-rms 1e-3d
 <li><a href="v1/surfaces">Surfaces on this server</a></li>
 <li><a href="docs">The HTTP interface</a></li>
 </ul>
+<p>{page.HOW_TO_BUILD}</p>
 """
 
 
 @readable(router, "/", include_in_schema=False)
 @needs(None)
-async def home() -> Response:
-    """A start page for browsers."""
-    return html_page("Lodestream", _HOME)
+async def home(request: Request) -> Response:
+    """The page that shows the surfaces; where it is not built, one that says how to build it."""
+    return _sent(request, page.INDEX) or html_page("Lodestream", _HOME)
+
+
+@readable(router, "/assets/{name}", include_in_schema=False)
+@needs(None)
+async def asset(request: Request, name: str) -> Response:
+    """Scripts, styles and kernels of the page."""
+    answer = _sent(request, f"assets/{name}")
+    if answer is None:
+        raise NotFoundError(f"there is no {name[:80]!a} among the files of the page")
+    return answer
 
 
 @readable(router, "/docs", include_in_schema=False)
@@ -92,6 +106,17 @@ async def readyz(parts: Parts) -> Response:
 async def metrics(parts: Parts) -> Response:
     """All metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
+
+
+def _sent(request: Request, name: str) -> Response | None:
+    found = page.assets().get(name)
+    if found is None:
+        return None
+    unchanged = matches(request.headers.get("if-none-match"), found.etag)
+    if unchanged is not None:
+        unchanged.headers.update(found.headers)
+        return unchanged
+    return SentFile(found.path, headers=found.headers, media_type=found.media_type)
 
 
 def _root(request: Request) -> str:

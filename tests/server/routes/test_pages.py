@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from lodestream import page
 from lodestream_server import Settings, create_app
 from lodestream_server.routes.documentation import render
 from lodestream_server.routes.html_page import html_page
@@ -39,13 +40,48 @@ class Reader(HTMLParser):
 
 @pytest.fixture(scope="module")
 def pages() -> dict[str, httpx.Response]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "assets", dict)  # as where the page of the browser is not built
+        return asked(*PAGES, "/openapi.json")
+
+
+def asked(*paths: str, headers: dict[str, str] | None = None) -> dict[str, httpx.Response]:
+    """The answers of a server to these paths."""
     app = create_app(Settings(data=Path("nowhere")))
 
     async def ask() -> dict[str, httpx.Response]:
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as http:
-            return {path: await http.get(path) for path in (*PAGES, "/openapi.json")}
+            return {path: await http.get(path, headers=headers) for path in paths}
 
     return asyncio.run(ask())
+
+
+def test_a_page_that_is_not_built_says_how(pages: dict[str, httpx.Response]) -> None:
+    assert page.HOW_TO_BUILD in Reader(pages["/"].text).text
+
+
+def test_the_page_of_the_browser_is_served_with_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "assets").mkdir()
+    (tmp_path / page.INDEX).write_text("<!doctype html><title>page</title>")
+    (tmp_path / "assets" / "main-1.js").write_text("export {}")
+    (tmp_path / "assets" / "kernels-1.wasm").write_bytes(b"\0asm")
+    built = page.assets(tmp_path)
+    monkeypatch.setattr(page, "assets", lambda: built)
+    paths = "/", "/assets/main-1.js", "/assets/kernels-1.wasm", "/assets/nothing.js", "/assets/..%2findex.html"
+    home, script, kernels, *others = asked(*paths).values()
+    for answer, media_type in (
+        (home, "text/html; charset=utf-8"),
+        (script, "text/javascript; charset=utf-8"),
+        (kernels, "application/wasm"),
+    ):
+        assert (answer.status_code, answer.headers["content-type"]) == (200, media_type)
+        assert {key: answer.headers[key] for key in page.HEADERS} == page.HEADERS
+    assert "immutable" in script.headers["cache-control"]
+    assert home.headers["cache-control"] == "no-cache"
+    assert [answer.status_code for answer in others] == [404, 404]
+    again = asked("/", headers={"if-none-match": home.headers["etag"]})["/"]
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["content-security-policy"] == page.HEADERS["content-security-policy"]
 
 
 @pytest.mark.parametrize("path", PAGES)

@@ -1,0 +1,129 @@
+"""Where the bytes of a container come from that is shown: a file, or a server."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Protocol
+
+from lodestream.errors import CorruptStreamError, RemoteProtocolError
+
+from .. import sync
+from ..requests import api
+
+__all__ = ["FileSource", "RemoteSource", "Source"]
+
+# Bytes of one request to a server, so that a browser that goes away costs no more than these.
+_AT_ONCE = 1 << 20
+
+
+class Source(Protocol):
+    """Random access to the bytes of one container, from several threads.
+
+    Attributes
+    ----------
+    name : str
+        What the page calls the surface.
+    size : int
+        Bytes of the container.
+    tag : str
+        Changes when the bytes change; letters and digits.
+    """
+
+    name: str
+    size: int
+    tag: str
+
+    def read(self, offset: int, length: int) -> bytes:
+        """At most ``length`` bytes from ``offset`` on, at least one.
+
+        Raises
+        ------
+        LodestreamError, OSError
+            If they cannot be had.
+        """
+
+
+class FileSource:
+    """A container file."""
+
+    def __init__(self, path: Path, name: str | None = None) -> None:
+        status = path.stat()
+        self.name = path.name.removesuffix(".lode") if name is None else name
+        self.size = status.st_size
+        self.tag = f"{status.st_ino:x}{status.st_mtime_ns:x}{status.st_size:x}"
+        self._path = path
+
+    def read(self, offset: int, length: int) -> bytes:
+        """At most ``length`` bytes from ``offset`` on.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        CorruptStreamError
+            If it is shorter than it was.
+        """
+        with self._path.open("rb") as file:
+            data = os.pread(file.fileno(), min(length, _AT_ONCE), offset)
+        if not data:
+            raise CorruptStreamError(f"expected {self.size} bytes in {self._path}, got fewer", offset)
+        return data
+
+
+class RemoteSource:
+    """A container on a server, or on any host of files with Range; the token stays here.
+
+    Parameters
+    ----------
+    url : str
+        Of a surface of a server, or of a container file.
+    token : str or None
+
+    Raises
+    ------
+    LodestreamError
+        If the server cannot be reached, refuses, or does not say how long the file is.
+    """
+
+    def __init__(self, url: str, token: str | None) -> None:
+        import httpx
+
+        identity = sync.identify(url, token=token)
+        if identity.size is None or identity.name is None:
+            raise RemoteProtocolError(f"expected the length and the version of {url}, got neither")
+        self.name = _name(url, token) or url.rstrip("/").rpartition("/")[2].removesuffix(".lode")
+        self.size = identity.size
+        self.tag = identity.name
+        self._url, self._token = url, token
+        self._lock = threading.Lock()
+        self._open = ExitStack()
+        self._client = self._open.enter_context(httpx.Client(**api.client_options(url, api.TIMEOUT)))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._open.close()
+
+    def read(self, offset: int, length: int) -> bytes:
+        """At most ``length`` bytes from ``offset`` on.
+
+        Raises
+        ------
+        LodestreamError
+            If the server cannot be reached, refuses, or sends other bytes than were asked for.
+        """
+        wanted = min(length, _AT_ONCE, self.size - offset)
+        with self._lock:
+            return sync.run(self._client, api.fetch_range(self._url, offset, wanted), self._url, self._token)
+
+
+def _name(url: str, token: str | None) -> str | None:
+    """The name that a server has for a surface."""
+    from ..requests import addresses
+
+    if not addresses.is_surface(url):
+        return None
+    name = sync.describe(url, token=token).details.get("name")
+    return name if isinstance(name, str) else None

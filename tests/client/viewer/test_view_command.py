@@ -1,0 +1,185 @@
+"""``lodestream view``: its folder of files, its pictures, and the page until Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+import lodestream as ls
+from lodestream import page
+from lodestream_client.program import main
+from lodestream_client.viewer.sources import FileSource, RemoteSource
+from lodestream_client.viewer.static import write_static
+from tests.client.files import ranged
+
+HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
+
+
+@pytest.fixture
+def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A page of two files, in place of the one that Node builds."""
+    folder = tmp_path / "built"
+    (folder / "assets").mkdir(parents=True)
+    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
+    (folder / "assets" / "main-1.js").write_text("export {}")
+    made = page.assets(folder)
+    for module in ("lodestream.page", "lodestream_client.commands.view"):
+        monkeypatch.setattr(f"{module}.assets", lambda: made)
+    return folder
+
+
+@pytest.fixture
+def container(tmp_path: Path) -> Path:
+    path = tmp_path / "hills.lode"
+    path.write_bytes(ls.encode(HILLS))
+    return path
+
+
+def test_a_page_that_is_not_built_is_told(
+    container: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lodestream_client.commands.view.assets", dict)
+    assert main(["view", str(container)]) == 1
+    assert "make page" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("built")
+def test_a_folder_for_any_host(tmp_path: Path, container: Path) -> None:
+    out = tmp_path / "out"
+    for _ in range(2):  # a second time it replaces its own files
+        assert main(["view", str(container), "--static", str(out)]) == 0
+    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == [
+        "assets/main-1.js",
+        "index.html",
+        "surface.lode",
+        "view.json",
+    ]
+    assert (out / "surface.lode").read_bytes() == container.read_bytes()
+    config = json.loads((out / "view.json").read_text())
+    surface = {"name": "hills", "src": "surface.lode", "bytes": container.stat().st_size}
+    assert config == {"surfaces": [surface], "live": False}
+
+
+@pytest.mark.usefixtures("built")
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, container: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("mine")
+    assert main(["view", str(container), "--static", str(tmp_path / "out")]) == 1
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine"]
+
+
+@pytest.mark.usefixtures("built")
+def test_other_files_are_encoded_first(tmp_path: Path) -> None:
+    np.save(tmp_path / "hills.npy", HILLS)
+    assert main(["view", str(tmp_path / "hills.npy"), "--name", "my hills", "--static", str(tmp_path / "out")]) == 0
+    assert json.loads((tmp_path / "out" / "view.json").read_text())["surfaces"][0]["name"] == "my hills"
+    assert np.array_equal(ls.decode((tmp_path / "out" / "surface.lode").read_bytes()).points, HILLS)
+
+
+def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("matplotlib")
+    assert main(["view", str(container), "--png", str(tmp_path / "out.png"), "--at", "1kB,all"]) == 0
+    said = capsys.readouterr().err
+    assert "RMS error 0, maximum 0" in said.splitlines()[-1]
+    sizes = []
+    for label in ("1kB", "all"):
+        with image.open(tmp_path / f"out-{label}.png") as drawn:
+            sizes.append(drawn.size)
+    assert sizes[0] == sizes[1]
+    assert min(sizes[0]) > 200
+    assert (tmp_path / "out-1kB.png").read_bytes() != (tmp_path / "out-all.png").read_bytes()
+    assert main(["view", str(container), "--png", str(tmp_path / "out.png"), "--at", "1"]) == 1
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        ls.Surface(np.random.default_rng(1).normal(size=(9, 1, 3))),
+        ls.Surface(np.random.default_rng(1).normal(size=(9, 8, 2)), (True, False)),
+        ls.Surface(np.random.default_rng(1).normal(size=(9, 8, 3)), mask=np.eye(9, 8) == 0),
+        ls.Surface(np.array([[1.0, np.inf, -np.inf, 2.0]])),
+    ],
+    ids=["curve", "plane", "holes", "infinite"],
+)
+def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "one.lode").write_bytes(ls.encode(surface))
+    assert main(["view", str(tmp_path / "one.lode"), "--png", str(tmp_path / "one.png")]) == 0
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--png", "a.png", "--static", "b"],
+        ["--at", "1kB"],
+        ["--png", "a.gif"],
+        ["--port", "65536"],
+        ["other.npy", "http://host/a.lode"],
+    ],
+)
+def test_wrong_command_lines(container: Path, arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(container), *arguments])
+    assert ended.value.code == 2
+
+
+def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Path) -> None:
+    with ranged(tmp_path) as host:
+        source = RemoteSource(f"{host.url}/{container.name}", None)
+        try:
+            assert (source.name, source.size) == ("hills", container.stat().st_size)
+            assert source.read(10, 30) == container.read_bytes()[10:40]
+            write_static(tmp_path / "out", {}, source)
+        finally:
+            source.close()
+    assert (tmp_path / "out" / "surface.lode").read_bytes() == container.read_bytes()
+
+
+def test_a_file_that_has_become_shorter(container: Path) -> None:
+    source = FileSource(container)
+    container.write_bytes(b"")
+    with pytest.raises(ls.CorruptStreamError, match="got fewer"):
+        source.read(0, 10)
+
+
+@pytest.fixture
+def viewing(built: Path, container: Path) -> Iterator[subprocess.Popen[str]]:
+    code = (
+        f"import sys; from pathlib import Path; from lodestream import page; made = page.assets(Path({str(built)!r}))\n"
+        "from lodestream_client.commands import view; view.assets = lambda: made\n"
+        "from lodestream_client.program import main; sys.exit(main(sys.argv[1:]))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", code, "view", str(container), "--no-browser"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_page_is_there_until_it_is_told_to_end(
+    viewing: subprocess.Popen[str], container: Path, number: signal.Signals, code: int
+) -> None:
+    assert viewing.stdout is not None
+    url = viewing.stdout.readline().strip()
+    assert httpx.get(url).status_code == 200
+    while "progress" in httpx.get(url + "view.json").json()["surfaces"][0]:
+        pass
+    assert httpx.get(url + "surface.lode").content == container.read_bytes()
+    viewing.send_signal(number)
+    assert viewing.wait(20) == code
