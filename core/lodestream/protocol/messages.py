@@ -28,10 +28,10 @@ __all__ = [
     "End",
     "Error",
     "Event",
-    "Header",
     "Layer",
     "MessageError",
     "Open",
+    "Opened",
     "Segments",
     "Stop",
 ]
@@ -157,7 +157,7 @@ class Bye:
 
 
 @dataclass(frozen=True)
-class Header:
+class Opened:
     """From the server: which container is sent, and how much of it.
 
     Attributes
@@ -233,4 +233,4 @@ class Error:
     detail: str
 
 
-Event: TypeAlias = Open | Credit | Stop | Bye | Header | Segments | Layer | End | Error
+Event: TypeAlias = Open | Credit | Stop | Bye | Opened | Segments | Layer | End | Error

@@ -20,22 +20,22 @@ from lodestream.protocol.messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     MessageError,
     Open,
+    Opened,
     Segments,
     Stop,
 )
 from lodestream.protocol.wire import serialize
 
-HEADER = Header("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
+HEADER = Opened("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
 SAMPLES: dict[type[Event], Event] = {
     Open: Open(credit=100),
     Credit: Credit(50),
     Stop: Stop(),
     Bye: Bye(),
-    Header: HEADER,
+    Opened: HEADER,
     Segments: Segments(0, b"x" * 10),
     Layer: Layer(0, 0, 10, 0.5, 1.0),
     End: End("complete"),
@@ -100,7 +100,7 @@ def test_what_one_side_may_send_the_other_side_knows() -> None:
     kinds = {side: {kind for sends, _ in TRANSITIONS[side].values() for kind in sends} for side in Side}
     heard = {side: {kind for _, receives in TRANSITIONS[side].values() for kind in receives} for side in Side}
     assert kinds[Side.CLIENT] == heard[Side.SERVER] == {Open, Credit, Stop, Bye}
-    assert kinds[Side.SERVER] == heard[Side.CLIENT] == {Header, Segments, Layer, End, Error}
+    assert kinds[Side.SERVER] == heard[Side.CLIENT] == {Opened, Segments, Layer, End, Error}
 
 
 def test_the_server_cannot_send_beyond_the_credit() -> None:
