@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo kernels page test test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -37,6 +37,30 @@ torture: kernels ## what takes too long for every run, into docs/reliability.md;
 # Compiled when Lodestream is installed, and again whenever their sources change.
 kernels: $(STAMP)
 	@$(BIN)/python core/kernels/build.py
+
+# The page of the browser, of which server and client serve the built files: see client/web/README.md.
+WEB := client/web
+PAGE := core/lodestream/page/static
+WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -not -name module.ts 2>/dev/null) \
+	$(wildcard $(WEB)/*.json $(WEB)/*.ts core/kernels/*.[ch])
+
+page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
+
+test-web: page ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
+	@cd $(WEB) && npm run --silent check && PYTHON=../../$(BIN)/python npm test --silent
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
+
+bench-web: page ## speed of the browser's decoder, times to the first picture, and the size of the bundle
+	@PYTHON=$(BIN)/python $(BIN)/python -m benchmarks.web
+
+$(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES)
+	@$(BIN)/python -c 'import ziglang' 2>/dev/null || $(BIN)/python -m pip install --quiet --group web
+	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page -- --logLevel warn
+	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
+
+$(WEB)/node_modules/.package-lock.json: $(WEB)/package-lock.json | $(STAMP)
+	@command -v npm > /dev/null || { echo "The page is built with Node 20 or newer, and npm: there is none" >&2; exit 1; }
+	@cd $(WEB) && npm ci --silent --no-audit --no-fund
 
 C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
@@ -78,7 +102,7 @@ wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch6
 	@$(BIN)/python .ci/wheels.py dist
 
 clean: ## remove the environment and everything else that can be made again
-	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native $(PAGE) $(WEB)/node_modules $(WEB)/dist $(WEB)/src/kernels/module.ts .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is written last, so an installation that was interrupted is taken up again by the next make.
