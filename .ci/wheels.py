@@ -27,12 +27,15 @@ ROOT = Path(__file__).resolve().parent.parent
 #: What the processors of a wheel are in ELF, and the largest pages that Linux has there.
 MACHINES = {"x86_64": ("EM_X86_64", 1 << 12), "aarch64": ("EM_AARCH64", 1 << 16)}
 PLATFORMS = ("manylinux_2_17", "musllinux_1_2")
-MOST_BYTES = 1_000_000
+#: Of a wheel: what it has without the page of the browser, and the page.
+MOST_BYTES = 1_000_000 + 270_000
 
 CHECK = """
 import numpy as np
 import lodestream as ls
 from lodestream.library import NATIVE, why_missing
+from lodestream.page import assets
+assert "index.html" in assets(), "the page of the browser is not there"
 assert why_missing() is None, why_missing()
 points = np.sqrt(np.arange(12.0)).reshape(3, 4)
 assert np.array_equal(ls.decode(ls.encode(points)).points, points)
@@ -55,6 +58,8 @@ def check_wheel(wheel: Path, machine: str) -> None:
         names = [name for name in archive.namelist() if name.startswith("lodestream/native/")]
         made_for = [machine, "x86_64-v3"] if machine == "x86_64" else [machine]
         wanted = [f"lodestream/native/lodestream-linux-{name}.so" for name in made_for]
+        page = "lodestream/page/static/index.html"
+        expect(page in archive.namelist(), f"{page} in {wheel.name}: it is built by make page")
         expect(sorted(names) == sorted(wanted), f"{wanted}, got {names}")
         for name in names:
             check_library(archive.read(name), machine)
