@@ -26,7 +26,7 @@ from lodestream.protocol.messages import MAX_MESSAGE, MIN_WINDOW, SUBPROTOCOL
 from lodestream.target import Region, Target
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.range_download import RangeDownload
-from lodestream.transfer.receiver_state import Reception, Sink, Store
+from lodestream.transfer.receiver_state import ReceiverState, Sink, Store
 
 from ..errors import SilenceError
 from ..requests import addresses, answers, api, problems
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import httpx
 
     from lodestream.decoding.decoder import Decoder, View
-    from lodestream.protocol.messages import Header
+    from lodestream.protocol.messages import Opened
     from lodestream.transfer.receiver_state import DownloadEvent
 
 __all__ = ["PARTS", "BaseStream", "Received"]
@@ -95,7 +95,7 @@ class BaseStream:
         self._close_timeout = close_timeout
         self._link = Link(limit_rate) if limit_rate is not None else None
         self._window = window_for(limit_rate) if window is None and limit_rate is not None else window
-        self._reception = Reception(
+        self._reception = ReceiverState(
             target, store=store, container=container, size=size, sink=sink, max_vertices=max_vertices
         )
         self.target = self._reception.target
@@ -137,9 +137,9 @@ class BaseStream:
         return self._reception.decoder
 
     @property
-    def header(self) -> Header | None:
+    def header(self) -> Opened | None:
         """The server's first message over the WebSocket: the container's SHA-256 and size, and how much is planned."""
-        return self._download.header if self._download is not None else None
+        return self._download.answer if self._download is not None else None
 
     @property
     def identity(self) -> Identity:
@@ -240,7 +240,7 @@ class BaseStream:
     def _travel(self) -> Way:
         self._transports.start(time.monotonic())
         while True:
-            before, self._withheld = self._reception.held.total, ""
+            before, self._withheld = self._reception.cached.total, ""
             try:
                 yield from self._by_socket() if self._transports.transport == "ws" else self._by_parts()
                 return
@@ -250,7 +250,7 @@ class BaseStream:
                 yield self._drop()
                 if self._over():
                     return
-                progressed = self._reception.held.total > before
+                progressed = self._reception.cached.total > before
                 try:
                     pause = self._transports.failed(error, time.monotonic(), progressed=progressed)
                 except LodestreamError:

@@ -113,7 +113,7 @@ class Header:
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
-        An residual section follows the layers.
+        A residual section follows the layers.
     layer_count : int
         Layers of the complete stream.
     codecs : tuple of int
@@ -360,8 +360,8 @@ class Index:
     """Where everything lies in a complete container.
 
     ``residual`` is None where the lattice alone is exact, or nothing is stored beyond it; ``chunks`` of it stand in
-    the order of `chunks.windows`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the SHA-256
-    of the values where all are exact.
+    the order of `chunks.chunk_places`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the
+    SHA-256 of the values where all are exact.
     """
 
     header: Header

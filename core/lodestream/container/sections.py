@@ -10,7 +10,7 @@ import msgpack
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
 from ..transform.predictors import COEFFICIENT_BITS
-from .chunks import windows
+from .chunks import chunk_places
 from .fields import FieldReader, FieldWriter
 from .metadata import check_length, packed
 from .model import ByteRange, Errors, Header
@@ -180,10 +180,10 @@ def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
 
 
 def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[bytes, int]]]:
-    """The errors that an residual section, which stands at ``offset``, leaves; its chunks and their places."""
+    """The errors that a residual section, which stands at ``offset``, leaves; its chunks and their places."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
-    lengths = [fields.varint(len(payload)) for _ in windows(header)]
+    lengths = [fields.varint(len(payload)) for _ in chunk_places(header)]
     chunks = []
     for length in lengths:
         at = fields.at

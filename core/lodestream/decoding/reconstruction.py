@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container.chunks import Window, windows
+from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
@@ -184,7 +184,7 @@ class Reconstruction:
     def _correct(self, blocks: list[Values], chosen: NDArray[np.bool_] | None, region: Region | None = None) -> None:
         """Restore all windows of residual that there are, or of a region of the only block those inside."""
         top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
-        for number, window in enumerate(windows(self.header)):
+        for number, window in enumerate(chunk_places(self.header)):
             inside = region is None or all(
                 a <= start and stop <= b
                 for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
@@ -334,7 +334,7 @@ class Values:
 
     arrays: list[NDArray[Any]]
 
-    def window(self, window: Window, top: int = 0, left: int = 0) -> NDArray[Any]:
+    def window(self, window: ChunkPlace, top: int = 0, left: int = 0) -> NDArray[Any]:
         """One channel in a window, a view; the arrays begin at row ``top`` and column ``left`` of the block."""
         channel = window.channel
         rows, columns = (

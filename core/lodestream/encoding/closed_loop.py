@@ -83,7 +83,7 @@ class ClosedLoop:
 def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]]]:
     """Level by level, interfaces before patches that take their sides from them: the numbers of each grid's bands."""
     layout = table.layout
-    levels = np.array([tile.level for tile in layout.tiles])[table.windows[:, 0]]
+    levels = np.array([tile.level for tile in layout.tiles])[table.origins[:, 0]]
     every = list(range(len(layout.grids)))
     interfaces = sum(grid.interface for grid in layout.grids)
     for level in range(layout.levels + 1):
@@ -156,7 +156,7 @@ class _Coder:
             chosen = self._own(self._chooser.chosen, number)
             np.abs(chosen, out=self._own(self._sizes, number))
             np.sign(chosen, out=self._own(self._signs, number), casting="same_kind")
-        known = self._sizes, self._signs, self._early, self._table.bands, self._table.windows, self._steps
+        known = self._sizes, self._signs, self._early, self._table.bands, self._table.origins, self._steps
         for grid, numbers in of_grid.items():
             spread_bands(*known, numbers, self._complete, self._complete.size, self._reconstructed_grids[grid], (0, 0))
 
@@ -167,7 +167,7 @@ class _Coder:
 
     def _window(self, number: int) -> tuple[slice, slice]:
         """Where a band lies among the coefficients of its grid."""
-        _, top, left = self._table.windows[number].tolist()
+        _, top, left = self._table.origins[number].tolist()
         rows, columns = self._table.bands[number, [ROWS, COLUMNS]].tolist()
         return slice(top, top + rows), slice(left, left + columns)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..container.chunks import Window, windows
+from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..decoding.reconstruction import Values
 from ..residual import chunk_coder
@@ -35,7 +35,7 @@ def encode_chunks(prepared: Preparation, header: Header, restored: list[Values])
         What comes back without these chunks.
     """
     coder = _ChunkCoder(prepared, header, restored)
-    chunks = [coder.code(window) for window in windows(header)]
+    chunks = [coder.code(window) for window in chunk_places(header)]
     return chunks, coder.exact
 
 
@@ -64,7 +64,7 @@ def chunk_size(prepared: Preparation, header: Header, restored: list[Values], co
         coder = _ChunkCoder(prepared, tried, restored)
         inside = (
             window
-            for window in windows(tried)
+            for window in chunk_places(tried)
             if starts[0] <= window.rows[0] < stops[0] and starts[1] <= window.columns[0] < stops[1]
         )
         costs.append(sum(len(coder.code(window)) + _TABLES for window in inside) / share)
@@ -84,7 +84,7 @@ class _ChunkCoder:
         self._rough = rough
         self.exact = [True] * header.channels
 
-    def code(self, window: Window) -> bytes:
+    def code(self, window: ChunkPlace) -> bytes:
         """One chunk."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]

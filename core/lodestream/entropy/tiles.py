@@ -40,7 +40,7 @@ class TileTable:
         Number of each tile's first band, and the number of bands at the end.
     size, blocks : int
         Lengths of the flat arrays of coefficients and of block flags.
-    windows : int64, shape (band, 3)
+    origins : int64, shape (band, 3)
         Of each band: its tile, and its first row and column in the array of coefficients.
     of_grid : list of int64 arrays
         For each grid the numbers of its bands, coarsest level first.
@@ -52,7 +52,7 @@ class TileTable:
     first: list[int]
     size: int
     blocks: int
-    windows: NDArray[np.int64]
+    origins: NDArray[np.int64]
     of_grid: list[NDArray[np.int64]]
 
     @staticmethod
@@ -60,7 +60,7 @@ class TileTable:
     def of(layout: Layout, coordinate: bool = True) -> TileTable:
         """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
         rows: list[tuple[int, ...]] = []
-        windows: list[tuple[int, int, int]] = []
+        origins: list[tuple[int, int, int]] = []
         of_grid: list[list[int]] = [[] for _ in layout.grids]
         first = [0]
         size, blocks = 3, 0
@@ -78,12 +78,12 @@ class TileTable:
                 parent = above.get((band.grid, kind))
                 joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
                 rows.append((place, stride, height, width, flags, *joined, kind))
-                windows.append((number, band.rows[0], band.columns[0]))
+                origins.append((number, band.rows[0], band.columns[0]))
                 size += (height + 4) * stride + 2
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
             known.append(own)
-        places = np.array(windows, np.int64).reshape(-1, 3)
+        places = np.array(origins, np.int64).reshape(-1, 3)
         of = [np.array(numbers, np.int64) for numbers in of_grid]
         described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
         return TileTable(layout, members, described, first, size + PADDING, blocks, places, of)
@@ -177,7 +177,7 @@ class Tiles:
         last = self.table.first[tiles_of(level).stop]
         for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
             chosen = numbers[numbers < last]
-            chosen = chosen[state[self.table.windows[chosen, 0]] < UNANNOUNCED]
+            chosen = chosen[state[self.table.origins[chosen, 0]] < UNANNOUNCED]
             self._spread(chosen, state, array, tiles_of(whole).stop)
 
     def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
@@ -187,7 +187,7 @@ class Tiles:
         """
         height, width = (int(n) for n in self.table.bands[number, [ROWS, COLUMNS]])
         array = np.zeros((height, width), np.int32)
-        tile, top, left = (int(n) for n in self.table.windows[number])
+        tile, top, left = (int(n) for n in self.table.origins[number])
         self._spread(np.array([number]), state, array, tile if finer else tile + 1, (top, left))
         return array
 
@@ -199,7 +199,7 @@ class Tiles:
         finer: int,
         origin: tuple[int, int] = (0, 0),
     ) -> None:
-        arrays = self.known, self.sign, self.early, self.table.bands, self.table.windows, self.steps
+        arrays = self.known, self.sign, self.early, self.table.bands, self.table.origins, self.steps
         spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
 
 

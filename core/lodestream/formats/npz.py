@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .notes import listing, warn
-from .npy import Header, read_header, read_values
+from .npy import NpyHeader, read_header, read_values
 from .placed import Coordinate, place
 from .source import Source, number, refuse_array
 
@@ -83,7 +83,7 @@ class _Contents:
     source: Source
     archive: ZipFile
     members: Mapping[str, ZipInfo]
-    headers: Mapping[str, Header]
+    headers: Mapping[str, NpyHeader]
 
     @property
     def listing(self) -> str:
@@ -172,7 +172,7 @@ def _members(archive: ZipFile) -> dict[str, ZipInfo]:
     return members
 
 
-def _header(archive: ZipFile, member: ZipInfo) -> Header:
+def _header(archive: ZipFile, member: ZipInfo) -> NpyHeader:
     with archive.open(member) as file:
         header = read_header(file)
         promised = file.tell() + header.nbytes

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.capacity import Capacity
-from ..container.chunks import windows
+from ..container.chunks import chunk_places
 from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
 from ..grid.support import check_region, needed_tiles
@@ -132,7 +132,7 @@ def select(index: Index, selection: Selection) -> SelectedSlices:
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
     chunks = {}
     if index.chunks:
-        for number, (window, chunk) in enumerate(zip(windows(header), index.chunks, strict=True)):
+        for number, (window, chunk) in enumerate(zip(chunk_places(header), index.chunks, strict=True)):
             touches = selection.region is None or all(
                 start < b and a < stop
                 for (start, stop), (a, b) in zip(selection.region, (window.rows, window.columns), strict=True)
