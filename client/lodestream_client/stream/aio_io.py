@@ -48,8 +48,8 @@ class AsyncIO:
         match effect:
             case Dial():
                 return await self._dial(effect)
-            case Hear(seconds):
-                return await self._hear(seconds)
+            case Hear(until):
+                return await self._hear(self._left(until))
             case Send():
                 return await self.send()
             case Get():
@@ -57,15 +57,18 @@ class AsyncIO:
             case Read():
                 assert self._body is not None, "a body is read of an open answer"
                 return await anext(self._body, b"")
-            case Wait(seconds):
+            case Wait(until):
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(seconds):
+                    async with asyncio.timeout(self._left(until)):
                         await self.wake.wait()
             case HangUp():
                 await self.hang_up(effect)
             case _:
                 assert_never(effect)
         return None
+
+    def _left(self, until: float) -> float:
+        return max(until - self._session.clock(), 0.0)
 
     async def _dial(self, dial: Dial) -> Dialled:
         from websockets.asyncio.client import ClientConnection, connect

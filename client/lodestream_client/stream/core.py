@@ -114,6 +114,6 @@ class Core:
                     session.truncate()
                     raise
             left = session.reception.tick(session.clock())
-            yield Wait(pause if left is None else min(pause, left))
+            yield Wait(session.clock() + (pause if left is None else min(pause, left)))
             if session.over():
                 return

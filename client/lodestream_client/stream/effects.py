@@ -62,12 +62,17 @@ class DialError(Exception):
 
 @dataclass(frozen=True)
 class Hear:
-    """Wait for the next message of the WebSocket. Result: its bytes, or None if none came within so many seconds.
+    """Wait for the next message of the WebSocket. Result: its bytes, or None if none came in time.
 
     Fails with ``ConnectionClosed``.
+
+    Attributes
+    ----------
+    until : float
+        Until when, by the session's clock: a wait that is interrupted and taken up again gets no longer by this.
     """
 
-    seconds: float
+    until: float
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,9 @@ class Read:
 
 @dataclass(frozen=True)
 class Wait:
-    """Wait so many seconds, or until the stream is told to stop. Result: None."""
+    """Wait until this time by the session's clock, or until the stream is told to stop. Result: None."""
 
-    seconds: float
+    until: float
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def _heard(session: Session, download: Download, seconds: float) -> Flow[bytes |
     from websockets.exceptions import ConnectionClosed
 
     try:
-        message: bytes | None = yield Hear(seconds)
+        message: bytes | None = yield Hear(session.clock() + seconds)
     except ConnectionClosed as error:
         _lost(session, download, error)
     return message

@@ -217,12 +217,12 @@ class Session:
         if self._link is None:
             return
         until = self.clock() + self._link.delay(size, self.clock())
-        while not self.stopped and (wait := until - self.clock()) > 0:
+        while not self.stopped and self.clock() < until:
             left = self.tick()
             yield Send()
             if left == 0:
                 return
-            yield Wait(wait if left is None else min(wait, left))
+            yield Wait(until if left is None else min(until, self.clock() + left))
 
     def over(self) -> bool:
         """Whether a connection that broke is not to be replaced, since nothing more is wanted."""

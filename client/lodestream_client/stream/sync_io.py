@@ -49,21 +49,24 @@ class SyncIO:
         match effect:
             case Dial():
                 return self._dial(effect)
-            case Hear(seconds):
-                return self._hear(seconds)
+            case Hear(until):
+                return self._hear(self._left(until))
             case Send():
                 return self.send()
             case Get():
                 return self._get(effect)
             case Read():
                 return next(self._body, b"")
-            case Wait(seconds):
-                self.wake.wait(seconds)
+            case Wait(until):
+                self.wake.wait(self._left(until))
             case HangUp():
                 self.hang_up(effect)
             case _:
                 assert_never(effect)
         return None
+
+    def _left(self, until: float) -> float:
+        return max(until - self._session.clock(), 0.0)
 
     def _dial(self, dial: Dial) -> Dialled:
         from websockets.exceptions import WebSocketException
