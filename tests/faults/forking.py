@@ -25,7 +25,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from lodestream_server import forkserver, jobs, processes, worker
+from lodestream_client import program
+from lodestream_server import forkserver, jobs, processes, records, worker
 
 __all__ = ["DIED", "main"]
 
@@ -33,6 +34,8 @@ __all__ = ["DIED", "main"]
 DIED = 70
 
 _MODULES = (
+    "anyio._backends._asyncio",
+    "encodings.idna",
     "lodestream_client.__main__",
     "lodestream_client.program",
     "lodestream_server.app",
@@ -40,6 +43,8 @@ _MODULES = (
     "lodestream_server.repair",
     "lodestream_server.running",
     "lodestream_server.token_command",
+    "uvicorn.lifespan.on",
+    "uvicorn.loops.asyncio",
     "uvicorn.protocols.http.auto",
     "uvicorn.protocols.websockets.websockets_sansio_impl",
 )
@@ -121,6 +126,11 @@ def main() -> None:
     for module in _MODULES:
         import_module(module)
     worker.preload()
+    # What each process would make first: both take as long as looking through a small folder.
+    records._adapter()
+    parser = program.build_parser()
+    names: Any = program
+    names.build_parser = lambda _: parser
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     # A fork server that is started anew belongs to the shim, too.

@@ -206,7 +206,7 @@ def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
     from tests.faults.shim import CannotError
 
     try:
-        report = faults.run(folder, count / 100, seconds)
+        report = faults.run(count / 100, seconds)
     except CannotError as error:
         return 0, (f"skipped: {error}",)
     # The figures come last: of many problems the page shows the end.
