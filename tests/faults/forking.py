@@ -164,8 +164,10 @@ def _run(arguments: list[str], log: str) -> dict[str, Any]:
 def _be(arguments: list[str], log: str) -> int:
     from lodestream_client.__main__ import main
 
-    # Killed with the process that it comes from: it is in no group of anybody's.
-    os.setsid()
+    # A group of its own, to be killed as a whole, but no session: Linux gives each of those the processor in turn, so
+    # that whoever runs many of them in the background would take it from everybody else. Killed with the process that
+    # it comes from: it is in no group of anybody's.
+    os.setpgid(0, 0)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     said = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     nothing = os.open(os.devnull, os.O_RDONLY)

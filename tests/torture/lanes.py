@@ -84,9 +84,10 @@ class Lanes:
             command = [sys.executable, "-m", "tests.torture.parts", wish.part.name, str(wish.count), seconds, str(file)]
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
             with said.open("wb") as output:
-                # A group of its own: what it has started can be ended with it.
+                # A group of its own: what it has started can be ended with it. No session: Linux would take a part for
+                # somebody else's work, whatever the priority of this process.
                 process = subprocess.Popen(
-                    command, stdout=output, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                    command, stdout=output, stderr=subprocess.STDOUT, env=environment, process_group=0
                 )
             self._await(process)
             if file.exists():
