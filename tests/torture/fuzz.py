@@ -210,7 +210,7 @@ def _atheris(name: str, count: int, seconds: float, seed: int, folder: Path) -> 
 
 
 def _measure_memory_once() -> None:
-    from lodestream import capacity  # not before its lines are counted
+    from lodestream.container import capacity  # not before its lines are counted
 
     # Each decoder reads several files for it, in which nothing changes: a sixth of the time of a case.
     limit = capacity.memory_limit()
