@@ -24,7 +24,7 @@ from .arguments import (
     add_token_option,
     parse_pictures,
     parse_port,
-    precisions,
+    quality_of,
     surface_options,
     token_of,
 )
@@ -190,7 +190,7 @@ def _encoded(args: argparse.Namespace, files: Inputs, progress: Callable[[float]
     require("encoding")
     import lodestream as ls
 
-    precision, attribute_precision = precisions(args)
+    quality = quality_of(args)
     surface = read_surface(args, files, surface_options(args))
     with progress_bar() as bar:
         task = bar.add_task("encoding", total=1.0, figures="")
@@ -199,4 +199,4 @@ def _encoded(args: argparse.Namespace, files: Inputs, progress: Callable[[float]
             bar.update(task, completed=done)
             progress(done)
 
-        return ls.encode(surface, precision, rms=args.rms, attribute_precision=attribute_precision, progress=tell)
+        return ls.encode(surface, quality=quality, progress=tell)

@@ -1,4 +1,4 @@
-"""The chunks of an residual section: one for each channel in each window of each block."""
+"""The chunks of a residual section: one for each channel in each window of each block."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ChunkPlace(NamedTuple):
 
 
 def chunk_places(header: Header) -> Iterator[ChunkPlace]:
-    """All chunks in the order of the file: block by block, row by row of windows, channel by channel.
+    """All chunks in the order of the file: block by block, row by row of places, channel by channel.
 
     A block of which holes are kept has as many chunks again, in the same order, of these.
     """

@@ -113,7 +113,7 @@ class Header:
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
-        An residual section follows the layers.
+        A residual section follows the layers.
     layer_count : int
         Layers of the complete stream.
     codecs : tuple of int

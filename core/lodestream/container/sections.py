@@ -180,7 +180,7 @@ def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
 
 
 def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[bytes, int]]]:
-    """The errors that an residual section, which stands at ``offset``, leaves; its chunks and their places."""
+    """The errors that a residual section, which stands at ``offset``, leaves; its chunks and their places."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     lengths = [fields.varint(len(payload)) for _ in chunk_places(header)]

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FormatError, OptionError, SwitchedOffError, TooLargeError
+from ..errors import FormatError, InputError, OptionError, SwitchedOffError, TooLargeError
 from ..surface import Closed
 
-__all__ = ["DEFAULT_MAX_VERTICES", "Source", "check_allowed", "number"]
+__all__ = ["DEFAULT_MAX_VERTICES", "Source", "check_allowed", "number", "with_name"]
 
 #: What `read` accepts unless told otherwise: 2 GiB of float64 heights.
 DEFAULT_MAX_VERTICES = 1 << 28
@@ -145,3 +145,9 @@ def check_allowed(names: Sequence[str], allowed: Collection[str] | None) -> None
 def number(value: int) -> str:
     """Write a count with separators, as messages show it."""
     return f"{value:,}"
+
+
+def with_name(error: InputError, label: str) -> InputError:
+    """Put the file's name in front of a message, which stays one line whatever either holds."""
+    message = f"{label}: {error}"
+    return type(error)("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message))

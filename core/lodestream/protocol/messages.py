@@ -167,7 +167,7 @@ class Opened:
     size : int
         Bytes of the whole container.
     planned : int
-        Bytes of the surface (header, layers, exactness) that the target needs, including held ones; index and metadata
+        Bytes of the surface (header, layers, residual) that the target needs, including held ones; index and metadata
         are not counted.
     extent : float
         Unit of relative tolerances: the range of the heights, or the diagonal of the bounding box.

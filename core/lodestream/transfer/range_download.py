@@ -64,7 +64,7 @@ class RangeDownload:
     """Receiving a surface over HTTP Range: requests out, parts of the file in.
 
     The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
-    body, in chunks of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
+    body, cut anywhere, to `receive`, then calls `finish`; until `request` returns None. If a connection
     breaks, it continues with the next `request`.
 
     Parameters
@@ -186,8 +186,8 @@ class RangeDownload:
         tag = _CONTAINER_TAG.fullmatch(self._etag or "")
         self.reception.identify(tag[1] if tag else None, size)
 
-    def receive(self, chunk: bytes) -> list[DownloadEvent]:
-        """Take a chunk of the body of an answer; returns the views that it completes.
+    def receive(self, data: bytes) -> list[DownloadEvent]:
+        """Take more of the body of an answer; returns the views that it completes.
 
         Raises
         ------
@@ -196,16 +196,16 @@ class RangeDownload:
         RemoteProtocolError
             If there are more bytes than requested.
         """
-        self.reception.wire_bytes += len(chunk)
+        self.reception.wire_bytes += len(data)
         asked, start = self._asked, self._position
-        self._position += len(chunk)
+        self._position += len(data)
         if asked is None or self._position > asked.offset + asked.length:
             raise RemoteProtocolError(f"expected {asked.length if asked else 0} bytes of the file, got more")
         events: list[DownloadEvent] = []
         # Until the index is known everything may be of use; then what lies between two slices is not kept.
-        places = self.reception.wanted(start, len(chunk)) if self.reception.plan else [(start, len(chunk))]
+        places = self.reception.wanted(start, len(data)) if self.reception.plan else [(start, len(data))]
         for offset, length in list(places):
-            events += self.reception.take(offset, chunk[offset - start : offset - start + length])
+            events += self.reception.take(offset, data[offset - start : offset - start + length])
         return events
 
     def finish(self, now: float | None = None) -> None:

@@ -475,8 +475,6 @@ class Builder:
             files=tuple(self._storage.upload_files(record)),
             filename=record.filenames[0] or None,
             name=record.name,
-            precision=options.pop("precision", None),
-            rms=options.pop("rms", None),
             closed=options.pop("closed", "auto"),
             options=options,
             max_vertices=self._settings.max_vertices,

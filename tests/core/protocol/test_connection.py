@@ -241,6 +241,24 @@ def test_each_error_code_has_a_close_code_that_an_application_may_use() -> None:
         assert code.title
 
 
+def moves(client: Connection, server: Connection, window: int, left: int) -> list[str]:
+    """What either side may say next, of a stream with ``left`` bytes to send."""
+    choices = []
+    if client.state in (State.OPENED, State.STREAMING):
+        if client.credit < window:
+            choices.append("grant")
+        choices.append("stop")
+    if client.state is State.ENDED:
+        choices += ["bye", "open again"]
+    if server.state is State.OPENED:
+        choices.append("header")
+    if server.state is State.STREAMING and left and server.credit:
+        choices.append("segments")
+    if (server.state is State.STREAMING and not left) or server.state is State.STOPPING:
+        choices.append("end")
+    return choices
+
+
 @settings(max_examples=150, deadline=None)
 @given(window=st.integers(1, 300), left=st.integers(0, 1000), seed=st.integers(0, 2**32))
 def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: int) -> None:
@@ -253,23 +271,8 @@ def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: i
     received = sent = after_stop = 0
     stopped_at: int | None = None
     for _ in range(3000):
-        choices = []
-        if to_server:
-            choices.append("deliver to server")
-        if to_client:
-            choices.append("deliver to client")
-        if client.state in (State.OPENED, State.STREAMING):
-            if client.credit < window:
-                choices.append("grant")
-            choices.append("stop")
-        if client.state is State.ENDED:
-            choices += ["bye", "open again"]
-        if server.state is State.OPENED:
-            choices.append("header")
-        if server.state is State.STREAMING and left and server.credit:
-            choices.append("segments")
-        if (server.state is State.STREAMING and not left) or server.state is State.STOPPING:
-            choices.append("end")
+        choices = ["deliver to server"] * bool(to_server) + ["deliver to client"] * bool(to_client)
+        choices += moves(client, server, window, left)
         if not choices:
             break
         # Stopping is rare, so that whole streams are seen too.
