@@ -1,0 +1,3 @@
+/** Lodestream in a browser or in Node: containers, their decoding, plans and transfer. */
+export * from "./errors";
+export * from "./types";
