@@ -5,6 +5,7 @@ import type {
   BlockInfo,
   Grid,
   Moment,
+  NodeValues,
   Price,
   Source,
   SourceEvents,
@@ -67,6 +68,18 @@ export class ArtificialSource implements Source {
 
   grids(moment: number, level: number): Promise<Grid[]> {
     return Promise.resolve(this.info.blocks.map((of, block) => this.grid(of, block, moment, level)));
+  }
+
+  valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues> {
+    const { shape, closed } = this.info.blocks[block]!;
+    const [i, j] = [row / (closed[0] ? shape[0] : shape[0] - 1), column / (closed[1] ? shape[1] : shape[1] - 1)];
+    const point = this.surface.point(block, i, j, moment / this.info.levels);
+    if (point === null) return Promise.reject(new Error("expected a point, got a hole"));
+    const attributes = this.info.attributes.map(
+      (name) => [name, [this.surface.attribute?.(block, i, j) ?? 0]] as const,
+    );
+    const { rms, max } = this.info.prices![moment]!;
+    return Promise.resolve({ block, row, column, point, attributes, rms, max });
   }
 
   focus(): void {}

@@ -1,8 +1,8 @@
 /**
  * Colour maps as tables of equally spaced stops, between which colours are interpolated linearly in sRGB.
  *
- * viridis and cividis: 17 of the 256 entries of the tables in matplotlib's `_cm_listed.py` (CC0). terrain: the segments of
- * the map of that name in matplotlib's `_cm.py` (matplotlib licence, BSD style), sampled in steps of 0.05.
+ * viridis and cividis: 17 of the 256 entries of the tables in matplotlib's `_cm_listed.py` (CC0). terrain: hypsometric tints
+ * drawn up for this project.
  * red-blue: RdBu of 11 classes by C. Brewer, colorbrewer2.org (Apache License 2.0), reversed.
  */
 
@@ -11,8 +11,7 @@ const TABLES = {
     "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725",
   cividis:
     "00224e 002e6a 1a386f 32436d 434e6c 535a6d 61656f 6f7073 7d7c78 8c8878 9b9476 aba072 bcae6c cdbb63 dec958 f0d846 fee838",
-  terrain:
-    "333399 2255bb 1177dd 0099ff 00b2b2 00cc66 33d670 66e07a 99eb85 ccf58f ffff99 e6de8b ccbe7d b39d70 997c62 805c54 997c76 b39d98 ccbebb e6dedd ffffff",
+  terrain: "2c6049 4f8356 7fa466 b0c07c d9d49a e2d19a d3b37c b8926a 9a7660 8a7468 a99c95 cfc8c3 f7f5f3",
   "red-blue": "053061 2166ac 4393c3 92c5de d1e5f0 f7f7f7 fddbc7 f4a582 d6604d b2182b 67001f",
   grey: "1a1a1a f2f2f2",
 } as const;

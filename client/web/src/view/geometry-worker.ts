@@ -52,6 +52,7 @@ function take(message: ToGeometry): void {
 }
 
 function wants(): void {
+  if (!geometry.sees) return;
   const { region, pixels, finer } = geometry;
   scope.postMessage({ kind: "wants", level: Math.max(0, level + finer), region, pixels });
 }

@@ -110,6 +110,11 @@ export class Geometry {
     this.most = triangles;
   }
 
+  /** Whether a view is known. */
+  get sees(): boolean {
+    return this.eye !== null;
+  }
+
   /** How many levels finer or coarser a grid the view would show, see `Strides.finer`. */
   get finer(): number {
     return this.chosen?.finer ?? 0;

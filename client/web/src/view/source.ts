@@ -105,6 +105,20 @@ export interface Moment {
   readonly complete: boolean;
 }
 
+/** What is known of a node of the full surface. */
+export interface NodeValues {
+  readonly block: number;
+  readonly row: number;
+  readonly column: number;
+  /** Coordinates in the surface's unit. */
+  readonly point: readonly number[];
+  /** Names with the values of their components; NaN where there is none. */
+  readonly attributes: readonly (readonly [string, readonly number[]])[];
+  /** What errors around here do not exceed, or else those of the whole; NaN where they are not known. */
+  readonly rms: number;
+  readonly max: number;
+}
+
 /** How the transmission stands. */
 export interface Progress {
   readonly state: "connecting" | "receiving" | "waiting" | "resuming" | "stopped" | "target" | "complete" | "failed";
@@ -140,8 +154,8 @@ export interface Source {
    * @throws Error if they cannot be computed, e.g. because the data are damaged.
    */
   grids(moment: number, level: number): Promise<Grid[]>;
-  /** What the errors of the values around a node do not exceed at a moment; null where only the whole has figures. */
-  errorsAt?(moment: number, row: number, column: number): Promise<{ rms: number; max: number } | null>;
+  /** The values of a node at full resolution, as they are known at a moment, and the errors that hold there. */
+  valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues>;
   /** Asks for a region before the rest; null: no longer. Without effect on surfaces of several blocks. */
   focus(region: Region | null): void;
   /** Changes the target; goes on if it had ended. */
