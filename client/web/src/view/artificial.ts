@@ -204,7 +204,7 @@ export const SPHERE: ArtificialSurface = {
     ...BASE,
     name: "Artificial sphere",
     blocks: [{ shape: [65, 128], closed: [false, true] }],
-    extent: 4,
+    extent: 6.93,
     attributes: [],
   },
   point: (_, row, column) => {
@@ -219,7 +219,7 @@ export const BLOCKS: ArtificialSurface = {
     ...BASE,
     name: "Artificial blocks",
     blocks: Array.from({ length: 6 }, () => ({ shape: [33, 33] as const, closed: [false, false] as const })),
-    extent: 4,
+    extent: 3.46,
     joined: true,
     attributes: [],
   },

@@ -35,11 +35,13 @@ export function boxOf(grids: readonly Grid[]): Box {
  * The frame in which what lies in a box is drawn about 2 units large around 0.
  *
  * @param geographic - x and y are degrees, z metres: all are drawn in metres.
+ * @param diagonal - Of the box of the whole surface, where that is known: a coarse picture may be smaller.
  */
-export function frameOf(box: Box, geographic: boolean): Frame {
+export function frameOf(box: Box, geographic: boolean, diagonal = 0): Frame {
   const origin = ([0, 1, 2] as const).map((k) => (box[0][k] + box[1][k]) / 2) as [number, number, number];
   const metres = geographic ? [DEGREE * Math.max(Math.cos((origin[1] * Math.PI) / 180), 0.01), DEGREE, 1] : [1, 1, 1];
-  const across = Math.max(...[0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!)) || box[1][2] - box[0][2] || 1;
+  const sides = [0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!);
+  const across = Math.max(...sides, diagonal / 2) || box[1][2] - box[0][2] || 1;
   return { origin, scale: metres.map((unit) => (2 * unit) / across) as [number, number, number] };
 }
 

@@ -31,11 +31,12 @@ export function positionOf({ azimuth, elevation, distance, target }: Orbit): [nu
  * The camera that sees a whole box.
  *
  * @param half - Half the extent of the box around 0.
+ * @param whole - Half the diagonal of the whole surface, where the box may be that of a coarser one; else 0.
  * @param aspect - Width of the view by its height.
  * @param flat - A height field: seen from the south and above.
  */
-export function fitted(half: Triple, aspect: number, flat: boolean): Orbit {
-  const radius = Math.hypot(...half) || 1;
+export function fitted(half: Triple, whole: number, aspect: number, flat: boolean): Orbit {
+  const radius = Math.max(Math.hypot(...half), whole) || 1;
   const narrow = Math.min(1, aspect);
   const distance = (radius / Math.sin((VIEW_ANGLE / 2) * RADIANS) / narrow) * (flat ? 0.86 : 0.95);
   return { azimuth: flat ? -90 : -60, elevation: flat ? 42 : 25, distance, target: [0, 0, 0] };

@@ -72,6 +72,8 @@ export type ToGeometry =
       readonly geographic: boolean;
       /** Forget all before. */
       readonly fresh: boolean;
+      /** Of the box around the whole surface; 0: not known. */
+      readonly diagonal: number;
     }
   | { readonly kind: "eye"; readonly eye: Eye }
   | { readonly kind: "field"; readonly field: Field }

@@ -23,10 +23,10 @@ scope.onmessage = ({ data }) => {
 function take(message: ToGeometry): void {
   switch (message.kind) {
     case "picture": {
-      const { grids, joined, geographic, fresh } = message;
+      const { grids, joined, geographic, fresh, diagonal } = message;
       picture = message.picture;
       level = message.level;
-      send(geometry.setPicture(grids, joined, geographic, fresh), true);
+      send(geometry.setPicture(grids, joined, geographic, fresh, diagonal), true);
       wants();
       break;
     }

@@ -56,9 +56,10 @@ export class Geometry {
    * @param joined - Sides of blocks coincide, so that all of it is drawn at one stride.
    * @param geographic - x and y are degrees, z metres.
    * @param fresh - Forget all before.
+   * @param diagonal - See `frameOf`.
    * @returns the buffers of all patches.
    */
-  setPicture(grids: readonly Grid[], joined: boolean, geographic: boolean, fresh: boolean): Change {
+  setPicture(grids: readonly Grid[], joined: boolean, geographic: boolean, fresh: boolean, diagonal = 0): Change {
     if (fresh) {
       this.fixed = null;
       this.base = null;
@@ -67,7 +68,7 @@ export class Geometry {
     this.before = !fresh && gridsFit(this.grids, grids) ? this.grids : null;
     this.grids = grids;
     this.joined = joined;
-    this.fixed ??= frameOf(this.box, geographic);
+    this.fixed ??= frameOf(this.box, geographic, diagonal);
     this.ends = boundaryNormals(grids, this.fixed);
     const shapes = grids.map(({ rowsAt, columnsAt }) => [rowsAt.length, columnsAt.length] as const);
     this.size = patchSize(shapes.map((shape, k) => quadsOf(shape, grids[k]!.closed)));

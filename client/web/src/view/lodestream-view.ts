@@ -15,7 +15,7 @@ import { Session } from "./session";
 import type { Moment, Source, SurfaceInfo } from "./source";
 import { Stage } from "./stage";
 import { styles } from "./styles";
-import { formatView, parseView, type SharedView } from "./url-state";
+import { parseView, type SharedView, withView } from "./url-state";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -57,6 +57,7 @@ export class LodestreamView extends HTMLElement {
   private lastBytes = -1;
   private life: AbortController | null = null;
   private pending = 0;
+  private sharing: ReturnType<typeof setTimeout> | undefined;
   private secret: string | null = null;
 
   constructor() {
@@ -250,9 +251,11 @@ export class LodestreamView extends HTMLElement {
         (k) => ((patches.box[1][k] - patches.box[0][k]) / 2) * patches.frame.scale[k],
       ) as [number, number, number];
       const exaggeration = this.shared.exaggeration ?? defaultExaggeration(half, session.info.heights);
-      stage.setRadius(Math.hypot(...half) * 1.5);
+      const whole = session.info.heights ? 0 : (session.info.extent / 2) * patches.frame.scale[0];
+      stage.setRadius(Math.max(Math.hypot(...half), whole) * 1.5);
       this.home = fitted(
         [half[0], half[1], half[2] * exaggeration],
+        whole,
         stage.size[0] / stage.size[1],
         session.info.heights,
       );
@@ -413,12 +416,17 @@ export class LodestreamView extends HTMLElement {
     return [drawn[0], drawn[1], drawn[2] * this.look.exaggeration];
   }
 
+  /** Writes the view into the address, soon: browsers limit how often that may be done. */
   private share(): void {
     if (!this.hasAttribute("share") || this.orbit === null || this.frame === null) return;
-    const { field, map, range, exaggeration, lines } = this.look;
-    const view: SharedView = { camera: this.toSurface(this.orbit), field, map, exaggeration, lines };
-    if (range !== null) view.range = range;
-    this.dispatchEvent(new CustomEvent("lodestream-view", { detail: formatView(view) }));
+    this.sharing ??= setTimeout(() => {
+      this.sharing = undefined;
+      if (!this.isConnected || this.orbit === null || this.frame === null) return;
+      const { field, map, range, exaggeration, lines } = this.look;
+      const view: SharedView = { camera: this.toSurface(this.orbit), field, map, exaggeration, lines };
+      if (range !== null) view.range = range;
+      history.replaceState(history.state, "", withView(location.hash, view));
+    }, 400);
   }
 
   private takeShared(view: SharedView): void {

@@ -104,13 +104,7 @@ export class LookPanel {
     html("div", { class: "row" }, html("label", { for: "field" }, "Coloured by"), this.field),
     this.mapRow,
     this.rangeRow,
-    html(
-      "div",
-      { class: "row" },
-      html("label", { for: "exaggeration" }, "Heights times"),
-      this.exaggeration,
-      this.times,
-    ),
+    html("div", { class: "row" }, html("label", { for: "exaggeration" }, "Exaggerate"), this.exaggeration, this.times),
     html("div", { class: "row check" }, html("label", {}, this.lines, "Quad lines")),
     html("div", { class: "row" }, this.home, this.top),
   );

@@ -198,8 +198,11 @@ export class Session {
       const joined = info.joined || info.blocks.length > 1;
       const { geographic } = info;
       const fresh = shown === null;
+      const diagonal = info.heights ? 0 : info.extent;
       const kind = "picture";
-      this.post({ kind, picture: moment.number, level, grids, joined, geographic, fresh }, [...new Set(buffers)]);
+      this.post({ kind, picture: moment.number, level, grids, joined, geographic, fresh, diagonal }, [
+        ...new Set(buffers),
+      ]);
       const patches = await came;
       if (this.closed) return;
       this.shown = { moment, level };

@@ -17,7 +17,7 @@ const CSS = `
 :host([hidden]) { display: none }
 * { box-sizing: border-box }
 [hidden] { display: none !important }
-.frame { display: grid; grid-template: minmax(0, 1fr) auto / minmax(0, 1fr) 19.5rem; height: 100% }
+.frame { display: grid; grid-template: minmax(0, 1fr) auto / minmax(0, 1fr) 20rem; height: 100% }
 .stage { position: relative; min-width: 0; min-height: 0; background: var(--sky); overflow: hidden }
 canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block; touch-action: none; cursor: grab }
 canvas:active { cursor: grabbing }
@@ -47,14 +47,14 @@ h2 { font-size: 11px; font-weight: 600; letter-spacing: .06em; text-transform: u
 .figures { display: grid; grid-template-columns: 1fr 1fr; gap: 0 14px; margin: 0 0 8px } .figures dt { color: var(--soft); font-size: 12px } .figures dd { margin: 0; font-size: 15px }
 .figures dt::before { content: ""; display: inline-block; width: 9px; height: 3px; border-radius: 2px; margin-right: 6px; vertical-align: middle; background: var(--accent) }
 .figures dt.max::before { background: var(--second) }
-.curve { display: block; width: 100%; margin: 2px 0 4px; overflow: visible } .curve .grid { stroke: var(--line); stroke-width: 1 }
+.curve { display: block; width: 100%; max-width: 24rem; margin: 2px 0 4px; overflow: visible } .curve .grid { stroke: var(--line); stroke-width: 1 }
 .curve .tick { fill: var(--soft); font-size: 9.5px } .curve .line { fill: none; stroke-width: 1.3; stroke-opacity: .55 }
 .curve .rms { stroke: var(--accent) } .curve .max { stroke: var(--second) } .curve .dot.rms { fill: var(--accent); stroke: none } .curve .dot.max { fill: var(--second); stroke: none }
 .curve .marker { stroke: var(--ink); stroke-opacity: .6; stroke-dasharray: 3 3 }
 .row { display: flex; align-items: center; gap: 8px; margin: 7px 0; flex-wrap: wrap } .row > label:first-child, .row > .name { flex: 0 0 5.6rem; color: var(--soft) }
 .row .grow { flex: 1 1 3.4rem; min-width: 0 } .row .small { padding: 4px 8px } .row.end { justify-content: flex-end; margin: 0 } .row.end select { background: none; color: var(--soft); padding: 0 2px; font-size: 12px; min-height: 24px } .row.check label { display: flex; gap: 8px; align-items: center; flex: 1 1 auto; color: var(--ink) }
 select, input[type=number], button { font: inherit; color: inherit; background: var(--field); border: 1px solid transparent; border-radius: 5px; padding: 4px 8px; min-height: 28px; min-width: 0 }
-input[type=number] { width: 100% } input[type=range] { accent-color: var(--accent); min-width: 0; margin: 0 } input[type=checkbox] { accent-color: var(--accent); margin: 0; width: 15px; height: 15px }
+input[type=number] { width: 100%; appearance: textfield } input::-webkit-inner-spin-button { display: none } input[type=range] { accent-color: var(--accent); min-width: 0; margin: 0 } input[type=checkbox] { accent-color: var(--accent); margin: 0; width: 15px; height: 15px }
 button { cursor: pointer; padding: 4px 12px } button:hover { border-color: var(--soft) }
 button.primary { background: var(--accent); color: var(--accent-ink); font-weight: 600 } button.quiet { background: none; border-color: var(--line) }
 :is(select, input, button, summary):focus-visible { outline: 2px solid var(--accent); outline-offset: 1px }

@@ -89,3 +89,15 @@ export function parseView(text: string): SharedView {
   if (get("l") === "1") view.lines = true;
   return view;
 }
+
+/** Keys of `formatView`; others in an address belong to the page. */
+const KEYS = new Set(["v", "c", "m", "r", "x", "l"]);
+
+/** An address's part after #, with another view in it and what else there was. */
+export function withView(hash: string, view: SharedView): string {
+  const others = hash
+    .replace(/^#/, "")
+    .split("&")
+    .filter((part) => part !== "" && !KEYS.has(part.split("=", 1)[0]!));
+  return `#${[...others, formatView(view)].filter((part) => part !== "").join("&")}`;
+}
