@@ -170,7 +170,7 @@ const DEFAULTS: Readonly<Record<string, unknown>> = {
 /** The bytes of a message. */
 export function serialize(event: Event): Uint8Array {
   const fields: Record<string, unknown> = { type: event.type };
-  if (event.type === "open") fields["version"] = VERSION;
+  if (event.type === "open") fields.version = VERSION;
   for (const [name] of FIELDS[event.type]) {
     const value = plain(name, (event as unknown as Record<string, unknown>)[name]);
     if (value !== undefined) fields[name] = value;
@@ -193,14 +193,14 @@ export function parse(message: Uint8Array): Event {
     );
   }
   const fields = unpacked(message);
-  const type = fields["type"];
+  const type = fields.type;
   if (typeof type !== "string" || !Object.hasOwn(FIELDS, type)) {
     throw new MessageError(
       "bad-message",
       `expected a type out of ${Object.keys(FIELDS).join(", ")}, got ${show(type)}`,
     );
   }
-  if (type === "open") checkVersion(fields["version"]);
+  if (type === "open") checkVersion(fields.version);
   try {
     return values(type as EventType, fields);
   } catch (error) {

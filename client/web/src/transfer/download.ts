@@ -50,13 +50,18 @@ export class Download<View extends ViewInfo> {
     this.window = new Window(options.window);
     // Of a container that is not known by name, nothing can be said to be held.
     const held = reception.container === undefined ? [] : largest(reception);
-    this.opening = this.open(held, reception.container, options.token);
+    this.opening = this.openWith(held, reception.container, options.token);
     this.outbox = [this.opening];
   }
 
   /** Bytes of the container that may still arrive without further credit. */
   get credit(): number {
     return this.connection.credit;
+  }
+
+  /** Whether another target can be asked for over this connection. */
+  get open(): boolean {
+    return this.running || this.stopping;
   }
 
   /**
@@ -123,17 +128,20 @@ export class Download<View extends ViewInfo> {
    */
   retarget(target: Target): void {
     this.reception.retarget(target);
-    const under = this.running || this.stopping;
-    this.turn();
-    this.turning = this.aiming = under;
+    this.turn(true);
   }
 
-  /** End the current order, and open again with the changed target of the reception. */
-  turn(): void {
-    if (this.running) {
-      this.turning = true;
-      this.outbox.push(this.connection.send({ type: "stop" }));
-    }
+  /**
+   * End the current order, and open again with the changed target of the reception.
+   *
+   * @param aiming Whether more than the region that comes first has changed, so that what is under way may end and the
+   * next target still be wanted.
+   */
+  turn(aiming = false): void {
+    if (this.running) this.outbox.push(this.connection.send({ type: "stop" }));
+    else if (!(aiming && this.stopping)) return;
+    this.turning = true;
+    this.aiming ||= aiming;
   }
 
   /** Ask the server to stop sending, at once. A second call, or one after the end, does nothing. */
@@ -187,7 +195,7 @@ export class Download<View extends ViewInfo> {
     return this.connection.state === "withdrawn" || this.connection.state === "stopping";
   }
 
-  private open(held: readonly Place[] = [], container?: string, token?: string): Uint8Array {
+  private openWith(held: readonly Place[] = [], container?: string, token?: string): Uint8Array {
     const credit = this.window.size;
     this.window.grant(credit);
     return this.connection.send({ type: "open", target: this.reception.target, credit, held, container, token });
@@ -220,7 +228,7 @@ export class Download<View extends ViewInfo> {
       this.turning = this.aiming = false;
       // The server knows what it has sent, and that nothing more of the last grants will come.
       this.window.restart();
-      this.outbox.push(this.open());
+      this.outbox.push(this.openWith());
       return;
     }
     this.outbox.push(this.connection.send({ type: "bye" }));

@@ -51,7 +51,7 @@ export function fromCode(code: string, message: string): LodestreamError {
  */
 export function fromResponse(status: number, reason: string, body: string, url: string): LodestreamError {
   const document = parsed(body);
-  const detail = textOf(document["detail"]) ?? textOf(document["title"]);
+  const detail = textOf(document.detail) ?? textOf(document.title);
   let message = detail?.slice(0, LONGEST) ?? `the server answered ${status} ${reason} for ${url}`;
   const { code, title } = document;
   if (typeof code === "string") {
