@@ -5,12 +5,12 @@
  */
 
 import type { Index } from "../container/model";
+import { select } from "../container/selection";
 import { OptionError } from "../errors";
 import type { ByteRange, LevelRecord, Target } from "../types";
 import { type Ended, endOf, type Mark, type Plan } from "./plans";
 import type { RangeSet } from "./ranges";
 import { regionFirst } from "./region-first";
-import { select, wishOf } from "./selection";
 import { absolute } from "./target";
 
 /**
@@ -142,7 +142,7 @@ function byLevel(index: Index, target: Target, level: number): Plan {
 
 /** A window, or some attributes only: segments in file order or level by level, then pieces of exactness. */
 function selected(index: Index, target: Target): Plan {
-  const chosen = select(index, wishOf(target));
+  const chosen = select(index, target);
   const { tiles, levels } = index.header.layout;
   const partial = target.region !== undefined;
   const finest = target.level ?? levels;

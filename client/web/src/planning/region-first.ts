@@ -1,10 +1,10 @@
 /** Reordering a plan: what a region needs comes first, the rest after it. */
 
 import type { Index } from "../container/model";
+import { checkWish, wishedTiles } from "../container/selection";
 import type { ByteRange, Region } from "../types";
 import type { Mark, Plan } from "./plans";
 import { RangeSet } from "./ranges";
-import { Wish } from "./selection";
 
 /** A mark, and of the bytes before it in the plan's order those that now come ahead and behind. */
 interface Step {
@@ -25,9 +25,8 @@ interface Step {
  * @throws OptionError if the surface has no such region, or several blocks.
  */
 export function regionFirst(index: Index, chosen: Plan, region: Region): Plan {
-  const wish = new Wish(region);
-  wish.check(index.header);
-  const tiles = wish.tiles(index.header);
+  checkWish({ region }, index.header);
+  const tiles = wishedTiles({ region }, index.header);
   const near = new RangeSet(
     index.segments.filter((segment) => tiles[segment.tile]).map(({ range }) => [range.offset, range.length] as const),
   );

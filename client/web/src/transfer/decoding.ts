@@ -5,6 +5,7 @@
  * what has been decoded, and credit is granted for what has been used.
  */
 
+import type { Capacity } from "../container/capacity";
 import type { Header } from "../container/header";
 import type { Index } from "../container/model";
 import type { Region, ViewInfo } from "../types";
@@ -20,7 +21,7 @@ export interface StreamDecoder<View extends ViewInfo> {
   /** Whether the whole surface has arrived; metadata and index may still be missing. */
   readonly complete: boolean;
   /** How much memory may be taken; `take` counts, and throws `TooLargeError` beyond `bytes`. */
-  readonly capacity: { readonly bytes: number; take(count: number): void };
+  readonly capacity: Capacity;
 
   /**
    * Decode a slice of the container that starts at `offset`; returns the views that it completes.

@@ -6,7 +6,6 @@
  * within the first bytes are shown before the plan exists, if it is certain to contain them.
  */
 
-import { readIndex } from "../container/reader";
 import { RemoteError, RemoteProtocolError, TruncatedStreamError } from "../errors";
 import { type Place, RangeSet } from "../planning/ranges";
 import { MAX_CREDIT, MIN_WINDOW } from "../protocol/messages";
@@ -33,13 +32,6 @@ const CONTAINER_TAG = /^"([0-9a-f]{64})"$/;
 /** Headers of an answer, by names in any case; `Headers` of the platform is one. */
 export interface AnswerHeaders {
   get(name: string): string | null;
-}
-
-/** Bytes that are needed to read the index. */
-class Missing extends Error {
-  constructor(readonly place: Place) {
-    super();
-  }
 }
 
 /** One request for a range of the file, and its answer: `answer`, then `receive` for each piece, then `finish`. */
@@ -281,21 +273,9 @@ export class RangeDownload<View extends ViewInfo> {
   }
 
   private readIndex(): View[] {
-    const store = this.reception.keep();
-    const size = this.reception.size ?? 0;
-    const read = (offset: number, length: number): Uint8Array => {
-      const taken = Math.min(length, size - offset);
-      for (const gap of store.ranges.missing(offset, taken)) throw new Missing(gap);
-      return store.read(offset, taken);
-    };
-    this.needed = undefined;
-    try {
-      return this.reception.learn(readIndex(read, size, this.reception.indexCapacity()));
-    } catch (error) {
-      if (!(error instanceof Missing)) throw error;
-      this.needed = error.place;
-      return [];
-    }
+    const found = this.reception.find(this.reception.size ?? 0);
+    this.needed = "missing" in found ? found.missing : undefined;
+    return "views" in found ? found.views : [];
   }
 
   /** The next slice that is missing, with those after it that are near and nothing between that is held. */

@@ -5,8 +5,10 @@
  * The reception is handed to the next connection, so that bytes that have arrived are not requested again.
  */
 
+import { Capacity } from "../container/capacity";
+import type { Header } from "../container/header";
 import type { Index } from "../container/model";
-import { INDEX_GROWTH, indexFrom } from "../container/reader";
+import { headerSteps, INDEX_GROWTH, indexFrom, indexSteps } from "../container/reader";
 import { checkMetadataLength } from "../container/sections";
 import { OptionError, RemoteError, RemoteProtocolError, TooLargeError, TruncatedStreamError } from "../errors";
 import { plan } from "../planning/plan";
@@ -129,6 +131,21 @@ export class Reception<View extends ViewInfo> {
   learn(index: Index): View[] {
     this.makePlan(index);
     return this.advance();
+  }
+
+  /**
+   * Look for the index among the bytes that are kept, of a container whose size is known.
+   *
+   * @returns The views that stored bytes complete, or the first bytes that are missing to read the index.
+   * @throws CorruptStreamError, TruncatedStreamError, UnsupportedVersionError, TooLargeError if they are not those of a
+   * container that can be read.
+   * @throws OptionError if the container cannot meet the target.
+   */
+  find(size: number): { readonly views: View[] } | { readonly missing: Place } {
+    const store = this.keep();
+    const capacity = new Capacity(this.decoder.capacity.maxVertices);
+    const found = stepped(indexSteps(size, capacity), store, size);
+    return isPlace(found) ? { missing: found } : { views: this.learn(found) };
   }
 
   /**
@@ -330,10 +347,44 @@ export class Reception<View extends ViewInfo> {
   private learnFromStore(store: Store): View[] | undefined {
     if (this.service === undefined || !store.ranges.covers(...this.service[0])) return undefined;
     const [offset, length] = this.service[0];
-    const header = this.decoder.header ?? headerFrom(store);
-    if (header === null) return undefined;
-    this.decoder.capacity.take(INDEX_GROWTH * length);
+    const own = this.decoder.header;
+    const header = own !== null && !own.awaitsMasks ? own : headerIn(store);
+    if (header === undefined) return undefined;
+    const { capacity } = this.decoder;
+    capacity.promise(0, [], { masked: 0, tables: header.tables });
+    capacity.take(INDEX_GROWTH * length);
     return this.learn(indexFrom(store.read(offset, length), offset, header));
+  }
+}
+
+/** The header, and the masks after it, in a store; undefined: not all has come. */
+function headerIn(store: Store): Header | undefined {
+  const run = store.ranges.run(0);
+  try {
+    const found = stepped(headerSteps(run), store, run);
+    return isPlace(found) ? undefined : found;
+  } catch (error) {
+    if (error instanceof TruncatedStreamError) return undefined;
+    throw error;
+  }
+}
+
+function isPlace(found: object): found is Place {
+  return Array.isArray(found);
+}
+
+/** What bytes in a store lead to; where some are missing that are needed, the first run of them. */
+function stepped<Result extends object>(
+  steps: Generator<ByteRange, Result, Uint8Array>,
+  store: Store,
+  size: number,
+): Result | Place {
+  for (let step = steps.next(); ; ) {
+    if (step.done) return step.value;
+    const { offset, length } = step.value;
+    const taken = Math.max(Math.min(length, size - offset), 0);
+    for (const gap of store.ranges.missing(offset, taken)) return gap;
+    step = steps.next(store.read(offset, taken));
   }
 }
 
