@@ -27,7 +27,7 @@ export function neededTiles(layout: Layout, region: Region): Uint8Array {
   const needed = new Uint8Array(tiles.length);
   needed[0] = 1;
   const shape = layout.grids[0]!.shape;
-  let samples = ([0, 1] as const).map((axis) => new Uint8Array(shape[axis]).fill(1, ...region[axis]));
+  let samples: Uint8Array[] = ([0, 1] as const).map((axis) => new Uint8Array(shape[axis]).fill(1, ...region[axis]));
   for (let level = layout.levels; level > 0; level--) {
     const steps = layout.steps(0, level);
     // Coefficients along each axis: nodes first, details after them.
