@@ -96,5 +96,5 @@ export function readMetadata(data: Uint8Array, offset: number): Metadata {
 export function takeDigest(values: Metadata): string | null {
   const digest = values[DIGEST];
   delete values[DIGEST];
-  return typeof digest === "string" ? digest : null;
+  return digest === undefined ? null : String(digest);
 }
