@@ -20,6 +20,20 @@ export const DTYPES = [
 /** Type of a channel's values. */
 export type DType = (typeof DTYPES)[number];
 
+/** Bytes of a value of each type. */
+export const DTYPE_BYTES: Readonly<Record<DType, number>> = {
+  int8: 1,
+  int16: 2,
+  int32: 4,
+  int64: 8,
+  uint8: 1,
+  uint16: 2,
+  uint32: 4,
+  uint64: 8,
+  float32: 4,
+  float64: 8,
+};
+
 /** An array of values of one `DType`, in C order. Integers of 64 bits are bigints. */
 export type Values =
   | Int8Array
