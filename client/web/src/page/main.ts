@@ -1,11 +1,11 @@
 /** The page: a list of surfaces, and one of them opened, by what follows # in the address. */
 
-import type { LodestreamView } from "../view";
+import { LodestreamView } from "../view";
 import { html, setText } from "../view/dom";
-import { formatBytes } from "../view/format";
+import { formatBytes, formatNumber } from "../view/format";
 import type { Progress, SurfaceInfo } from "../view/source";
 import { ProblemError, Server } from "./api";
-import { type Configuration, configured } from "./configuration";
+import { configured, type ShownSurface } from "./configuration";
 import { askToken } from "./dialogs";
 import icon from "./icon.svg?url";
 import { Listing, nameOf } from "./listing";
@@ -46,7 +46,7 @@ function open(src: string, name: string, back: boolean): void {
     setTimeout(() => setText(copy, "Copy link"), 1500);
   });
   header.replaceChildren(mark(back), title, facts, html("span", { class: "grow" }), copy);
-  view = document.createElement("lodestream-view") as LodestreamView;
+  view = new LodestreamView();
   view.token = server.token;
   view.setAttribute("share", "");
   if (name !== "") view.setAttribute("name", name);
@@ -117,16 +117,67 @@ function fail(error: unknown): void {
   );
 }
 
-function start(configuration: Configuration | null): void {
-  if (configuration === null) {
+/** Shows the surfaces of a static host: the only one, or the one whose number is asked for, or a list. */
+async function showConfigured(surfaces: readonly ShownSurface[]): Promise<void> {
+  const asked = /(?:^#|&)f=(\d+)/.exec(location.hash)?.[1];
+  const only = surfaces.length === 1 ? surfaces[0] : surfaces[Number(asked ?? -1)];
+  if (only === undefined) return showChoice(surfaces);
+  const { src, name, progress } = only;
+  if (progress !== null) return showMaking(surfaces, name, progress);
+  const address = new URL(src, document.baseURI);
+  if (address.origin !== location.origin)
+    throw new Error(`expected a container of this host, got one of ${address.host}`);
+  open(address.href, name, surfaces.length > 1);
+}
+
+function showChoice(surfaces: readonly ShownSurface[]): void {
+  closeAll();
+  header.replaceChildren(mark(false));
+  const items = surfaces.map(({ name, bytes }, k) =>
+    html("li", {}, html("a", { href: `#f=${k}` }, name), bytes === null ? null : ` ${formatBytes(bytes)}`),
+  );
+  document.body.replaceChildren(
+    header,
+    html(
+      "main",
+      { class: "list" },
+      html("div", { class: "title" }, html("h1", {}, "Surfaces")),
+      html("ul", { class: "choice" }, ...items),
+    ),
+  );
+}
+
+/** A container that is being made: looks again twice a second. */
+function showMaking(surfaces: readonly ShownSurface[], name: string, progress: number): void {
+  const text = `Encoding: ${formatNumber(Math.floor(100 * progress))} %`;
+  const status = document.querySelector(".making [role=status]");
+  const bar = document.querySelector<HTMLProgressElement>(".making progress");
+  if (status !== null && bar !== null) {
+    setText(status, text);
+    bar.value = progress;
+  } else {
+    header.replaceChildren(mark(false), html("h1", {}, name));
+    const made = html("progress", { max: 1, value: progress, "aria-label": `Encoding of ${name}` });
+    document.body.replaceChildren(
+      header,
+      html("main", { class: "list making" }, html("p", { class: "message", role: "status" }, text), made),
+    );
+  }
+  setTimeout(() => {
+    configured()
+      .then((found) => showConfigured(found ?? surfaces))
+      .catch(fail);
+  }, 500);
+}
+
+function start(surfaces: ShownSurface[] | null): void {
+  if (surfaces === null) {
     addEventListener("hashchange", () => void route());
     void route();
     return;
   }
-  const address = new URL(configuration.src, document.baseURI);
-  if (address.origin !== location.origin)
-    throw new Error(`expected a container of this host, got one of ${address.host}`);
-  open(address.href, configuration.name, false);
+  if (surfaces.length > 1) addEventListener("hashchange", () => void showConfigured(surfaces).catch(fail));
+  showConfigured(surfaces).catch(fail);
 }
 
 configured().then(start).catch(fail);

@@ -64,7 +64,7 @@ export class Uploads {
 
   private async upload(file: File): Promise<void> {
     const what = html("span", { class: "what", role: "status" }, "Waiting");
-    const bar = html("progress", { max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
+    const bar = html("progress", { class: "bar", max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
     const cancel = html("button", { type: "button", class: "plain" }, "Cancel");
     const item = html("li", {}, html("span", { class: "name" }, file.name), cancel, what, bar);
     this.list.prepend(item);

@@ -34,9 +34,6 @@ export interface BlockInfo {
   readonly closed: readonly [boolean, boolean];
 }
 
-/** A rule of x or y, see `coordinates.ts`. */
-export type Rule = readonly (number | boolean | string)[];
-
 /** What is known of a surface before its values. */
 export interface SurfaceInfo {
   readonly name: string;
