@@ -65,3 +65,9 @@ export class RemoteError extends LodestreamError {
     this.code = code;
   }
 }
+
+/** There is no connection to the server, or it broke before the end. */
+export class UnreachableError extends LodestreamError {}
+
+/** The server sent nothing for longer than allowed. */
+export class SilenceError extends LodestreamError {}

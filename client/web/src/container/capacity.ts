@@ -28,12 +28,13 @@ export interface Extent {
 export class Capacity {
   /** Bytes allowed for the surface, and again for what is read. */
   readonly bytes: number;
-  readonly #maxVertices: number | null;
+  /** The vertices that were allowed; null: no number was given. */
+  readonly maxVertices: number | null;
   #read = 0;
 
   /** Allows this many vertices and `BYTES_PER_VERTEX` bytes for each, plus 16 MiB; null: 3 GiB. */
   constructor(maxVertices: number | null = null) {
-    this.#maxVertices = maxVertices;
+    this.maxVertices = maxVertices;
     this.bytes = maxVertices === null ? DEFAULT_BYTES : LEAST + maxVertices * BYTES_PER_VERTEX;
   }
 
@@ -42,8 +43,8 @@ export class Capacity {
    * are kept, and `tables` tiles of all channels and blocks. Throws `TooLargeError`.
    */
   promise(vertices: number, grids: Iterable<Extent>, { masked, tables }: { masked: number; tables: number }): void {
-    if (this.#maxVertices !== null && vertices > this.#maxVertices) {
-      throw new TooLargeError(`expected at most ${this.#maxVertices} vertices (maxVertices), got ${vertices}`);
+    if (this.maxVertices !== null && vertices > this.maxVertices) {
+      throw new TooLargeError(`expected at most ${this.maxVertices} vertices (maxVertices), got ${vertices}`);
     }
     let needed = masked * MASKS + tables * TABLE;
     for (const { shape, sizes } of grids) {

@@ -16,6 +16,9 @@ const FIRST_READ = 512;
 /** Reads bytes of a container; fewer than asked for only where it ends. */
 export type Read = (offset: number, length: number) => Promise<Uint8Array>;
 
+/** What reads an index: it asks for bytes, fewer only where the container ends, and ends with the index. */
+export type IndexSteps = Generator<ByteRange, Index, Uint8Array>;
+
 /**
  * Index of a complete container of `size` bytes.
  *
@@ -24,18 +27,26 @@ export type Read = (offset: number, length: number) => Promise<Uint8Array>;
  * does not end with a footer, but is otherwise one.
  */
 export async function readIndex(read: Read, size: number, capacity?: Capacity): Promise<Index> {
-  const header = await readHeader(read, size, capacity);
+  const steps = indexSteps(size, capacity);
+  for (let step = steps.next(); ; ) {
+    if (step.done) return step.value;
+    step = steps.next(await read(step.value.offset, step.value.length));
+  }
+}
+
+/** What `readIndex` does, for callers that have bytes in other ways. */
+export function* indexSteps(size: number, capacity?: Capacity): IndexSteps {
+  const header = yield* headerSteps(size, capacity);
   capacity?.promise(0, [], { masked: 0, tables: header.tables });
   const tail = size - FOOTER_LENGTH;
-  const place = footerIn(await read(Math.max(tail, 0), FOOTER_LENGTH), tail, size);
+  const place = footerIn(yield { offset: Math.max(tail, 0), length: FOOTER_LENGTH }, tail, size);
   capacity?.take(INDEX_GROWTH * place.length);
-  const index = indexFrom(await read(place.offset, place.length), place.offset, header);
+  const index = indexFrom(yield place, place.offset, header);
   if (index.size !== size) {
     throw new CorruptStreamError(`expected a container of ${index.size} bytes, got ${size}`, tail);
   }
-  const { offset, length } = index.metadata;
-  capacity?.take(length);
-  const values = readMetadata(await read(offset, length), offset);
+  capacity?.take(index.metadata.length);
+  const values = readMetadata(yield index.metadata, index.metadata.offset);
   const digest = takeDigest(values);
   return index.withMetadata(values, digest);
 }
@@ -49,13 +60,14 @@ function footerIn(data: Uint8Array, tail: number, size: number): ByteRange {
   }
 }
 
-async function readHeader(read: Read, size: number, capacity?: Capacity): Promise<Header> {
+/** The header, and the masks after it, of a container of which `size` bytes can be had. */
+export function* headerSteps(size: number, capacity?: Capacity): Generator<ByteRange, Header, Uint8Array> {
   const reader = new FrameReader();
   let header: Header | null = null;
   let wanted = FIRST_READ;
   for (let position = 0; position < size; wanted *= 2) {
     capacity?.take(Math.min(wanted, size - position));
-    const chunk = await read(position, Math.min(wanted, size - position));
+    const chunk = yield { offset: position, length: Math.min(wanted, size - position) };
     for (const frame of reader.feed(chunk)) {
       if (header === null) header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
       else if (frame.kind === KIND.masks || frame.kind === KIND.keptMasks) return parseMasks(header, frame);
