@@ -1,7 +1,7 @@
 /** Decoders for tests of streams. */
 import { Decoder } from "../src/decoding/decoder";
 import type { View } from "../src/decoding/view";
-import { loadKernels } from "../src/kernels";
+import { loadKernels } from "../src/kernels/instance";
 import type { StreamDecoder } from "../src/transfer/decoding";
 import type { Target } from "../src/types";
 

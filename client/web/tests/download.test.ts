@@ -187,10 +187,12 @@ describe.each(KINDS)("%s", (kind) => {
       checkEnd(link.reception, kind, target);
       expect(link.server.connection.state).toBe("closed");
       expect(link.client.header!.planned).toBe(endOf(plan(INDEX[kind]!, target)).bytes);
-      if (window === MAX_CREDIT && target.first === undefined) {
-        const bytesOf = plan(INDEX[kind]!, target).marks.map((mark) => mark.bytes);
-        expect(link.views.map((view) => view.bytes)).toEqual(bytesOf);
-      }
+      // Levels that are whole make views beside those of layers, and layers beside those of levels; where a region comes
+      // first, the tables of layers come with the rest.
+      const shown = link.views.map((view) => view.bytes);
+      const marks = target.first === undefined ? plan(INDEX[kind]!, target).marks : [];
+      for (const mark of marks) expect(shown).toContain(mark.bytes);
+      expect(shown).toEqual(shown.toSorted((a, b) => a - b));
     }
   });
 

@@ -16,7 +16,10 @@ export function recording(): Recorded[] {
   const listing = page.split("<!-- recorded -->")[1]!.split("<!-- recorded until here -->")[0]!;
   const entries: Recorded[] = [];
   for (const paragraph of listing.split("\n\n")) {
-    const [head, ...lines] = paragraph.trim().split("\n");
+    const [head, ...lines] = paragraph
+      .replaceAll(/```\w*/g, "")
+      .trim()
+      .split("\n");
     const found = /^(client|server): (\w+)/.exec(head!);
     const number = entries.length;
     if (found !== null) {

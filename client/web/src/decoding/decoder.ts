@@ -46,10 +46,11 @@ interface Begun {
 export class Decoder {
   /** All states so far. */
   readonly layers: View[] = [];
+  /** How much memory may be taken; it counts what has been read. */
+  readonly capacity: Capacity;
   readonly #module: WebAssembly.Module;
   readonly #wish: Wish;
   readonly #finest: number | undefined;
-  readonly #capacity: Capacity;
   readonly #frames = new FrameReader();
   readonly #values: Metadata = {};
   readonly #digest: { value: string | null } = { value: null }; // filled when it comes, for views made before
@@ -72,7 +73,7 @@ export class Decoder {
     this.#module = module;
     this.#wish = { region: options.region, attributes: options.attributes };
     this.#finest = options.level;
-    this.#capacity = new Capacity(options.maxVertices);
+    this.capacity = new Capacity(options.maxVertices);
   }
 
   /** The header, with the masks once they have come; null before it. */
@@ -103,7 +104,7 @@ export class Decoder {
   /** Decode the next bytes of the file; returns the views that they complete. The layers before damage stay usable. */
   feed(chunk: Uint8Array): View[] {
     const before = this.layers.length;
-    this.#capacity.take(chunk.length);
+    this.capacity.take(chunk.length);
     this.#feed(chunk);
     return this.layers.slice(before);
   }
@@ -114,7 +115,7 @@ export class Decoder {
    */
   feedAt(offset: number, chunk: Uint8Array): View[] {
     const before = this.layers.length;
-    this.#capacity.take(chunk.length);
+    this.capacity.take(chunk.length);
     if (this.#slices !== null) {
       this.#takeSlice(this.#slices, offset, chunk);
     } else if (offset === this.#frames.position + this.#frames.pending) {
@@ -208,7 +209,7 @@ export class Decoder {
     if (pages === null) {
       throw new CorruptStreamError("expected the pages of an index before its root, got the root", root.offset);
     }
-    this.#capacity.take(INDEX_GROWTH * (root.end - pages.offset));
+    this.capacity.take(INDEX_GROWTH * (root.end - pages.offset));
     this.#index = parseIndex(pages, root, header).withMetadata(this.#metadata ?? {}, this.#digest.value);
   }
 
@@ -226,7 +227,7 @@ export class Decoder {
     const header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
     this.#header = header;
     checkWish(this.#wish, header);
-    checkSize(this.#wish, header, this.#capacity, this.#finest);
+    checkSize(this.#wish, header, this.capacity, this.#finest);
     if (!header.masked) this.#begin(header);
   }
 
@@ -251,7 +252,7 @@ export class Decoder {
       throw new CorruptStreamError(`expected ${header.layerCount} layers, got more`, frame.offset);
     }
     const { errors, entries, start } = parseLayer(frame.payload, frame.payloadOffset, header);
-    this.#capacity.take(ENTRY * entries.length);
+    this.capacity.take(ENTRY * entries.length);
     const segments: Coded[] = [];
     let place = start;
     for (const { tile, channel, top, passes, length } of entries) {
@@ -306,7 +307,7 @@ export class Decoder {
     const { header, progress, shared, wanted } = begun;
     const { channels, layout } = header;
     const state = progress.snapshot(made.allPlanes);
-    this.#capacity.take(state.length);
+    this.capacity.take(state.length);
     if (made.wholeLevel >= 0) {
       // The index says that there is nothing more of these levels.
       const stop = layout.tilesOf(made.wholeLevel)[1] * channels;
@@ -344,7 +345,7 @@ export class Decoder {
   }
 
   #takeLooseIndex(data: Uint8Array, start: number, begun: Begun): void {
-    this.#capacity.take(INDEX_GROWTH * data.length);
+    this.capacity.take(INDEX_GROWTH * data.length);
     const index = indexFrom(data, start, begun.header).withMetadata(this.#metadata ?? {}, this.#digest.value);
     this.#index = index;
     const slices = new Slices(index, select(index, this.#wish), this.#wish.region !== undefined);
