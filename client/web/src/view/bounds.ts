@@ -31,18 +31,34 @@ export function boxOf(grids: readonly Grid[]): Box {
       ];
 }
 
+/** What decides a frame beside the box. */
+export interface FrameOptions {
+  /** x and y are degrees, z metres: all are drawn in metres. */
+  readonly geographic: boolean;
+  readonly heights: boolean;
+  /** Of the box of the whole surface; 0 where it is not known: a coarse picture may be smaller. */
+  readonly diagonal: number;
+}
+
+/** How high relief of an unknown unit is drawn, where 2 is the largest extent of x and y. */
+const FITTED = 0.4;
+
 /**
  * The frame in which what lies in a box is drawn about 2 units large around 0.
+.
  *
- * @param geographic - x and y are degrees, z metres: all are drawn in metres.
- * @param diagonal - Of the box of the whole surface, where that is known: a coarse picture may be smaller.
+ * Heights that range over more than x and y have another unit than these, such as metres over degrees: they are drawn so
+ * that the relief can be seen.
  */
-export function frameOf(box: Box, geographic: boolean, diagonal = 0): Frame {
+export function frameOf(box: Box, { geographic, heights, diagonal }: FrameOptions): Frame {
   const origin = ([0, 1, 2] as const).map((k) => (box[0][k] + box[1][k]) / 2) as [number, number, number];
   const metres = geographic ? [DEGREE * Math.max(Math.cos((origin[1] * Math.PI) / 180), 0.01), DEGREE, 1] : [1, 1, 1];
   const sides = [0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!);
   const across = Math.max(...sides, diagonal / 2) || box[1][2] - box[0][2] || 1;
-  return { origin, scale: metres.map((unit) => (2 * unit) / across) as [number, number, number] };
+  const scale = metres.map((unit) => (2 * unit) / across) as [number, number, number];
+  const high = (box[1][2] - box[0][2]) * scale[2];
+  if (heights && high > 2) scale[2] *= FITTED / high;
+  return { origin, scale };
 }
 
 /** Box and average edge of a patch, as it is drawn. */

@@ -1,5 +1,6 @@
 /** What the element and its geometry worker say to each other; arrays are transferred, not copied. */
 
+import type { PictureOptions } from "./geometry";
 import type { Frame } from "./lattice";
 import type { Grid, Region } from "./source";
 
@@ -68,12 +69,7 @@ export type ToGeometry =
       readonly picture: number;
       readonly level: number;
       readonly grids: readonly Grid[];
-      readonly joined: boolean;
-      readonly geographic: boolean;
-      /** Forget all before. */
-      readonly fresh: boolean;
-      /** Of the box around the whole surface; 0: not known. */
-      readonly diagonal: number;
+      readonly options: PictureOptions;
     }
   | { readonly kind: "eye"; readonly eye: Eye }
   | { readonly kind: "field"; readonly field: Field }

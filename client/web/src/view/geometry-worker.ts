@@ -23,10 +23,10 @@ scope.onmessage = ({ data }) => {
 function take(message: ToGeometry): void {
   switch (message.kind) {
     case "picture": {
-      const { grids, joined, geographic, fresh, diagonal } = message;
+      const { grids, options } = message;
       picture = message.picture;
       level = message.level;
-      send(geometry.setPicture(grids, joined, geographic, fresh, diagonal), true);
+      send(geometry.setPicture(grids, options), true);
       wants();
       break;
     }

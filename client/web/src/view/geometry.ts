@@ -1,7 +1,7 @@
 /** The drawn surface: which patches there are, at which strides, and their buffers. Runs in a worker. */
 
 import { type BoundaryNormals, boundaryNormals } from "./boundary-normals";
-import { boundsOf, boxOf, frameOf, gridsFit } from "./bounds";
+import { boundsOf, boxOf, type FrameOptions, frameOf, gridsFit } from "./bounds";
 import { extremes, type FieldInput, fieldBefore, fieldValues, inner, NO_VALUE } from "./fields";
 import type { Box, Colouring, Eye, Field, Hit, PatchBuffers } from "./geometry-messages";
 import { type Frame, latticeBetween, latticeOf, placesOf } from "./lattice";
@@ -16,6 +16,14 @@ import { chooseStrides, type PatchBounds, type Strides } from "./strides";
 export interface Change {
   readonly patches: PatchBuffers[];
   readonly triangles: number;
+}
+
+/** What is said of a picture. */
+export interface PictureOptions extends FrameOptions {
+  /** Sides of blocks coincide, so that all of it is drawn at one stride. */
+  readonly joined: boolean;
+  /** Forget all before. */
+  readonly fresh: boolean;
 }
 
 /** Triangles on the graphics card where nothing else is said. */
@@ -53,13 +61,9 @@ export class Geometry {
   /**
    * Takes a new picture; the one in hand becomes the one before, from which the new one is blended in.
    *
-   * @param joined - Sides of blocks coincide, so that all of it is drawn at one stride.
-   * @param geographic - x and y are degrees, z metres.
-   * @param fresh - Forget all before.
-   * @param diagonal - See `frameOf`.
    * @returns the buffers of all patches.
    */
-  setPicture(grids: readonly Grid[], joined: boolean, geographic: boolean, fresh: boolean, diagonal = 0): Change {
+  setPicture(grids: readonly Grid[], { joined, fresh, ...options }: PictureOptions): Change {
     if (fresh) {
       this.fixed = null;
       this.base = null;
@@ -68,7 +72,7 @@ export class Geometry {
     this.before = !fresh && gridsFit(this.grids, grids) ? this.grids : null;
     this.grids = grids;
     this.joined = joined;
-    this.fixed ??= frameOf(this.box, geographic, diagonal);
+    this.fixed ??= frameOf(this.box, options);
     this.ends = boundaryNormals(grids, this.fixed);
     const shapes = grids.map(({ rowsAt, columnsAt }) => [rowsAt.length, columnsAt.length] as const);
     this.size = patchSize(shapes.map((shape, k) => quadsOf(shape, grids[k]!.closed)));

@@ -29,7 +29,10 @@ export function gridOf(block: Block, number: number, header: Header, level: numb
   const values = numbers(block.points);
   const { components } = block.points;
   const points = new Float64Array(3 * rows * columns);
-  let [rowsAt, columnsAt]: [Float64Array, Float64Array] = [Float64Array.from(block.rows), Float64Array.from(block.columns)];
+  let [rowsAt, columnsAt]: [Float64Array, Float64Array] = [
+    Float64Array.from(block.rows),
+    Float64Array.from(block.columns),
+  ];
   if (areHeights(header)) {
     const { placement, at } = placed(block, header, level, metadata);
     [rowsAt, columnsAt] = at;

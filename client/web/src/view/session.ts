@@ -39,6 +39,7 @@ export class Session {
   private pixels = 0;
   private asked = 0;
   private busy = false;
+  private eyeDue = false;
   private closed = false;
   private userStopped = false;
   private triangles: number;
@@ -102,12 +103,12 @@ export class Session {
     this.viewChanged();
   }
 
-  /** The camera has moved or the canvas has another size: soon the worker is told. */
+  /** The camera has moved or the canvas has another size: soon the worker is told, but not while a picture is blended in. */
   viewChanged(): void {
     this.eyeTimer ??= setTimeout(() => {
       this.eyeTimer = undefined;
-      if (!this.closed && this.shown !== null && !this.busy) this.post({ kind: "eye", eye: this.stage.eye() });
-      else if (!this.closed) this.viewChanged();
+      this.eyeDue = true;
+      if (!this.busy) this.tellEye();
     }, 120);
   }
 
@@ -165,6 +166,12 @@ export class Session {
     }
   }
 
+  private tellEye(): void {
+    if (!this.eyeDue || this.closed || this.shown === null) return;
+    this.eyeDue = false;
+    this.post({ kind: "eye", eye: this.stage.eye() });
+  }
+
   private post(message: ToGeometry, transfer: Transferable[] = []): void {
     this.worker.postMessage(message, transfer);
   }
@@ -195,14 +202,11 @@ export class Session {
           array === null ? [] : [array.buffer as ArrayBuffer],
         ),
       );
+      const { geographic, heights } = info;
       const joined = info.joined || info.blocks.length > 1;
-      const { geographic } = info;
-      const fresh = shown === null;
-      const diagonal = info.heights ? 0 : info.extent;
-      const kind = "picture";
-      this.post({ kind, picture: moment.number, level, grids, joined, geographic, fresh, diagonal }, [
-        ...new Set(buffers),
-      ]);
+      const diagonal = heights ? 0 : info.extent;
+      const options = { joined, geographic, heights, diagonal, fresh: shown === null };
+      this.post({ kind: "picture", picture: moment.number, level, grids, options }, [...new Set(buffers)]);
       const patches = await came;
       if (this.closed) return;
       this.shown = { moment, level };
@@ -218,7 +222,8 @@ export class Session {
     } finally {
       this.busy = false;
     }
-    if (this.wanted === null) this.viewChanged();
+    this.eyeDue ||= this.wanted === null;
+    this.tellEye();
     void this.pump();
   }
 

@@ -43,7 +43,9 @@ class Drawn {
 
   picture(grids: Grid[], joined = false): this {
     this.patches.clear();
-    return this.take(this.geometry.setPicture(grids, joined, false, false).patches);
+    return this.take(
+      this.geometry.setPicture(grids, { joined, geographic: false, heights: false, diagonal: 0, fresh: false }).patches,
+    );
   }
 
   eye(eye: Eye): this {
