@@ -4,24 +4,11 @@ import { html, setText } from "../view/dom";
 import { formatBytes } from "../view/format";
 import { type ListedSurface, ProblemError, type Server } from "./api";
 import { askDelete } from "./dialogs";
+import { matches, nameOf } from "./names";
 import { Uploads } from "./uploads";
 
 /** Milliseconds after which surfaces that are being built are looked at again. */
 const POLL = 2000;
-
-/** How a surface is called where it has no name. */
-export function nameOf(surface: ListedSurface): string {
-  return surface.name || surface.filenames.filter((name) => name !== "").join(", ") || surface.id;
-}
-
-/** Whether a surface is found by some words: each is part of its name, its files' names or its id. */
-export function matches(surface: ListedSurface, search: string): boolean {
-  const text = [surface.name, ...surface.filenames, surface.id].join(" ").toLowerCase();
-  return search
-    .toLowerCase()
-    .split(/\s+/)
-    .every((word) => text.includes(word));
-}
 
 /** The list, until `close`. */
 export class Listing {

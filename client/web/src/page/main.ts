@@ -8,7 +8,8 @@ import { ProblemError, Server } from "./api";
 import { configured, type ShownSurface } from "./configuration";
 import { askToken } from "./dialogs";
 import icon from "./icon.svg?url";
-import { Listing, nameOf } from "./listing";
+import { Listing } from "./listing";
+import { nameOf } from "./names";
 
 const server = new Server(new URL(".", location.href).href);
 const header = html("header");

@@ -78,7 +78,10 @@ function placed(
   const at = ([0, 1] as const).map((axis) => {
     const [length, nodes] = [header.shape[axis], block.shape[axis]];
     const step = header.closed[axis] ? length / nodes : (length - 1) / Math.max(nodes - 1, 1);
-    return Float64Array.from({ length: nodes }, (_, k) => step * (coarse.nodes[axis]?.[k] ?? k));
+    const last = header.closed[axis] ? length : length - 1;
+    // Beside a gap nodes may stand slightly outside.
+    const place = (k: number): number => Math.min(Math.max(step * (coarse.nodes[axis]?.[k] ?? k), 0), last);
+    return Float64Array.from({ length: nodes }, (_, k) => place(k));
   }) as [Float64Array, Float64Array];
   return { placement, at };
 }
