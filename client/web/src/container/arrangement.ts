@@ -1,0 +1,107 @@
+/** The part of a header that says how blocks are cut into parts and curves (docs/format.md, section 3.1). */
+import { CorruptStreamError } from "../errors";
+import { type Arrangement, type Curve, covers, type Part, type Side } from "../grid/arrangement";
+import type { Closed, Shape, Span } from "../types";
+import { type FieldReader, LARGEST } from "./fields";
+
+const MOST_PARTS = 1 << 16;
+
+/** A block's rows and columns, and which of its axes wrap. */
+export interface BlockShape {
+  readonly shape: Shape;
+  readonly closed: Closed;
+}
+
+/** Blocks, curves and parts; checks that parts cover the blocks and fit their curves. */
+export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; arrangement: Arrangement } {
+  const start = fields.at;
+  const blocks: BlockShape[] = [];
+  let points = 0;
+  for (let left = countOf(fields, 1); left > 0; left--) {
+    const shape: Shape = [fields.varint(), fields.varint()];
+    const flags = fields.byte();
+    points += shape[0] * shape[1];
+    if (shape[0] * shape[1] < 2 || points > LARGEST || flags > 3) {
+      throw new CorruptStreamError(`expected blocks of points, got ${shape[0]} x ${shape[1]}`, start);
+    }
+    blocks.push({ shape, closed: [(flags & 1) !== 0, (flags & 2) !== 0] });
+  }
+  const curves: Curve[] = [];
+  for (let left = countOf(fields, 0); left > 0; left--) {
+    const number = fields.varint();
+    curves.push({ length: Math.floor(number / 4), closed: number % 2 === 1, stops: number % 4 >= 2 });
+  }
+  const parts: Part[] = [];
+  for (let left = countOf(fields, 1); left > 0; left--) parts.push(parsePart(fields, blocks, curves));
+  const used = new Set(parts.flatMap((part) => part.sides.flatMap((side) => (side ? [side.curve] : []))));
+  if (used.size !== curves.length) {
+    const others = curves.length - used.size;
+    throw new CorruptStreamError(`expected curves that are sides of parts, got ${others} others`, start);
+  }
+  const own: Part[][] = blocks.map(() => []);
+  for (const part of parts) own[part.block]!.push(part);
+  blocks.forEach(({ shape, closed }, number) => {
+    if (!covers(shape, closed, own[number]!)) {
+      throw new CorruptStreamError(`expected parts that cover block ${number} once, got others`, start);
+    }
+  });
+  return { blocks, arrangement: { parts, curves } };
+}
+
+function countOf(fields: FieldReader, least: number): number {
+  const start = fields.at;
+  const count = fields.varint(MOST_PARTS);
+  // Each takes a byte at least: nothing is made that was not sent.
+  if (count < least || count > fields.data.length) {
+    throw new CorruptStreamError(`expected ${least} to ${fields.data.length} of them, got ${count}`, start);
+  }
+  return count;
+}
+
+function parsePart(fields: FieldReader, blocks: readonly BlockShape[], curves: readonly Curve[]): Part {
+  const start = fields.at;
+  const block = fields.varint(blocks.length - 1);
+  const flags = fields.byte();
+  const ends = fields.byte();
+  const { shape, closed: whole } = blocks[block]!;
+  const spans = ([0, 1] as const).map((axis): Span => {
+    if (!(flags & 64)) return [0, shape[axis]];
+    const first = fields.varint(shape[axis] - 1);
+    // Along an axis that wraps, a window may go on from the last sample to the first, and to that one again.
+    return [first, first + fields.varint(whole[axis] ? shape[axis] + 1 : shape[axis] - first)];
+  });
+  const [rows, columns] = spans as [Span, Span];
+  const closed: Closed = [(flags & 1) !== 0, (flags & 2) !== 0];
+  const lengths = [columns[1] - columns[0], rows[1] - rows[0]] as const;
+  const stops = [(flags & 16) !== 0, (flags & 32) !== 0] as const;
+  const sides = ([0, 1, 2, 3] as const).map((number): Side | null => {
+    if (!(ends & (16 << number))) return null;
+    const value = fields.varint(2 * MOST_PARTS);
+    const side = { curve: value >> 1, reversed: value % 2 === 1 };
+    const along = number < 2 ? 1 : 0;
+    const curve = curves[side.curve];
+    const length = lengths[number < 2 ? 0 : 1];
+    const pole = curve?.length === 1;
+    const same = curve?.length === length && curve.closed === closed[along] && curve.stops === stops[along];
+    if (!(pole || same) || closed[1 - along] || !(ends & (1 << number))) {
+      const got = curve ? `one of ${curve.length}` : "none";
+      throw new CorruptStreamError(`expected a curve of ${length} points at a clamped side, got ${got}`, start);
+    }
+    return side;
+  });
+  const [top, bottom, left, right] = sides as [Side | null, Side | null, Side | null, Side | null];
+  const wraps = [whole[0] && lengths[1] === shape[0], whole[1] && lengths[0] === shape[1]];
+  if (flags > 127 || Math.min(...lengths) < 1 || (closed[0] && !wraps[0]) || (closed[1] && !wraps[1])) {
+    throw new CorruptStreamError(`expected a part of a block of ${shape[0]} x ${shape[1]}, got another`, start);
+  }
+  return {
+    block,
+    rows,
+    columns,
+    closed,
+    flipped: [(flags & 4) !== 0, (flags & 8) !== 0],
+    sides: [top, bottom, left, right],
+    clamped: [(ends & 1) !== 0, (ends & 2) !== 0, (ends & 4) !== 0, (ends & 8) !== 0],
+    stops,
+  };
+}

@@ -1,0 +1,154 @@
+/** A container as it arrives: sections out of any chunking of its bytes, each checked before it is handed on. */
+import { CorruptStreamError, UnsupportedVersionError } from "../errors";
+import { ByteBuffer } from "./buffer";
+import { crc32 } from "./crc";
+import { checkMetadataLength, checkSignature, KIND, OPTIONAL, SIGNATURE_LENGTH, VERSION } from "./sections";
+
+/** A section whose CRC holds: its payload stands at `payloadOffset`, all of it at `offset` to `end`. */
+export interface Frame {
+  readonly kind: number;
+  readonly offset: number;
+  readonly payloadOffset: number;
+  readonly payload: Uint8Array;
+  readonly end: number;
+}
+
+/** The kind and length of a section take at most so many bytes. */
+const LONGEST_START = 10;
+const KNOWN: ReadonlySet<number> = new Set(Object.values(KIND));
+
+/**
+ * Sections in file order.
+ *
+ * Memory grows with what has arrived, never with what a length promises. Metadata that are too long are refused as soon
+ * as they say so.
+ */
+export class FrameReader {
+  /** The index was read: nothing but the footer follows. */
+  ended = false;
+  readonly #data = new ByteBuffer();
+  #offset = 0; // of #data in the container
+  #started = false;
+
+  /** Bytes of the container taken so far, partial sections not counted. */
+  get position(): number {
+    return this.#offset;
+  }
+
+  /** Bytes that wait for the rest of their section. */
+  get pending(): number {
+    return this.#data.length;
+  }
+
+  /**
+   * Take bytes, yield the sections that are now complete.
+   *
+   * Throws `CorruptStreamError` where the bytes are no container, or a section fails its CRC; `UnsupportedVersionError`
+   * where the container is of another version, or a section that must be understood is not known.
+   */
+  *feed(chunk: Uint8Array): Generator<Frame> {
+    this.#data.append(chunk);
+    while (!this.ended) {
+      const frame = this.#next();
+      if (frame === null) return;
+      if (KNOWN.has(frame.kind)) {
+        this.ended = frame.kind === KIND.index;
+        yield frame;
+      }
+    }
+  }
+
+  /** Take the bytes that are no whole section, as those after the index. */
+  rest(): Uint8Array {
+    return this.#data.take(this.#data.length);
+  }
+
+  #next(): Frame | null {
+    if (!this.#started && !this.#start()) return null;
+    const head = this.#data.peek(LONGEST_START);
+    if (this.#offset === SIGNATURE_LENGTH && head.length && head[0] !== KIND.header) {
+      throw new CorruptStreamError(`expected the header section first, got kind ${head[0]}`, SIGNATURE_LENGTH);
+    }
+    const extent = sectionExtent(head, this.#offset);
+    if (extent === null || this.#data.length < extent.end) return null;
+    const offset = this.#offset;
+    const frame = this.#data.take(extent.end);
+    this.#offset += extent.end;
+    return checked(frame, offset, extent.start);
+  }
+
+  #start(): boolean {
+    checkSignature(this.#data.peek(SIGNATURE_LENGTH));
+    if (this.#data.length < SIGNATURE_LENGTH) return false;
+    this.#data.take(SIGNATURE_LENGTH);
+    this.#offset = SIGNATURE_LENGTH;
+    this.#started = true;
+    return true;
+  }
+}
+
+/** Where the payload of the section at the start of `data` begins and the section ends; null: not yet to be told. */
+export function sectionExtent(data: Uint8Array, offset: number): { start: number; end: number } | null {
+  let length = 0;
+  let scale = 1;
+  for (let place = 1; place < Math.min(data.length, LONGEST_START); place++) {
+    length += (data[place]! & 127) * scale;
+    scale *= 128;
+    if (data[place]! < 128) {
+      if (data[0] === KIND.metadata) checkMetadataLength(length, offset);
+      return { start: place + 1, end: place + 1 + length + 4 };
+    }
+  }
+  if (data.length >= LONGEST_START) {
+    throw new CorruptStreamError("expected the length of a section, got a number of more than 9 bytes", offset);
+  }
+  return null;
+}
+
+/** Where the index ends that stands at the start of `data`: its pages and its root; null: not yet to be told. */
+export function indexExtent(data: Uint8Array, offset: number): number | null {
+  const pages = sectionExtent(data.subarray(0, LONGEST_START), offset);
+  if (pages === null) return null;
+  const root = sectionExtent(data.subarray(pages.end, pages.end + LONGEST_START), offset + pages.end);
+  return root && pages.end + root.end;
+}
+
+/** The pages and the root of an index that was fetched by itself. Throws where these are not two whole sections. */
+export function indexSections(data: Uint8Array, offset: number): { pages: Frame; root: Frame } {
+  const extent = sectionExtent(data.subarray(0, LONGEST_START), offset);
+  const end = Math.min(extent === null ? data.length : extent.end, data.length);
+  const rootOffset = offset + (extent === null ? data.length : extent.end);
+  const root = wholeSection(data.subarray(end), rootOffset, KIND.index);
+  return { pages: wholeSection(data.subarray(0, end), offset, KIND.pages), root };
+}
+
+/** A section that was fetched by itself. Throws where it is not one whole section of that kind. */
+export function wholeSection(data: Uint8Array, offset: number, kind: number): Frame {
+  const extent = sectionExtent(data.subarray(0, LONGEST_START), offset);
+  if (extent === null || extent.end !== data.length || data[0] !== kind) {
+    throw new CorruptStreamError(`expected one whole section of kind ${kind}, got other bytes`, offset);
+  }
+  return checked(data, offset, extent.start);
+}
+
+/** A whole section, whose payload starts at `start` of it, after its CRC was checked. */
+function checked(frame: Uint8Array, offset: number, start: number): Frame {
+  const kind = frame[0]!;
+  const end = frame.length - 4;
+  const crc = new DataView(frame.buffer, frame.byteOffset + end, 4).getUint32(0, true);
+  if (crc32(frame.subarray(0, end)) !== crc) {
+    throw new CorruptStreamError(`expected a section of kind ${kind} to match its CRC, got other bytes`, offset);
+  }
+  if (!KNOWN.has(kind) && kind < OPTIONAL) {
+    throw new UnsupportedVersionError(
+      `expected sections of version ${VERSION}, got an unknown one of kind ${kind} that must not be skipped`,
+    );
+  }
+  return {
+    kind,
+    offset,
+    payloadOffset: offset + start,
+    payload: frame.subarray(start, end),
+    end: offset + frame.length,
+  };
+}

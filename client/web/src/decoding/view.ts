@@ -1,0 +1,313 @@
+/** Views: the states of a surface while its container is being received. */
+import type { Plane } from "../container/extras";
+import type { Header } from "../container/header";
+import type { Metadata } from "../container/sections";
+import { checkWish, restoredRegion, type Wish, wishedChannels, wishedTiles } from "../container/selection";
+import { CorruptStreamError, InputError, OptionError } from "../errors";
+import { levelPositions, type Positions, partsByBlock } from "../grid/parts";
+import type { Block, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
+import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
+import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane } from "./heights";
+import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
+import { rint } from "./rules";
+import type { State } from "./slices";
+
+/** What all views of a surface have in common; metadata and digest are filled when they come. */
+export interface Shared {
+  readonly reconstruction: Reconstruction;
+  readonly metadata: Metadata;
+  readonly digest: { value: string | null };
+}
+
+/** A block that is not shown whole has holes by itself: points of which a coordinate is not finite. */
+interface Shown {
+  readonly points: Grid;
+  readonly mask: Uint8Array | null;
+}
+
+/** One state of a surface. Its points are computed on request, even if more data have arrived since. */
+export class View implements ViewInfo {
+  readonly number: number;
+  readonly level: number;
+  readonly bytes: number;
+  readonly rms: number;
+  readonly maxError: number;
+  readonly complete: boolean;
+  readonly #shared: Shared;
+  readonly #known: Known;
+  readonly #wish: Wish;
+
+  constructor(state: Omit<ViewInfo, never> & Partial<State>, shared: Shared, known: Known, wish: Wish) {
+    this.number = state.number;
+    this.level = state.level;
+    this.bytes = state.bytes;
+    this.rms = state.rms;
+    this.maxError = state.maxError;
+    this.complete = state.complete;
+    this.#shared = shared;
+    this.#known = known;
+    this.#wish = wish;
+  }
+
+  /** What is known of the state without decoding it, in plain values. */
+  get info(): ViewInfo {
+    const { number, level, bytes, rms, maxError, complete } = this;
+    return { number, level, bytes, rms, maxError, complete };
+  }
+
+  /**
+   * The points of a window at full resolution; costs time and memory for the window only. Throws `OptionError` where the
+   * region is outside the surface, the surface has several blocks, or the view holds another region only.
+   */
+  window(region: Region): Surface {
+    const { header } = this.#shared.reconstruction;
+    const wish: Wish = { region, attributes: this.#wish.attributes };
+    checkWish(wish, header);
+    const shown = this.#wish.region;
+    if (
+      shown &&
+      !([0, 1] as const).every((axis) => shown[axis][0] <= region[axis][0] && region[axis][1] <= shown[axis][1])
+    ) {
+      throw new OptionError(
+        `expected a region inside the one received, ${shown.join(" x ")}, got ${region.join(" x ")}`,
+      );
+    }
+    const wanted = wishedTiles(wish, header);
+    const state = this.#known.state.slice();
+    for (let unit = 0; unit < state.length; unit++) if (!wanted[Math.floor(unit / header.channels)]) state[unit] = 0;
+    return new View(this, this.#shared, { length: this.#known.length, state }, wish).surface();
+  }
+
+  /**
+   * The state as a surface, at full resolution or at a coarser level.
+   *
+   * Throws `OptionError` where there is no such level; `CorruptStreamError` where the SHA-256 of the complete surface is
+   * wrong, or no value is finite.
+   */
+  surface(level?: number): Surface {
+    const { reconstruction, metadata, digest } = this.#shared;
+    const { header } = reconstruction;
+    const { region } = this.#wish;
+    const asked = level !== undefined;
+    const shownLevel = level ?? header.levels;
+    const finest = shownLevel === header.levels;
+    if (!(Number.isInteger(shownLevel) && shownLevel >= 0 && shownLevel <= header.levels)) {
+      throw new OptionError(`expected a level of 0 to ${header.levels}, got ${level}`);
+    }
+    if (!finest && region) {
+      throw new OptionError(`expected the finest level, ${header.levels}, for a window, got ${level}`);
+    }
+    let values: Metadata = { ...metadata };
+    if (asked) {
+      // The grid of that level, without what a seam repeats.
+      delete values.seam;
+      delete values.turn;
+    }
+    const chosen = wishedChannels(this.#wish, header);
+    const nodes = this.#nodes(shownLevel);
+    const grids = region
+      ? [this.#window(region, chosen)]
+      : reconstruction.blocks(this.#known, shownLevel, this.#corrected && finest, chosen);
+    const closures = header.blocks.map(({ shape, closed }) => (region ? windowClosed(closed, shape, region) : closed));
+    const masks = nodes.map((own, block) => this.#maskAt(block, own));
+    const keptMasks = this.#corrected && finest ? reconstruction.kept : [];
+    let blocks = grids.map((own, block): Block => {
+      let mask = masks[block] ?? null;
+      if (mask && !region && !mask.includes(1)) mask = null; // it shows what stands under the holes
+      const kept = keptMasks[block] ? pick(keptMasks[block], header.blocks[block]!.shape, nodes[block]!) : null;
+      if (mask) reconstruction.clear(own, kept ? union(mask, kept) : mask);
+      const [points, ...attributes] = own;
+      return this.#block(
+        validated({ points: points!, mask }, header, region),
+        attributes,
+        nodes[block]!,
+        closures[block]!,
+      );
+    });
+    let plane: Plane | null = header.plane;
+    let placed: Nodes = [null, null];
+    const only = blocks.length === 1 ? blocks[0]! : null;
+    if (!finest && only && header.pointChannels === 1) {
+      const halvings = header.levels - shownLevel;
+      const coarse = levelPlacement(values, plane, header.shape, only.shape, header.closed, halvings);
+      values = coarse.metadata;
+      plane = coarse.plane;
+      placed = coarse.nodes;
+    } else if (plane && region) {
+      plane = windowPlane(plane, header.shape);
+      placed = [[...nodes[0]![0]], [...nodes[0]![1]]];
+    }
+    if (plane && only) {
+      const kept = keptMasks[0] ? pick(keptMasks[0], header.shape, nodes[0]!) : null;
+      blocks = [withCoordinates(only, plane, placed, kept, header)];
+    }
+    if (region) {
+      values = windowMetadata(values, header.shape, region);
+    } else if (this.complete && finest && header.exact && digest.value !== null && chosen.every(Boolean)) {
+      const found = reconstruction.digest(valuesOf(blocks));
+      if (found !== digest.value) {
+        throw new CorruptStreamError(`expected values with the SHA-256 ${digest.value}, got ${found}`, header.length);
+      }
+    }
+    return { blocks, metadata: values };
+  }
+
+  /** Whether exactness is known. */
+  get #corrected(): boolean {
+    return this.complete && this.#shared.reconstruction.header.corrected;
+  }
+
+  /** Which rows and columns of each block are shown at a level, or in the window. */
+  #nodes(level: number): Positions[] {
+    const { header } = this.#shared.reconstruction;
+    const { region } = this.#wish;
+    if (region) return [[range(region[0]), range(region[1])]];
+    return partsByBlock(header.parts, header.blocks.length).map((own, block) =>
+      levelPositions(own, header.parts.length, header.layout, level, header.blocks[block]!.shape),
+    );
+  }
+
+  /** Which of these rows and columns of a block are valid points; null: all. */
+  #maskAt(block: number, nodes: Positions): Uint8Array | null {
+    const { masks, header } = this.#shared.reconstruction;
+    const mask = masks[block];
+    return mask ? pick(mask, header.blocks[block]!.shape, nodes) : null;
+  }
+
+  /** Points and attributes of a window of the only block. */
+  #window(region: Region, chosen: readonly boolean[]): BlockGrids {
+    const { reconstruction } = this.#shared;
+    const { header } = reconstruction;
+    if (header.arrangement) {
+      // A block that meets itself: what its sides share may lie anywhere in it.
+      const whole = reconstruction.blocks(this.#known, header.levels, this.#corrected, chosen)[0]!;
+      return whole.map((grid) => cutGrid(grid, region[0], region[1]));
+    }
+    const taken = restoredRegion(header, region);
+    const whole = reconstruction.window(this.#known, taken, this.#corrected, chosen);
+    const moved = ([0, 1] as const).map(
+      (axis): Span => [region[axis][0] - taken[axis][0], region[axis][1] - taken[axis][0]],
+    );
+    return whole.map((grid) => cutGrid(grid, moved[0]!, moved[1]!));
+  }
+
+  #block({ points, mask }: Shown, attributes: readonly Grid[], nodes: Positions, closed: Closed): Block {
+    const { header } = this.#shared.reconstruction;
+    const named = new Map<string, PointArray>();
+    for (const [number, kind] of header.attributes.entries()) {
+      if (this.#wish.attributes && !this.#wish.attributes.includes(kind.name)) continue;
+      const { dtype, components, values } = attributes[number]!;
+      named.set(kind.name, { dtype, components, flat: kind.components === 0, values });
+    }
+    return {
+      shape: points.shape,
+      closed,
+      points: { dtype: points.dtype, components: points.components, flat: header.flat, values: points.values },
+      mask,
+      attributes: named,
+      rows: nodes[0],
+      columns: nodes[1],
+    };
+  }
+}
+
+function range([start, stop]: Span): Int32Array {
+  return Int32Array.from({ length: stop - start }, (_, i) => start + i);
+}
+
+/** A mask of a block at some of its rows and columns. */
+function pick(mask: Uint8Array, shape: Shape, [rows, columns]: Positions): Uint8Array {
+  const picked = new Uint8Array(rows.length * columns.length);
+  let count = 0;
+  for (const row of rows) for (const column of columns) picked[count++] = mask[row * shape[1] + column]!;
+  return picked;
+}
+
+function union(one: Uint8Array, other: Uint8Array): Uint8Array {
+  return one.map((mark, i) => mark | other[i]!);
+}
+
+/** Which axes of a window wrap: those that do in the surface, where the window holds all of them. */
+function windowClosed(closed: Closed, shape: Shape, region: Region): Closed {
+  const whole = ([0, 1] as const).map((axis) => closed[axis] && region[axis][1] - region[axis][0] === shape[axis]);
+  return [whole[0]!, whole[1]!];
+}
+
+/** Points with the holes that they have by themselves: a coordinate that is not finite. */
+function validated({ points, mask }: Shown, header: Header, region: Region | undefined): Shown {
+  let valid = mask;
+  const { values, components } = points;
+  if (points.dtype === "float32" || points.dtype === "float64") {
+    const numbers = values as Float32Array | Float64Array;
+    const coordinates = Math.min(components, 3);
+    const count = points.shape[0] * points.shape[1];
+    for (let point = 0; point < count; point++) {
+      for (let k = 0; k < coordinates; k++) {
+        if (!Number.isFinite(numbers[point * components + k]!)) {
+          if (valid === null || valid === mask) valid = mask ? mask.slice() : new Uint8Array(count).fill(1);
+          valid[point] = 0;
+        }
+      }
+    }
+  }
+  if (valid === null || !valid.includes(0)) return { points, mask: null };
+  if (!valid.includes(1)) {
+    const what = `${points.shape[0]} x ${points.shape[1]} holes`;
+    if (region) throw new InputError(`expected at least one valid point, got ${what}`);
+    throw new CorruptStreamError(
+      `expected the points of a surface: expected at least one valid point, got ${what}`,
+      header.length,
+    );
+  }
+  return { points, mask: valid };
+}
+
+/** Heights with the x and y that rules give them, in the type of the heights. */
+function withCoordinates(block: Block, plane: Plane, nodes: Nodes, kept: Uint8Array | null, header: Header): Block {
+  const { shape, points } = block;
+  const grid = newGrid(points.dtype, shape, 3);
+  const places = coordinatesOf({ rules: plane, swapped: false, nodes }, shape);
+  const count = shape[0] * shape[1];
+  for (const [channel, { rows, columns, values }] of places.entries()) {
+    for (let point = 0; point < count; point++) {
+      const row = rows === 1 ? 0 : Math.floor(point / shape[1]);
+      const column = columns === 1 ? 0 : point % shape[1];
+      put(grid, 3 * point + channel, values[row * columns + column]!);
+    }
+  }
+  for (let point = 0; point < count; point++) grid.values[3 * point + 2] = points.values[point]!;
+  const floats = points.dtype === "float32" || points.dtype === "float64";
+  if (block.mask && floats) {
+    const shown = block.mask.slice();
+    for (let point = 0; point < count; point++) {
+      // Holes of infinite height have x and y as well.
+      const infinite = Math.abs(Number(points.values[point])) === Number.POSITIVE_INFINITY;
+      if (kept ? kept[point] : infinite) shown[point] = 1;
+    }
+    clearGrid(grid, shown, 0n);
+  }
+  const { mask } = validated({ points: grid, mask: block.mask }, header, undefined);
+  const made: PointArray = { dtype: points.dtype, components: 3, flat: false, values: grid.values };
+  return { ...block, points: made, mask };
+}
+
+/** Put a number into a grid, rounded to its type. */
+function put(grid: Grid, place: number, value: number): void {
+  const { values } = grid;
+  if (values instanceof BigInt64Array || values instanceof BigUint64Array) {
+    values[place] = BigInt(Number.isFinite(value) ? rint(value) : 0);
+  } else if (grid.dtype === "float32" || grid.dtype === "float64") {
+    values[place] = value;
+  } else {
+    values[place] = rint(value);
+  }
+}
+
+/** All values as bytes: block by block the points, then each attribute. */
+function* valuesOf(blocks: readonly Block[]): Generator<Uint8Array> {
+  for (const { points, attributes } of blocks) {
+    for (const { values } of [points, ...attributes.values()]) {
+      yield new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
+    }
+  }
+}

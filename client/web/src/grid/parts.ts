@@ -1,0 +1,100 @@
+/** Blocks cut into parts: where the nodes of parts stand in their blocks, at any level (docs/format.md, section 4). */
+import type { Shape } from "../types";
+import type { Part } from "./arrangement";
+import { hasTail } from "./axis";
+import type { Layout } from "./layout";
+
+/** A part with its number among those of all blocks. */
+export interface NumberedPart {
+  readonly number: number;
+  readonly part: Part;
+}
+
+/** Rows and columns of a block. */
+export type Positions = readonly [rows: Int32Array, columns: Int32Array];
+
+/** The parts of each of so many blocks. */
+export function partsByBlock(parts: readonly Part[], count: number): NumberedPart[][] {
+  const found: NumberedPart[][] = Array.from({ length: count }, () => []);
+  parts.forEach((part, number) => {
+    found[part.block]!.push({ number, part });
+  });
+  return found;
+}
+
+/** Whether a part is its block as it is, perhaps turned round. */
+export function isWhole(part: Part, shape: Shape): boolean {
+  const { rows, columns } = part;
+  return rows[0] === 0 && rows[1] === shape[0] && columns[0] === 0 && columns[1] === shape[1];
+}
+
+/** Which samples of a grid's axis stand at the nodes of a level. */
+function nodePositions(layout: Layout, grid: number, axis: number, level: number): Int32Array {
+  const length = layout.grids[grid]!.shape[axis]!;
+  let positions: Int32Array = Int32Array.from({ length }, (_, i) => i);
+  for (let finer = layout.levels; finer > level; finer--) {
+    const step = layout.steps(grid, finer)[axis]!;
+    if (!step.midpoints) continue;
+    const nodes = new Int32Array(step.coarse);
+    for (let i = 0; i < step.run; i++) nodes[i] = positions[2 * i]!;
+    if (hasTail(step)) nodes[step.coarse - 1] = positions[positions.length - 1]!;
+    positions = nodes;
+  }
+  return positions;
+}
+
+/** Which rows and columns of its block, of this shape, the nodes of a part stand at, in the order of the part's grid. */
+export function partPositions(
+  own: NumberedPart,
+  parts: number,
+  layout: Layout,
+  level: number,
+  shape: Shape,
+): Positions {
+  const grid = layout.grids.length - parts + own.number;
+  const [rows, columns] = [own.part.rows, own.part.columns].map((window, axis) => {
+    const nodes = nodePositions(layout, grid, axis, level);
+    const last = layout.grids[grid]!.shape[axis]! - 1;
+    const flipped = own.part.flipped[axis];
+    // Along closed axes windows go on from the last sample to the first.
+    return nodes.map((node) => (window[0] + (flipped ? last - node : node)) % shape[axis]!);
+  });
+  return [rows!, columns!];
+}
+
+/** Which rows and columns of a block of this shape stand at a level's nodes, increasing; `own` are its parts of `parts`. */
+export function levelPositions(
+  own: readonly NumberedPart[],
+  parts: number,
+  layout: Layout,
+  level: number,
+  shape: Shape,
+): Positions {
+  const seen = [new Uint8Array(shape[0]), new Uint8Array(shape[1])];
+  for (const part of own) {
+    partPositions(part, parts, layout, level, shape).forEach((positions, axis) => {
+      for (const position of positions) seen[axis]![position] = 1;
+    });
+  }
+  const [rows, columns] = seen.map((marks) => {
+    const found = new Int32Array(marks.reduce((sum, mark) => sum + mark, 0));
+    let count = 0;
+    marks.forEach((mark, position) => {
+      if (mark) found[count++] = position;
+    });
+    return found;
+  });
+  return [rows!, columns!];
+}
+
+/** Rows and columns of each block's grid at a level; `shapes` are the blocks'. */
+export function levelShapes(parts: readonly Part[], layout: Layout, level: number, shapes: readonly Shape[]): Shape[] {
+  if (parts.length === shapes.length && parts.every((part) => isWhole(part, shapes[part.block]!))) {
+    const curves = layout.grids.length - parts.length;
+    return shapes.map((_, number) => layout.shape(curves + number, level));
+  }
+  return partsByBlock(parts, shapes.length).map((own, block): Shape => {
+    const [rows, columns] = levelPositions(own, parts.length, layout, level, shapes[block]!);
+    return [rows.length, columns.length];
+  });
+}

@@ -1,0 +1,122 @@
+/** The server's HTTP interface, as the page needs it. The token is kept here, in memory, and goes into no address. */
+
+/** A surface as the server lists it. */
+export interface ListedSurface {
+  readonly id: string;
+  /** A path on the server. */
+  readonly url: string;
+  readonly name: string;
+  readonly state: "queued" | "building" | "ready" | "failed" | "waiting" | "missing";
+  /** 0 to 1. */
+  readonly progress: number;
+  readonly reason: string | null;
+  readonly created: string;
+  readonly filenames: readonly string[];
+  readonly upload_bytes: number;
+  readonly bytes?: number;
+  readonly shape?: readonly [number, number] | null;
+}
+
+/** What the server answered in place of what was asked for. */
+export class ProblemError extends Error {
+  /** @param code - A word such as `no-token`; `network` where there was no answer. */
+  constructor(
+    readonly status: number,
+    readonly code: string,
+    title: string,
+    detail: string,
+  ) {
+    super(detail === "" ? title : `${title}: ${detail}`);
+  }
+}
+
+/** The path of surfaces, relative to the page, so that the server may stand below a path of a proxy. */
+const SURFACES = "v1/surfaces";
+
+/** Reads a problem document, or makes one from an answer without. */
+export function problemOf(status: number, text: string): ProblemError {
+  try {
+    const { code, title, detail } = JSON.parse(text) as Record<string, unknown>;
+    if (typeof title === "string") return new ProblemError(status, String(code ?? ""), title, String(detail ?? ""));
+  } catch {
+    // Not JSON: a proxy's own page.
+  }
+  return new ProblemError(status, `http-${status}`, `The server answered ${status}`, "");
+}
+
+/** Requests to one server. */
+export class Server {
+  token: string | null = null;
+
+  /** @param base - Address of the page. */
+  constructor(private readonly base: string) {}
+
+  /** One page of surfaces, oldest first, and the address of the next one. */
+  async page(address: string | null): Promise<{ surfaces: ListedSurface[]; next: string | null }> {
+    return (await this.json("GET", address ?? `${SURFACES}?limit=1000`)) as {
+      surfaces: ListedSurface[];
+      next: string | null;
+    };
+  }
+
+  /** One surface. */
+  async look(url: string): Promise<ListedSurface> {
+    return (await this.json("GET", url)) as ListedSurface;
+  }
+
+  /** Deletes a surface. */
+  async delete(url: string): Promise<void> {
+    await this.json("DELETE", url);
+  }
+
+  /** Builds a surface again. */
+  async retry(url: string): Promise<void> {
+    await this.json("POST", `${url}/retry`);
+  }
+
+  /** The absolute address of a path that the server gave. */
+  address(path: string): string {
+    const url = new URL(path, this.base);
+    if (url.origin !== new URL(this.base).origin)
+      throw new ProblemError(0, "origin", "The server named another host", url.host);
+    return url.href;
+  }
+
+  /**
+   * Uploads a file.
+   *
+   * @param progress - Called with bytes sent.
+   */
+  upload(file: File, progress: (sent: number) => void, signal: AbortSignal): Promise<ListedSurface> {
+    // Of fetch and XMLHttpRequest only the latter tells how much has been sent.
+    return new Promise((resolve, reject) => {
+      const request = new XMLHttpRequest();
+      request.open("POST", this.address(`${SURFACES}?filename=${encodeURIComponent(file.name)}`));
+      request.setRequestHeader("content-type", "application/octet-stream");
+      if (this.token !== null) request.setRequestHeader("authorization", `Bearer ${this.token}`);
+      request.upload.onprogress = ({ loaded }) => progress(loaded);
+      request.onload = () => {
+        if (request.status === 200 || request.status === 202)
+          resolve(JSON.parse(request.responseText) as ListedSurface);
+        else reject(problemOf(request.status, request.responseText));
+      };
+      request.onerror = () => reject(new ProblemError(0, "network", "The server could not be reached", ""));
+      request.onabort = () => reject(new ProblemError(0, "cancelled", "Cancelled", ""));
+      signal.addEventListener("abort", () => request.abort());
+      request.send(file);
+    });
+  }
+
+  private async json(method: string, path: string): Promise<unknown> {
+    const headers: Record<string, string> = this.token === null ? {} : { authorization: `Bearer ${this.token}` };
+    let answer: Response;
+    try {
+      answer = await fetch(this.address(path), { method, headers, credentials: "omit" });
+    } catch (error) {
+      if (error instanceof ProblemError) throw error;
+      throw new ProblemError(0, "network", "The server could not be reached", "");
+    }
+    if (!answer.ok) throw problemOf(answer.status, await answer.text());
+    return answer.status === 204 ? null : answer.json();
+  }
+}

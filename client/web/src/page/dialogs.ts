@@ -1,0 +1,66 @@
+/** Questions to the user, each in a dialog of its own. */
+
+import { html } from "../view/dom";
+
+/** Shows a dialog until it is answered. @returns what its buttons are called by, or "" if it was left. */
+function ask(dialog: HTMLDialogElement): Promise<string> {
+  document.body.append(dialog);
+  return new Promise((resolve) => {
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue);
+    });
+    dialog.showModal();
+  });
+}
+
+function buttons(answer: string, kind: string): HTMLElement {
+  return html(
+    "div",
+    { class: "actions" },
+    html("button", { value: "", formnovalidate: true }, "Cancel"),
+    html("button", { value: "yes", class: kind }, answer),
+  );
+}
+
+/** Asks for a token. @param problem - Why; may be empty. @returns null if none was given. */
+export async function askToken(problem: string): Promise<string | null> {
+  const input = html("input", {
+    type: "password",
+    id: "token",
+    autocomplete: "off",
+    spellcheck: "false",
+    required: true,
+  });
+  const dialog = html(
+    "dialog",
+    { "aria-labelledby": "token-title" },
+    html(
+      "form",
+      { method: "dialog" },
+      html("h2", { id: "token-title" }, "A token is needed"),
+      html("p", {}, problem === "" ? "This server gives its surfaces to those who have a token." : problem),
+      html("label", { for: "token" }, "Token (kept until this page is closed)"),
+      input,
+      buttons("Continue", "primary"),
+    ),
+  );
+  const answer = await ask(dialog);
+  return answer === "yes" && input.value.trim() !== "" ? input.value.trim() : null;
+}
+
+/** Asks whether a surface is to be deleted. */
+export async function askDelete(name: string): Promise<boolean> {
+  const dialog = html(
+    "dialog",
+    { "aria-labelledby": "delete-title" },
+    html(
+      "form",
+      { method: "dialog" },
+      html("h2", { id: "delete-title" }, "Delete this surface?"),
+      html("p", {}, `${name} and its container are removed from the server. This cannot be undone.`),
+      buttons("Delete", "danger"),
+    ),
+  );
+  return (await ask(dialog)) === "yes";
+}

@@ -1,0 +1,184 @@
+/** The page: a list of surfaces, and one of them opened, by what follows # in the address. */
+
+import { LodestreamView } from "../view";
+import { html, setText } from "../view/dom";
+import { formatBytes, formatNumber } from "../view/format";
+import type { Progress, SurfaceInfo } from "../view/source";
+import { ProblemError, Server } from "./api";
+import { configured, type ShownSurface } from "./configuration";
+import { askToken } from "./dialogs";
+import icon from "./icon.svg?url";
+import { Listing } from "./listing";
+import { nameOf } from "./names";
+
+const server = new Server(new URL(".", location.href).href);
+const header = html("header");
+let listing: Listing | null = null;
+let view: LodestreamView | null = null;
+let shown: string | null = null;
+let asking: Promise<boolean> | null = null;
+
+/** Asks for a token where one is missing or not good; several requests share one question. */
+function allowed(error: ProblemError): Promise<boolean> {
+  if (error.code !== "no-token" && error.code !== "bad-token" && error.code !== "small-scope")
+    return Promise.resolve(false);
+  asking ??= askToken(server.token === null ? "" : `${error.message}.`).then((token) => {
+    asking = null;
+    if (token !== null) server.token = token;
+    return token !== null;
+  });
+  return asking;
+}
+
+function mark(link: boolean): HTMLElement {
+  const parts = [html("img", { src: icon, alt: "" }), "Lodestream"];
+  return link ? html("a", { class: "mark", href: "#" }, ...parts) : html("span", { class: "mark" }, ...parts);
+}
+
+/** Shows a surface in place of whatever is shown. */
+function open(src: string, name: string, back: boolean): void {
+  closeAll();
+  const title = html("h1", {}, name);
+  const facts = html("span", { class: "facts" });
+  const copy = html("button", { type: "button", class: "plain" }, "Copy link");
+  copy.addEventListener("click", async () => {
+    await navigator.clipboard.writeText(location.href).catch(() => {});
+    setText(copy, "Copied");
+    setTimeout(() => setText(copy, "Copy link"), 1500);
+  });
+  header.replaceChildren(mark(back), title, facts, html("span", { class: "grow" }), copy);
+  view = new LodestreamView();
+  view.token = server.token;
+  view.setAttribute("share", "");
+  if (name !== "") view.setAttribute("name", name);
+  view.src = src;
+  view.addEventListener("lodestream-info", (event) => {
+    const info = (event as CustomEvent<SurfaceInfo>).detail;
+    if (name === "") setText(title, info.name || "Surface");
+    document.title = `${name || info.name || "Surface"} – Lodestream`;
+    const [first] = info.blocks;
+    const points = info.blocks.length === 1 && first ? first.shape.join(" × ") : `${info.blocks.length} blocks`;
+    setText(
+      facts,
+      info.size > 0 ? `${points} points, ${formatBytes(info.size)}`.replace("blocks points", "blocks") : points,
+    );
+  });
+  view.addEventListener("lodestream-progress", async (event) => {
+    const { state, code, detail } = (event as CustomEvent<Progress>).detail;
+    if (state !== "failed" || code === undefined || asking !== null) return;
+    if (await allowed(new ProblemError(401, code, detail, ""))) open(src, name, back);
+  });
+  document.body.replaceChildren(header, html("main", {}, view));
+}
+
+function showList(): void {
+  closeAll();
+  document.title = "Lodestream";
+  header.replaceChildren(mark(false));
+  listing = new Listing(server, allowed);
+  document.body.replaceChildren(header, listing.element);
+}
+
+function closeAll(): void {
+  listing?.close();
+  listing = null;
+  view?.remove();
+  view = null;
+}
+
+/** The id of a surface in the part of the address after #; null: the list. */
+function asked(): string | null {
+  const found = /(?:^#|&)s=([^&]+)/.exec(location.hash)?.[1];
+  return found === undefined ? null : decodeURIComponent(found);
+}
+
+async function route(): Promise<void> {
+  const id = asked();
+  if (id === shown && (view !== null || listing !== null)) return;
+  shown = id;
+  if (id === null) return showList();
+  const path = `v1/surfaces/${encodeURIComponent(id)}`;
+  try {
+    const surface = await server.look(path);
+    if (asked() === id) open(server.address(surface.url), nameOf(surface), true);
+  } catch (error) {
+    shown = null;
+    if (await allowed(error as ProblemError)) return route();
+    fail(error);
+  }
+}
+
+function fail(error: unknown): void {
+  closeAll();
+  header.replaceChildren(mark(true));
+  const text = error instanceof Error ? error.message : String(error);
+  document.body.replaceChildren(
+    header,
+    html("main", { class: "list" }, html("p", { class: "message error", role: "alert" }, text)),
+  );
+}
+
+/** Shows the surfaces of a static host: the only one, or the one whose number is asked for, or a list. */
+async function showConfigured(surfaces: readonly ShownSurface[]): Promise<void> {
+  const asked = /(?:^#|&)f=(\d+)/.exec(location.hash)?.[1];
+  const only = surfaces.length === 1 ? surfaces[0] : surfaces[Number(asked ?? -1)];
+  if (only === undefined) return showChoice(surfaces);
+  const { src, name, progress } = only;
+  if (progress !== null) return showMaking(surfaces, name, progress);
+  const address = new URL(src, document.baseURI);
+  if (address.origin !== location.origin)
+    throw new Error(`expected a container of this host, got one of ${address.host}`);
+  open(address.href, name, surfaces.length > 1);
+}
+
+function showChoice(surfaces: readonly ShownSurface[]): void {
+  closeAll();
+  header.replaceChildren(mark(false));
+  const items = surfaces.map(({ name, bytes }, k) =>
+    html("li", {}, html("a", { href: `#f=${k}` }, name), bytes === null ? null : ` ${formatBytes(bytes)}`),
+  );
+  document.body.replaceChildren(
+    header,
+    html(
+      "main",
+      { class: "list" },
+      html("div", { class: "title" }, html("h1", {}, "Surfaces")),
+      html("ul", { class: "choice" }, ...items),
+    ),
+  );
+}
+
+/** A container that is being made: looks again twice a second. */
+function showMaking(surfaces: readonly ShownSurface[], name: string, progress: number): void {
+  const text = `Encoding: ${formatNumber(Math.floor(100 * progress))} %`;
+  const status = document.querySelector(".making [role=status]");
+  const bar = document.querySelector<HTMLProgressElement>(".making progress");
+  if (status !== null && bar !== null) {
+    setText(status, text);
+    bar.value = progress;
+  } else {
+    header.replaceChildren(mark(false), html("h1", {}, name));
+    const made = html("progress", { max: 1, value: progress, "aria-label": `Encoding of ${name}` });
+    document.body.replaceChildren(
+      header,
+      html("main", { class: "list making" }, html("p", { class: "message", role: "status" }, text), made),
+    );
+  }
+  setTimeout(() => {
+    configured()
+      .then((found) => showConfigured(found ?? surfaces))
+      .catch(fail);
+  }, 500);
+}
+
+function start(surfaces: ShownSurface[] | null): void {
+  if (surfaces === null) {
+    addEventListener("hashchange", () => void route());
+    void route();
+    return;
+  }
+  if (surfaces.length > 1) addEventListener("hashchange", () => void showConfigured(surfaces).catch(fail));
+  showConfigured(surfaces).catch(fail);
+}
+
+configured().then(start).catch(fail);

@@ -1,0 +1,17 @@
+/** How surfaces are called and found. */
+
+import type { ListedSurface } from "./api";
+
+/** How a surface is called where it has no name. */
+export function nameOf(surface: ListedSurface): string {
+  return surface.name || surface.filenames.filter((name) => name !== "").join(", ") || surface.id;
+}
+
+/** Whether a surface is found by some words: each is part of its name, its files' names or its id. */
+export function matches(surface: ListedSurface, search: string): boolean {
+  const text = [surface.name, ...surface.filenames, surface.id].join(" ").toLowerCase();
+  return search
+    .toLowerCase()
+    .split(/\s+/)
+    .every((word) => text.includes(word));
+}

@@ -1,0 +1,96 @@
+/** Targets as callers write them, checked: how far to refine a surface, and in which order. */
+
+import { OptionError } from "../errors";
+import type { Region, Target, Tolerance } from "../types";
+
+/** A target as callers write it: a tolerance is a number in the surface's unit, `"1e-3d"` (times the extent), or both. */
+export interface TargetOptions {
+  readonly level?: number | undefined;
+  readonly untilRms?: number | string | Tolerance | undefined;
+  readonly untilMax?: number | string | Tolerance | undefined;
+  readonly maxBytes?: number | undefined;
+  readonly seconds?: number | undefined;
+  readonly order?: "quality" | "level" | undefined;
+  readonly region?: Region | undefined;
+  readonly attributes?: readonly string[] | undefined;
+  readonly first?: Region | undefined;
+}
+
+/**
+ * A target whose values are checked.
+ *
+ * @throws OptionError if a value is not allowed, or values contradict each other.
+ */
+export function makeTarget(options: TargetOptions = {}): Target {
+  const { level, maxBytes, seconds, region, attributes, first } = options;
+  const order = options.order ?? "quality";
+  const untilRms = options.untilRms === undefined ? undefined : tolerance(options.untilRms);
+  const untilMax = options.untilMax === undefined ? undefined : tolerance(options.untilMax);
+  const limited = [untilRms, untilMax, maxBytes, seconds].some((limit) => limit !== undefined);
+  if (level !== undefined && limited) throw new OptionError("expected either a level or other limits, got both");
+  if (level !== undefined && !(Number.isInteger(level) && level >= 0)) {
+    throw new OptionError(`expected a level of 0 or more, got ${level}`);
+  }
+  if (maxBytes !== undefined && !(Number.isInteger(maxBytes) && maxBytes >= 1)) {
+    throw new OptionError(`expected a limit of at least one byte, got ${maxBytes}`);
+  }
+  if (seconds !== undefined && !(seconds > 0)) {
+    throw new OptionError(`expected a positive number of seconds, got ${seconds}`);
+  }
+  if (order !== "quality" && order !== "level") {
+    throw new OptionError(`expected order quality or level, got ${JSON.stringify(order)}`);
+  }
+  if (region !== undefined) {
+    if (level !== undefined) throw new OptionError("expected either a level or a region, got both");
+    checkSpans(region);
+  }
+  if (first !== undefined) checkSpans(first);
+  const values = { level, untilRms, untilMax, maxBytes, seconds, order, region, attributes, first };
+  return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== undefined));
+}
+
+/**
+ * Refuse a region that contains no point, whatever the surface.
+ *
+ * @throws OptionError
+ */
+export function checkSpans(region: Region): void {
+  for (const [start, stop] of region) {
+    if (!(Number.isInteger(start) && Number.isInteger(stop) && 0 <= start && start < stop)) {
+      throw new OptionError(`expected a region of at least one row and column, got ${start}:${stop}`);
+    }
+  }
+}
+
+/**
+ * A tolerance from a number in the surface's unit, from text such as `0.5` or `1e-3d` (times the extent), or from itself.
+ *
+ * @throws OptionError if it is none of these, negative or not finite.
+ */
+export function tolerance(given: number | string | Tolerance): Tolerance {
+  if (typeof given === "object") return checked(given.value, given.relative);
+  if (typeof given === "number") return checked(given, false);
+  const relative = given.endsWith("d");
+  const digits = relative ? given.slice(0, -1) : given;
+  // Number("") is 0.
+  if (digits.trim() === "" || Number.isNaN(Number(digits))) {
+    throw new OptionError(`expected a number such as 0.5, or 1e-3d (times the extent), got ${JSON.stringify(given)}`);
+  }
+  return checked(Number(digits), relative);
+}
+
+/** A tolerance in the unit of a surface with this extent. */
+export function absolute(limit: Tolerance, extent: number): number {
+  return limit.relative ? limit.value * extent : limit.value;
+}
+
+/** Whether two regions are the same, or both left out. */
+export function sameRegion(one: Region | undefined, other: Region | undefined): boolean {
+  if (one === undefined || other === undefined) return one === other;
+  return one.every((span, axis) => span.every((end, side) => end === other[axis]![side]));
+}
+
+function checked(value: number, relative: boolean): Tolerance {
+  if (!(Number.isFinite(value) && value >= 0)) throw new OptionError(`expected an error of 0 or more, got ${value}`);
+  return { value, relative };
+}

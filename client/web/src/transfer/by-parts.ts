@@ -1,0 +1,133 @@
+/** Receiving parts of a file: the loop around a `RangeDownload` that moves bytes. */
+
+import { MIN_WINDOW } from "../protocol/messages";
+import type { ViewInfo } from "../types";
+import type { Journey } from "./journey";
+import type { PartAnswer, PartSource } from "./parts";
+import { type Part, RangeDownload } from "./range-download";
+import { seconds } from "./waiting";
+
+/** A request under way: its answer once there is one, and what comes next of it. */
+interface Flight {
+  readonly part: Part;
+  readonly abort: AbortController;
+  answer?: PartAnswer;
+  next: Promise<Landed>;
+}
+
+/** An answer, or a piece of its body; undefined at its end. */
+interface Landed {
+  readonly flight: Flight;
+  readonly answer?: PartAnswer;
+  readonly piece?: Uint8Array | undefined;
+}
+
+/** Up to two requests at a time. */
+export class PartsRoad<View extends ViewInfo> {
+  private readonly download: RangeDownload<View>;
+  private readonly flights = new Set<Flight>();
+  private turns = 0;
+
+  constructor(
+    private readonly journey: Journey<View>,
+    private readonly source: PartSource,
+  ) {
+    this.download = new RangeDownload(journey.reception);
+  }
+
+  /** Identifies this version of the file: its entity tag, or else its date; undefined if it has neither. */
+  get version(): string | undefined {
+    return this.download.version;
+  }
+
+  /**
+   * Receive until the stream ends.
+   *
+   * @throws LodestreamError if a connection breaks before, or the other side does not do what it should.
+   */
+  async travel(): Promise<void> {
+    const { journey, flights } = this;
+    this.turns = journey.turns;
+    try {
+      for (;;) {
+        // First: what was asked to stop has stopped, even if all that there is has come.
+        const left = this.tick();
+        this.turn();
+        this.ask();
+        if (journey.reception.ended !== undefined) return;
+        const landed = await journey.waiting.first(
+          [...flights].map((flight) => flight.next),
+          left,
+        );
+        if (landed !== undefined && flights.has(landed.flight)) await this.land(landed);
+        await journey.room();
+      }
+    } finally {
+      for (const flight of [...flights]) this.leave(flight);
+    }
+  }
+
+  /** Set the time; returns the seconds left of the target's. */
+  private tick(): number | undefined {
+    const left = this.journey.reception.tick(seconds());
+    if (this.journey.stopped) this.download.stop();
+    else if (left === 0) this.download.stop("seconds");
+    return left;
+  }
+
+  /** Where something else is wanted first, leave what would take long. */
+  private turn(): void {
+    if (this.turns === this.journey.turns) return;
+    this.turns = this.journey.turns;
+    for (const flight of [...this.flights]) if (flight.part.left > MIN_WINDOW) this.leave(flight);
+  }
+
+  private ask(): void {
+    for (;;) {
+      let part: Part | undefined;
+      this.journey.take(() => {
+        const asked = this.download.request(seconds());
+        part = asked.part;
+        return asked.views;
+      });
+      if (part === undefined) return;
+      this.launch(part);
+    }
+  }
+
+  private launch(part: Part): void {
+    const abort = new AbortController();
+    const asked = this.source.ask(part, () => this.journey.patience(), abort.signal);
+    const flight: Flight = { part, abort, next: asked.then((answer) => ({ flight, answer })) };
+    flight.next.catch(ignore);
+    this.flights.add(flight);
+  }
+
+  private async land({ flight, answer, piece }: Landed): Promise<void> {
+    const { journey, download } = this;
+    if (answer !== undefined) {
+      download.answer(flight.part, answer.status, answer.headers, seconds());
+      journey.met();
+      flight.answer = answer;
+    } else if (piece !== undefined) {
+      await journey.pace(piece.length);
+      journey.take(() => download.receive(flight.part, piece));
+    } else {
+      this.flights.delete(flight);
+      download.finish(flight.part, seconds());
+      return;
+    }
+    // The next piece is asked for when this one has been used.
+    flight.next = flight.answer!.read().then((next) => ({ flight, piece: next }));
+    flight.next.catch(ignore);
+  }
+
+  private leave(flight: Flight): void {
+    this.flights.delete(flight);
+    this.download.leave(flight.part);
+    flight.abort.abort();
+  }
+}
+
+/** Of a request that is left nobody asks what became of it; of others the loop does. */
+function ignore(): void {}

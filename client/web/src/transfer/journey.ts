@@ -1,0 +1,29 @@
+/** What the roads to a surface, a WebSocket and HTTP Range, need of the stream that takes them. */
+
+import type { ViewInfo } from "../types";
+import type { Reception } from "./reception";
+import type { Waiting } from "./waiting";
+
+/** A stream as its road sees it. */
+export interface Journey<View extends ViewInfo> {
+  /** What has arrived so far. */
+  readonly reception: Reception<View>;
+  /** Woken when `stopped` or `turns` changes, or the stream is to be closed. */
+  readonly waiting: Waiting;
+  /** Whether this side has stopped. */
+  readonly stopped: boolean;
+  /** How often the target has changed. */
+  readonly turns: number;
+  /** Seconds without data after which a connection counts as lost. */
+  patience(): number;
+  /** How long the other side may take to close. */
+  parting(): number;
+  /** Declare a connection, or a request, that has been answered as expected. */
+  met(): void;
+  /** Wait as long as so many bytes take at the rate allowed. */
+  pace(size: number): Promise<void>;
+  /** Take bytes, whose views are handed on. */
+  take(receive: () => View[]): void;
+  /** Wait until the views that were handed on have been taken. */
+  room(): Promise<void>;
+}

@@ -1,0 +1,403 @@
+/**
+ * A stream: one surface received over as many connections as it takes.
+ *
+ * It runs in one thread with its decoder. In a page that is a worker, see `connect`; in Node it may be the program's.
+ */
+
+import { LodestreamError, OptionError, RemoteError } from "../errors";
+import type { Ended } from "../planning/plans";
+import { makeTarget, type TargetOptions } from "../planning/target";
+import type { Region, Target, ViewInfo } from "../types";
+import { containerUrl } from "./addresses";
+import { PartsRoad } from "./by-parts";
+import { SocketRoad } from "./by-socket";
+import type { StreamDecoder } from "./decoding";
+import type { Journey } from "./journey";
+import { Link, windowFor } from "./pacing";
+import { BlobParts, HttpParts } from "./parts";
+import { fromCode } from "./problems";
+import { Reception, type Sink } from "./reception";
+import { type Pauses, type Road, Roads, type Transport } from "./roads";
+import { platformSocket, type SocketClass } from "./socket";
+import type { Store } from "./store";
+import { seconds, Waiting } from "./waiting";
+
+/** What a stream is doing. */
+export type Phase = "idle" | "connecting" | "streaming" | "reconnecting" | "ended";
+
+/** The state of a stream. */
+export interface StreamState {
+  readonly phase: Phase;
+  /** The transport in use: a WebSocket, HTTP Range, or a file of this machine. */
+  readonly transport: Road | "file";
+  /** While reconnecting: what became of the last connection, and the seconds until the next attempt. */
+  readonly problem?: string;
+  readonly pause?: number;
+  /** Once ended: why. */
+  readonly ended?: Ended;
+}
+
+/** How far a stream has come. */
+export interface Progress {
+  /** Bytes of the surface that are held, and that the target needs; undefined until that is known. */
+  readonly received: number;
+  readonly planned: number | undefined;
+  /** Bytes of the container, once they are known. */
+  readonly size: number | undefined;
+  /** Bytes of all messages and answers received. */
+  readonly wireBytes: number;
+  /** Bytes of the container received. */
+  readonly dataBytes: number;
+  /** Seconds since the stream began. */
+  readonly seconds: number;
+  /** Number of connections so far; over HTTP, number of requests. */
+  readonly connections: number;
+}
+
+/** Options of a stream that can be sent from one thread to another; times in seconds. */
+export interface PlainStreamOptions {
+  /** For a server that needs one. It goes to the URL's own origin only, and never into an address. */
+  readonly token?: string | undefined;
+  /** `auto`: a WebSocket, or HTTP Range where none gets through. */
+  readonly transport?: Transport | undefined;
+  /** Without data for so long, a connection counts as lost; 30. */
+  readonly silence?: number | undefined;
+  /** After a connection was lost: without data for so long, the stream gives up with the last error; 60. */
+  readonly deadline?: number | undefined;
+  /** How long the other side may take to close; 5. */
+  readonly closeTimeout?: number | undefined;
+  /** Bytes per second, to feel a slow link. */
+  readonly limitRate?: number | undefined;
+  /** Bytes that may be in flight over a WebSocket, up to 262,144; left out: measured from the link. */
+  readonly window?: number | undefined;
+  /** Give only the newest view to whoever is slower than the stream, which then does not wait. */
+  readonly latest?: boolean | undefined;
+  /** SHA-256 and size of the container that bytes are held of. */
+  readonly container?: string | undefined;
+  readonly size?: number | undefined;
+  /** Seconds between attempts. */
+  readonly pauses?: Pauses | undefined;
+}
+
+/** Options of a stream. */
+export interface StreamOptions extends PlainStreamOptions {
+  /** Called when the state changes. */
+  readonly onState?: ((state: StreamState) => void) | undefined;
+  /** Called when bytes have come. */
+  readonly onProgress?: ((progress: Progress) => void) | undefined;
+  /** Called with bytes of the container that had not come before; by then it is known which container it is. */
+  readonly onBytes?: Sink | undefined;
+  /** Bytes that are held already, and where others are kept. */
+  readonly store?: Store | undefined;
+  /** In place of the platform's own; Node 20 has no WebSocket. */
+  readonly WebSocket?: SocketClass | undefined;
+  readonly fetch?: typeof globalThis.fetch | undefined;
+}
+
+/**
+ * A surface being received: iterate over it for a view of each layer.
+ *
+ * If the iteration throws, for example because the server is gone, the stream ends but keeps what it has: earlier views
+ * stay usable, and `ended` is truncated.
+ */
+export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View>, Journey<View> {
+  readonly reception: Reception<View>;
+  readonly waiting = new Waiting();
+  stopped = false;
+  turns = 0;
+
+  private readonly roads: Roads | undefined;
+  private readonly socket: SocketRoad<View> | undefined;
+  private readonly parts: () => PartsRoad<View>;
+  private made: PartsRoad<View> | undefined;
+  private link: Link | undefined;
+  private readonly silence: number;
+  private readonly closeTimeout: number;
+  private current: StreamState;
+  private views: View[] = [];
+  private running: Promise<void> | undefined;
+  private failure: unknown;
+  private truncated = false;
+  private closeBy: number | undefined;
+  private connections = 0;
+  private began: number | undefined;
+
+  /**
+   * @param source URL of a surface on a server or of a container file, or a file.
+   * @param decoder One that decodes what the target asks for.
+   * @throws OptionError
+   */
+  constructor(
+    source: string | Blob,
+    target: Target,
+    decoder: StreamDecoder<View>,
+    private readonly options: StreamOptions = {},
+  ) {
+    const { token, limitRate } = options;
+    this.silence = positive("silence", options.silence ?? 30);
+    this.closeTimeout = positive("closeTimeout", options.closeTimeout ?? 5);
+    this.link = limitRate === undefined ? undefined : new Link(limitRate);
+    if (typeof source === "string") {
+      const roads = new Roads(source, options.transport ?? "auto", options.deadline ?? 60, options.pauses);
+      const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
+      const http = new HttpParts(containerUrl(roads.url), roads.url, token, fetch);
+      this.parts = () => new PartsRoad(this, http);
+      const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
+      this.socket = new SocketRoad(this, roads.url, { token, window }, options.WebSocket ?? platformSocket());
+      this.roads = roads;
+    } else this.parts = () => new PartsRoad(this, new BlobParts(source));
+    this.reception = new Reception(target, decoder, {
+      store: options.store,
+      container: options.container,
+      size: options.size,
+      sink: options.onBytes,
+    });
+    this.current = { phase: "idle", transport: this.transport };
+  }
+
+  /** What to receive, where to stop, and in which order. */
+  get target(): Target {
+    return this.reception.target;
+  }
+
+  /** Why the stream ended; undefined while it has not. After an error it is truncated. */
+  get ended(): Ended | undefined {
+    return this.reception.ended ?? (this.truncated ? "truncated" : undefined);
+  }
+
+  /** What the stream is doing. */
+  get state(): StreamState {
+    return this.current;
+  }
+
+  /** How far the stream has come. */
+  get progress(): Progress {
+    const { received, planned, size, wireBytes, dataBytes } = this.reception;
+    const passed = this.began === undefined ? 0 : seconds() - this.began;
+    return { received, planned, size, wireBytes, dataBytes, seconds: passed, connections: this.connections };
+  }
+
+  /** The transport in use. */
+  get transport(): Road | "file" {
+    return this.roads?.road ?? "file";
+  }
+
+  [Symbol.asyncIterator](): this {
+    return this;
+  }
+
+  /**
+   * The next view; done once the stream has ended. A stream that was given another target afterwards goes on.
+   *
+   * @throws LodestreamError if the stream cannot go on.
+   */
+  async next(): Promise<IteratorResult<View, undefined>> {
+    this.start();
+    while (this.views.length === 0 && this.running !== undefined) await this.waiting.woken();
+    const view = this.views.shift();
+    this.waiting.wake();
+    if (view !== undefined) return { value: view, done: false };
+    const { failure } = this;
+    this.failure = undefined;
+    if (failure !== undefined) throw failure;
+    return { value: undefined, done: true };
+  }
+
+  /** Stop and close the connection, within `closeTimeout`; leaving a loop over the stream does this. */
+  async return(): Promise<IteratorResult<View, undefined>> {
+    await this.close();
+    return { value: undefined, done: true };
+  }
+
+  /**
+   * Stop the stream at once: no further view is given. At most the credit that is outstanding still arrives.
+   *
+   * @returns A promise that is kept when the other side has ended, or is gone; it is never broken.
+   */
+  async stop(): Promise<void> {
+    if (this.ended !== undefined) return this.running;
+    this.stopped = true;
+    this.views.length = 0;
+    this.socket?.stop();
+    this.waiting.wake();
+    if (this.running !== undefined) return this.running;
+    this.reception.end("stopped");
+    this.tell({ phase: "ended" });
+  }
+
+  /** Stop and close the connection, within `closeTimeout`. */
+  async close(): Promise<void> {
+    this.closeBy = seconds() + this.closeTimeout;
+    this.views.length = 0;
+    this.socket?.interrupt();
+    this.waiting.wake();
+    await this.stop();
+    this.failure = this.closeBy = undefined;
+  }
+
+  /**
+   * Receive the data of a region before the rest; undefined: in the target's own order. Allowed at any time.
+   *
+   * Nothing is sent twice, and the stream ends as it would have. Views then come when a layer is complete in the region,
+   * and when it is complete everywhere. Their errors are NaN if more data have arrived than belong to the layer.
+   *
+   * @throws OptionError if the surface has no such region, or several blocks. While the surface is not known yet, the
+   * iteration throws it.
+   */
+  focus(region: Region | undefined): void {
+    if (this.stopped || this.ended !== undefined) return;
+    const { first: _, ...rest } = this.target;
+    const { first } = makeTarget(region === undefined ? rest : { ...rest, first: region });
+    if (!this.socket?.focus(first)) this.reception.focus(first);
+    this.turned();
+  }
+
+  /**
+   * Receive something else of the same surface, in another order or up to another limit. Allowed at any time; after the
+   * end, iterate again.
+   *
+   * @throws OptionError if the target is not valid, the surface cannot meet it, or its window or attributes differ.
+   */
+  aim(options: TargetOptions): void {
+    const target = makeTarget(options);
+    if (!this.socket?.retarget(target)) this.reception.retarget(target);
+    this.stopped = this.truncated = false;
+    this.failure = undefined;
+    this.turned();
+  }
+
+  /** Change the rate that `limitRate` set, in bytes per second; undefined: as fast as it goes. */
+  throttle(rate: number | undefined): void {
+    this.link = rate === undefined ? undefined : new Link(rate);
+    this.waiting.wake();
+  }
+
+  // What the roads need.
+
+  patience(): number {
+    return this.closeBy === undefined ? this.silence : this.parting();
+  }
+
+  parting(): number {
+    if (this.closeBy === undefined) return this.closeTimeout;
+    return Math.max(Math.min(this.silence, this.closeBy - seconds()), 0.001);
+  }
+
+  met(): void {
+    this.connections += 1;
+    if (this.roads !== undefined) this.roads.met = true;
+    if (this.current.phase !== "streaming") this.tell({ phase: "streaming" });
+  }
+
+  async pace(size: number): Promise<void> {
+    const { link } = this;
+    if (link === undefined) return;
+    const until = seconds() + link.delay(size, seconds());
+    while (!this.stopped && this.link === link) {
+      const wait = until - seconds();
+      if (wait <= 0) return;
+      const left = this.reception.tick(seconds());
+      if (left === 0) return;
+      await this.waiting.woken(Math.min(wait, left ?? wait));
+    }
+  }
+
+  take(receive: () => View[]): void {
+    let views: View[];
+    const before = this.reception.wireBytes;
+    try {
+      views = receive();
+    } catch (error) {
+      throw error instanceof RemoteError ? fromCode(error.code, error.message) : error;
+    }
+    if (!this.stopped && views.length > 0) {
+      if (this.options.latest) this.views = views.slice(-1);
+      else this.views.push(...views);
+      this.waiting.wake();
+    }
+    if (this.reception.wireBytes > before) this.options.onProgress?.(this.progress);
+  }
+
+  async room(): Promise<void> {
+    while (this.views.length > 0 && !this.options.latest && this.closeBy === undefined) {
+      const left = this.reception.tick(seconds());
+      if (left === 0) return;
+      await this.waiting.woken(left);
+    }
+  }
+
+  // Running.
+
+  private turned(): void {
+    this.turns += 1;
+    this.waiting.wake();
+  }
+
+  private start(): void {
+    if (this.running !== undefined || this.ended !== undefined) return;
+    this.began ??= seconds();
+    const run = async (): Promise<void> => {
+      try {
+        await this.travel();
+      } catch (error) {
+        this.truncated = true;
+        // Whoever stops or closes has what they want; how the other side takes it is no concern of theirs.
+        if (!this.stopped) this.failure = error;
+      }
+      this.socket?.hangUp();
+      this.running = undefined;
+      this.tell({ phase: "ended" });
+      this.waiting.wake();
+    };
+    this.running = run();
+  }
+
+  private async travel(): Promise<void> {
+    const { roads, reception } = this;
+    this.tell({ phase: "connecting" });
+    roads?.start(seconds());
+    while (reception.ended === undefined) {
+      const before = reception.held.total;
+      try {
+        if (this.socket !== undefined && roads?.road === "ws") await this.socket.travel();
+        else {
+          this.made ??= this.parts();
+          await this.made.travel();
+        }
+      } catch (error) {
+        this.socket?.hangUp();
+        if (this.over()) return;
+        if (roads === undefined || !(error instanceof LodestreamError)) throw error;
+        const pause = roads.failed(error, seconds(), reception.held.total > before);
+        const left = reception.tick(seconds());
+        const phase = roads.met ? "reconnecting" : "connecting";
+        this.tell({ phase, problem: error.message, pause });
+        const until = seconds() + Math.min(pause, left ?? pause);
+        while (!this.over() && seconds() < until) await this.waiting.woken(until - seconds());
+      }
+      this.socket?.hangUp();
+    }
+  }
+
+  /** Whether a connection that broke is not to be replaced, since nothing more is wanted. */
+  private over(): boolean {
+    const { reception } = this;
+    if (!this.stopped && this.closeBy === undefined && reception.stoppedFor === undefined) {
+      if (reception.tick(seconds()) !== 0) return false;
+      reception.stoppedFor = "seconds";
+    }
+    if (reception.ended === undefined) reception.end("stopped");
+    return true;
+  }
+
+  private tell(state: Omit<StreamState, "transport" | "ended">): void {
+    const { ended } = this;
+    this.current = { ...state, transport: this.transport, ...(ended === undefined ? {} : { ended }) };
+    this.options.onState?.(this.current);
+  }
+}
+
+function positive(name: string, value: number): number {
+  if (!(value > 0)) throw new OptionError(`expected a positive number of seconds for ${name}, got ${value}`);
+  return value;
+}

@@ -1,0 +1,107 @@
+/** What is known of a surface beside its stream: metadata and price list, which a container has at its end. */
+
+import type { Header } from "../container/header";
+import { indexFrom, readMetadata } from "../container/reader";
+import { FOOTER_LENGTH, type Metadata, parseFooter } from "../container/sections";
+import { containerUrl, isSurface } from "../transfer/addresses";
+import { attributeNames } from "./grids";
+import type { Price, SurfaceInfo } from "./source";
+
+/** Metadata and price list. */
+export interface Description {
+  readonly metadata: Metadata;
+  readonly prices: readonly Price[] | null;
+  readonly size: number;
+}
+
+/** Nothing is known. */
+export const NO_DESCRIPTION: Description = { metadata: {}, prices: null, size: 0 };
+
+/** Bytes at the end of a container that are asked for first: footer, index and metadata of small ones. */
+const TAIL = 16_384;
+/** The largest end that is asked for; larger indexes come with the stream, if at all. */
+const LARGEST_TAIL = 1 << 20;
+
+/**
+ * Asks a server, or reads the end of a container.
+ *
+ * @param header - Of the container, once it is known.
+ * @throws Error if neither works; the stream may all the same.
+ */
+export async function describe(url: string, token: string | null, header: Promise<Header>): Promise<Description> {
+  const headers: Record<string, string> = token === null ? {} : { authorization: `Bearer ${token}` };
+  if (isSurface(url)) {
+    const answer = await fetch(url, { headers });
+    if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
+    return fromServer((await answer.json()) as Record<string, unknown>);
+  }
+  return fromTail(containerUrl(url), headers, await header);
+}
+
+function fromServer({ metadata, layers, bytes }: Record<string, unknown>): Description {
+  const prices = (layers ?? null) as readonly Price[] | null;
+  return { metadata: (metadata ?? {}) as Metadata, prices, size: typeof bytes === "number" ? bytes : 0 };
+}
+
+async function fromTail(url: string, headers: Record<string, string>, header: Header): Promise<Description> {
+  const part = async (first: number, past: number): Promise<{ data: Uint8Array; size: number }> => {
+    const range = { range: `bytes=${first}-${past - 1}` };
+    const answer = await fetch(url, { headers: { ...headers, ...range }, cache: "no-store" });
+    if (answer.status !== 206) throw new Error(`expected a part of the container, got ${answer.status}`);
+    const size = Number(/\/(\d+)$/.exec(answer.headers.get("content-range") ?? "")?.[1] ?? Number.NaN);
+    return { data: new Uint8Array(await answer.arrayBuffer()), size };
+  };
+  const { size } = await part(0, 1);
+  let first = Math.max(0, size - TAIL);
+  let { data } = await part(first, size);
+  const footer = parseFooter(data.subarray(data.length - FOOTER_LENGTH), size - FOOTER_LENGTH);
+  // The metadata stand right before the index and have at most 64 KiB.
+  const start = Math.max(0, footer.index.offset - (1 << 16) - 32);
+  if (first > footer.index.offset && size - start > LARGEST_TAIL) return { ...NO_DESCRIPTION, size };
+  const read = async (offset: number, length: number): Promise<Uint8Array> => {
+    if (offset < first) {
+      data = (await part(offset, size)).data;
+      first = offset;
+    }
+    return data.subarray(offset - first, offset - first + length);
+  };
+  const index = indexFrom(await read(footer.index.offset, footer.index.length), footer.index.offset, header);
+  const metadata = readMetadata(await read(index.metadata.offset, index.metadata.length), index.metadata.offset);
+  const last = index.layers.at(-1);
+  const prices: Price[] = index.layers.map(({ end, level, errors }) => ({
+    bytes: end,
+    level,
+    rms: errors.rms,
+    max: errors.maximum,
+  }));
+  if (index.exactness !== null && last !== undefined) {
+    const { errors, level } = index.levels.at(-1)!;
+    prices.push({ bytes: index.surfaceEnd, level, rms: errors.rms, max: errors.maximum });
+  }
+  return { metadata, prices, size };
+}
+
+/** The description of a surface for those who look at it. */
+export function infoOf(header: Header, { metadata, prices, size }: Description): SurfaceInfo {
+  const text = (key: string): string => {
+    const value = metadata[key];
+    return typeof value === "string" ? value : "";
+  };
+  const heights = header.pointChannels === 1 && header.blocks.length === 1;
+  return {
+    name: text("name"),
+    blocks: header.blocks.map(({ shape, closed }) => ({ shape, closed })),
+    levels: header.levels,
+    extent: header.extent,
+    heights,
+    georeferenced:
+      heights && (header.plane !== null || metadata.axes !== undefined || (metadata.geotransform ?? null) !== null),
+    geographic: heights && /^\s*GEO(GCS|GCRS|DCRS|GRAPHICCRS)/i.test(text("crs")),
+    joined: header.arrangement !== null,
+    unit: text("unit"),
+    exact: header.exact,
+    attributes: attributeNames(header),
+    size,
+    prices,
+  };
+}

@@ -1,0 +1,232 @@
+/** The part of the panel about transmission: errors, curve, slider, target, stop. */
+
+import { html, setText } from "./dom";
+import { type CurveAxis, ErrorCurve } from "./error-curve";
+import { formatBytes, formatNumber, formatSeconds } from "./format";
+import type { Moment, Progress, SurfaceInfo, Target } from "./source";
+
+/** What the panel asks for. */
+export interface FocusActions {
+  stop(): void;
+  resume(): void;
+  /** null: the latest moment, and those to come. */
+  show(moment: number | null): void;
+  setTarget(target: Target): void;
+  throttle(rate: number | null): void;
+  stopBelowPixel(on: boolean): void;
+}
+
+/** All that the panel shows. */
+export interface FocusState {
+  readonly info: SurfaceInfo | null;
+  readonly moments: readonly Moment[];
+  readonly drawn: Moment | null;
+  readonly drawnLevel: number;
+  readonly following: boolean;
+  readonly progress: Progress;
+  readonly belowPixel: boolean;
+  /** Seconds without a byte, while receiving. */
+  readonly silent: number;
+}
+
+const TARGETS: readonly (readonly [string, string])[] = [
+  ["all", "Everything"],
+  ["rms", "RMS error"],
+  ["max", "Maximum error"],
+  ["bytes", "Kilobytes"],
+  ["level", "Level"],
+];
+
+/** Bytes a second that can be chosen. */
+const RATES: readonly (readonly [number, string])[] = [
+  [0, "As it comes"],
+  [1_000_000, "8 Mbit/s"],
+  [125_000, "1 Mbit/s"],
+  [32_000, "256 kbit/s"],
+  [7_000, "56 kbit/s"],
+];
+
+function options(of: readonly (readonly [string | number, string])[]): HTMLOptionElement[] {
+  return of.map(([value, text]) => html("option", { value }, text));
+}
+
+/** The section "In focus". */
+export class FocusPanel {
+  private readonly status = html("p", { class: "status", role: "status" });
+  private readonly detail = html("p", { class: "detail" });
+  private readonly done = html("i");
+  private readonly rms = html("dd");
+  private readonly max = html("dd");
+  private readonly curve = new ErrorCurve();
+  private readonly axis = html(
+    "select",
+    { "aria-label": "Error against" },
+    ...options([
+      ["bytes", "Against bytes"],
+      ["seconds", "Against seconds"],
+    ]),
+  );
+  private readonly slider = html("input", { type: "range", min: 0, max: 0, value: 0, class: "grow", id: "moment" });
+  private readonly shown = html("output", { for: "moment" });
+  private readonly target = html("select", { id: "target", class: "grow" }, ...options(TARGETS));
+  private readonly amount = html("input", {
+    type: "number",
+    min: 0,
+    step: "any",
+    class: "grow",
+    "aria-label": "Target value",
+    hidden: true,
+  });
+  private readonly rate = html("select", { id: "rate", class: "grow" }, ...options(RATES));
+  private readonly below = html("input", { type: "checkbox", checked: true, id: "below" });
+  private readonly button = html("button", { type: "button", class: "primary" }, "Stop");
+  private last: FocusState | null = null;
+
+  readonly element = html(
+    "section",
+    { "aria-label": "In focus" },
+    html("h2", {}, "In focus"),
+    this.status,
+    this.detail,
+    html("div", { class: "bar", "aria-hidden": "true" }, this.done),
+    html(
+      "dl",
+      { class: "figures" },
+      html("div", {}, html("dt", {}, "RMS error"), this.rms),
+      html("div", {}, html("dt", { class: "max" }, "Maximum error"), this.max),
+    ),
+    this.curve.element,
+    html("div", { class: "row end" }, this.axis),
+    html("div", { class: "row" }, html("label", { for: "moment" }, "Moment"), this.slider, this.shown),
+    html("div", { class: "row" }, html("label", { for: "target" }, "Target"), this.target, this.amount),
+    html("div", { class: "row" }, html("label", { for: "rate" }, "Link"), this.rate),
+    html("div", { class: "row check" }, html("label", {}, this.below, "Stop when below a pixel")),
+    html("div", { class: "row" }, this.button),
+  );
+
+  constructor(private readonly actions: FocusActions) {
+    this.button.addEventListener("click", () => (this.canStop ? actions.stop() : actions.resume()));
+    this.axis.addEventListener("change", () => this.last !== null && this.draw(this.last));
+    this.slider.addEventListener("input", () => this.slide(Number(this.slider.value)));
+    this.target.addEventListener("change", () => this.chooseTarget());
+    this.amount.addEventListener("change", () => this.sendTarget());
+    this.rate.addEventListener("change", () => actions.throttle(Number(this.rate.value) || null));
+    this.below.addEventListener("change", () => actions.stopBelowPixel(this.below.checked));
+  }
+
+  /** Whether there is something to stop. */
+  get canStop(): boolean {
+    const state = this.last?.progress.state;
+    return state === "connecting" || state === "receiving" || state === "resuming" || state === "waiting";
+  }
+
+  /** Says whether it stops below a pixel. */
+  setBelowPixel(on: boolean): void {
+    this.below.checked = on;
+  }
+
+  /** Goes so many moments back or on. */
+  step(by: number): void {
+    const to = Math.min(Math.max(Number(this.slider.value) + by, 0), Number(this.slider.max));
+    this.slider.value = String(to);
+    this.slide(to);
+  }
+
+  /** Shows another state. */
+  draw(state: FocusState): void {
+    this.last = state;
+    const { info, moments, drawn, progress, following } = state;
+    const unit = info?.unit ?? "";
+    setText(this.status, statusText(state));
+    setText(this.detail, detailText(state));
+    const total = progress.planned || info?.size || 0;
+    this.done.style.width = `${total > 0 ? Math.min(100, (100 * progress.bytes) / total) : 0}%`;
+    setText(this.rms, drawn === null ? "–" : errorText(drawn.rms, unit));
+    setText(this.max, drawn === null ? "–" : errorText(drawn.max, unit));
+    const axis = this.axis.value as CurveAxis;
+    this.curve.draw({ prices: info?.prices ?? null, moments, shown: drawn?.number ?? -1, axis, unit });
+    const [first, last] = [moments[0]?.number ?? 0, moments.at(-1)?.number ?? 0];
+    this.slider.min = String(first);
+    this.slider.max = String(last);
+    if (following) this.slider.value = String(last);
+    const at = moments.find(({ number }) => number === Number(this.slider.value));
+    setText(this.shown, at === undefined ? "" : formatBytes(at.bytes));
+    this.slider.setAttribute("aria-valuetext", at === undefined ? "nothing yet" : momentText(at, unit));
+    setText(this.button, this.canStop ? "Stop" : "Continue");
+    this.button.disabled = progress.state === "complete" || progress.state === "failed";
+    this.button.hidden = this.button.disabled;
+  }
+
+  private slide(to: number): void {
+    this.actions.show(to >= Number(this.slider.max) ? null : to);
+  }
+
+  private chooseTarget(): void {
+    const kind = this.target.value;
+    this.amount.hidden = kind === "all";
+    const drawn = this.last?.drawn;
+    const suggestion: Readonly<Record<string, number>> = {
+      rms: (drawn?.rms ?? 1) / 4,
+      max: (drawn?.max ?? 1) / 4,
+      bytes: Math.ceil((drawn?.bytes ?? 10_000) / 500),
+      level: this.last?.info?.levels ?? 0,
+    };
+    if (kind === "all") this.sendTarget();
+    else this.amount.value = String(Number((suggestion[kind] ?? 0).toPrecision(2)));
+    if (kind !== "all") this.sendTarget();
+  }
+
+  private sendTarget(): void {
+    const kind = this.target.value;
+    const amount = Number(this.amount.value);
+    if (kind === "all") this.actions.setTarget({});
+    else if (!Number.isFinite(amount) || amount < 0 || this.amount.value === "") return;
+    else if (kind === "level")
+      this.actions.setTarget({ level: Math.min(Math.round(amount), this.last?.info?.levels ?? 0) });
+    else if (kind === "bytes") this.actions.setTarget({ bytes: Math.round(amount * 1000) });
+    else this.actions.setTarget(kind === "rms" ? { rms: amount } : { max: amount });
+  }
+}
+
+/** An error with its unit. */
+export function errorText(value: number, unit: string): string {
+  if (Number.isNaN(value)) return "not yet known";
+  return `${formatNumber(value, 3)} ${unit}`.trim();
+}
+
+function momentText(moment: Moment, unit: string): string {
+  return `${formatBytes(moment.bytes)} after ${formatSeconds(moment.seconds)}, RMS error ${errorText(moment.rms, unit)}`;
+}
+
+function statusText({ progress, belowPixel, silent, info, moments }: FocusState): string {
+  if (belowPixel) return "Below a pixel: paused";
+  switch (progress.state) {
+    case "connecting":
+      return "Connecting";
+    case "receiving":
+      return silent >= 3 ? `Waiting: no data for ${silent} s` : "Receiving";
+    case "waiting":
+      return "Waiting";
+    case "resuming":
+      return "Link lost: resuming";
+    case "stopped":
+      return "Stopped";
+    case "target":
+      return "Target met";
+    case "complete":
+      return info?.exact === false || moments.at(-1)?.rms !== 0 ? "Complete" : "Complete: exact";
+    case "failed":
+      return "Failed";
+  }
+}
+
+function detailText({ progress, info, drawn, drawnLevel }: FocusState): string {
+  const total = progress.planned || info?.size || 0;
+  const parts = [total > 0 ? `${formatBytes(progress.bytes)} of ${formatBytes(total)}` : formatBytes(progress.bytes)];
+  if (progress.state === "receiving" && progress.rate > 0) parts.push(`${formatBytes(progress.rate)}/s`);
+  if (drawn !== null && info !== null) {
+    const level = `level ${drawn.level} of ${info.levels}`;
+    parts.push(drawnLevel < drawn.level ? `${level}, drawn at ${drawnLevel}` : level);
+  }
+  return [parts.join(" · "), progress.detail].filter((text) => text !== "").join(". ");
+}

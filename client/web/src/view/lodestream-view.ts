@@ -1,0 +1,457 @@
+/** `<lodestream-view>`: a surface that comes into focus, with its controls. */
+
+import { fitted, type Orbit, positionOf, VIEW_ANGLE } from "./camera";
+import { type ColourMapName, rangeOf } from "./colour-maps";
+import { html, setText } from "./dom";
+import { defaultExaggeration } from "./exaggeration";
+import { FocusPanel } from "./focus-panel";
+import type { FromGeometry } from "./geometry-messages";
+import { type Command, listen } from "./gestures";
+import type { Frame } from "./lattice";
+import { Legend, ScaleBar } from "./legend";
+import { fieldName, isCentred, type Look, LookPanel, mapFor } from "./look-panel";
+import { Probe } from "./probe";
+import { Session } from "./session";
+import type { Moment, Source, SurfaceInfo } from "./source";
+import { Stage } from "./stage";
+import { styles } from "./styles";
+import { parseView, type SharedView, withView } from "./url-state";
+
+type Patches = Extract<FromGeometry, { kind: "patches" }>;
+
+/** Makes the source of an address; null: this is not its kind of address. */
+export type SourceMaker = (src: string, options: { readonly token: string | null }) => Source | null;
+
+/**
+ * Shows the surface at `src`.
+ *
+ * Attributes: `src`, the address of a surface or container; `max-triangles`, 4 million unless given; `autostop="off"`
+ * goes on when the error is below a pixel; `share` keeps the view in the address of the page, after #; `name` is shown
+ * in place of the surface's.
+ *
+ * Events: `lodestream-info`, `lodestream-moment`, `lodestream-progress`, each with what has come as `detail`, and
+ * `lodestream-drawn` when a picture is drawn.
+ */
+export class LodestreamView extends HTMLElement {
+  static readonly observedAttributes = ["src", "max-triangles", "autostop"];
+  /** Makers of sources; the first that knows an address is used. */
+  static readonly sources: SourceMaker[] = [];
+
+  private readonly canvas = html("canvas", { tabindex: 0, role: "application", "aria-describedby": "values status" });
+  private readonly notice = html("div", { class: "notice", role: "alert" });
+  private readonly values = html("p", { class: "values", id: "values", "aria-live": "polite", "aria-label": "Values" });
+  private readonly legend = new Legend();
+  private readonly scales = new ScaleBar();
+  private readonly focusPanel: FocusPanel;
+  private readonly lookPanel: LookPanel;
+  private readonly probe: Probe;
+  private stage: Stage | null = null;
+  private session: Session | null = null;
+  private orbit: Orbit | null = null;
+  private home: Orbit | null = null;
+  private frame: Frame | null = null;
+  private latest: Patches | null = null;
+  private look: Look = { field: { kind: "height" }, map: "viridis", range: null, exaggeration: 1, lines: false };
+  private shared: SharedView = {};
+  private silentSince = 0;
+  private lastBytes = -1;
+  private life: AbortController | null = null;
+  private pending = 0;
+  private sharing: ReturnType<typeof setTimeout> | undefined;
+  private secret: string | null = null;
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: "open" });
+    root.adoptedStyleSheets = [styles()];
+    this.focusPanel = new FocusPanel({
+      stop: () => this.session?.stop(),
+      resume: () => this.session?.resume(),
+      show: (moment) => this.session?.show(moment),
+      setTarget: (target) => this.session?.setTarget(target),
+      throttle: (rate) => this.session?.source.throttle(rate),
+      stopBelowPixel: (on) => this.stopBelowPixel(on),
+    });
+    this.lookPanel = new LookPanel(
+      (look) => this.setLook(look),
+      (which) => this.command(which),
+    );
+    this.probe = new Probe(this.values);
+    root.append(
+      html(
+        "div",
+        { class: "frame" },
+        html("div", { class: "stage" }, this.canvas, this.scales.element, this.legend.element, this.notice),
+        this.values,
+        html(
+          "div",
+          { class: "panel", tabindex: 0, role: "group", "aria-label": "Controls" },
+          this.focusPanel.element,
+          this.lookPanel.element,
+          this.lookPanel.keys,
+        ),
+      ),
+    );
+    this.legend.draw(null);
+    this.scales.draw(0, "", null);
+    this.probe.clear();
+  }
+
+  /** The address of the surface. */
+  get src(): string {
+    return this.getAttribute("src") ?? "";
+  }
+
+  set src(value: string) {
+    this.setAttribute("src", value);
+  }
+
+  /** A token for servers that want one; never an attribute, so that it does not stand in the document. */
+  set token(value: string | null) {
+    this.secret = value;
+  }
+
+  /** The surface's description; null while it is not known. */
+  get info(): SurfaceInfo | null {
+    return this.session?.info ?? null;
+  }
+
+  /** All moments so far. */
+  get moments(): readonly Moment[] {
+    return this.session?.moments ?? [];
+  }
+
+  connectedCallback(): void {
+    this.life = new AbortController();
+    const { signal } = this.life;
+    try {
+      this.stage = new Stage(this.canvas, () => this.drawScales());
+    } catch {
+      setText(this.notice, "This browser does not offer WebGL2, which drawing needs.");
+      return;
+    }
+    const watcher = new ResizeObserver(() => {
+      this.stage?.resize();
+      this.session?.viewChanged();
+    });
+    watcher.observe(this.canvas);
+    signal.addEventListener("abort", () => watcher.disconnect());
+    listen(
+      this.canvas,
+      {
+        orbit: () => this.orbit ?? { azimuth: 0, elevation: 30, distance: 5, target: [0, 0, 0] },
+        setOrbit: (orbit) => this.setOrbit(orbit),
+        anchor: () => this.anchor(),
+        point: (at) => this.point(at),
+        command: (name) => this.command(name),
+      },
+      signal,
+    );
+    const timer = setInterval(() => this.watchSilence(), 1000);
+    signal.addEventListener("abort", () => clearInterval(timer));
+    if (this.hasAttribute("share")) {
+      this.shared = parseView(location.hash.replace(/^#/, ""));
+      addEventListener("hashchange", () => this.takeShared(parseView(location.hash.slice(1))), { signal });
+    }
+    this.open();
+  }
+
+  disconnectedCallback(): void {
+    this.life?.abort();
+    this.session?.close();
+    this.session = null;
+    this.stage?.dispose();
+    this.stage = null;
+  }
+
+  attributeChangedCallback(name: string, before: string | null, value: string | null): void {
+    if (before === value || this.stage === null) return;
+    if (name === "src") this.open();
+    else if (name === "max-triangles") this.session?.setTriangles(this.mostTriangles);
+    else this.stopBelowPixel(value !== "off");
+  }
+
+  private get mostTriangles(): number {
+    const given = Number(this.getAttribute("max-triangles") ?? Number.NaN);
+    return Number.isFinite(given) && given >= 2 ? given : 4_000_000;
+  }
+
+  private open(): void {
+    this.session?.close();
+    this.session = null;
+    this.orbit = null;
+    this.latest = null;
+    this.notice.textContent = "";
+    const { src, stage } = this;
+    if (src === "" || stage === null) return;
+    const source = LodestreamView.sources.reduce<Source | null>(
+      (made, maker) => made ?? maker(src, { token: this.secret }),
+      null,
+    );
+    if (source === null) {
+      setText(this.notice, `This is not the address of a surface: ${src}`);
+      return;
+    }
+    this.session = new Session(
+      source,
+      stage,
+      {
+        info: (info) => this.takeInfo(info),
+        moment: (moment) => this.changed("moment", moment),
+        progress: (progress) => {
+          if (progress.bytes !== this.lastBytes) this.silentSince = performance.now();
+          this.lastBytes = progress.bytes;
+          setText(this.notice, progress.state === "failed" ? progress.detail : "");
+          this.changed("progress", progress);
+        },
+        drawn: (patches, moment) => this.drawn(patches, moment),
+        failed: (detail) => setText(this.notice, detail),
+      },
+      this.mostTriangles,
+    );
+    this.stopBelowPixel(this.getAttribute("autostop") !== "off");
+    this.look = { ...this.look, field: this.shared.field ?? { kind: "height" }, range: this.shared.range ?? null };
+    this.session.setField(this.look.field);
+  }
+
+  private stopBelowPixel(on: boolean): void {
+    this.focusPanel.setBelowPixel(on);
+    if (this.session === null) return;
+    this.session.stopsBelowPixel = on;
+    this.session.considerPixels();
+    this.refresh();
+  }
+
+  private takeInfo(info: SurfaceInfo): void {
+    const name = this.getAttribute("name") ?? info.name;
+    this.canvas.setAttribute(
+      "aria-label",
+      `Surface ${name}. Arrow keys turn it, plus and minus zoom.`.replace("  ", " "),
+    );
+    this.lookPanel.offer(info);
+    const { field } = this.look;
+    if (field.kind === "attribute" && !info.attributes.includes(field.name))
+      this.setLook({ ...this.look, field: { kind: "height" } });
+    this.setLook({
+      ...this.look,
+      map: this.shared.map ?? mapFor(this.look.field, info),
+      lines: this.shared.lines ?? this.look.lines,
+    });
+    this.changed("info", info);
+  }
+
+  private drawn(patches: Patches, moment: Moment): void {
+    const { stage, session } = this;
+    if (stage === null || session?.info == null) return;
+    const first = this.latest === null;
+    this.latest = patches;
+    this.frame = patches.frame;
+    if (first) {
+      const half = ([0, 1, 2] as const).map(
+        (k) => ((patches.box[1][k] - patches.box[0][k]) / 2) * patches.frame.scale[k],
+      ) as [number, number, number];
+      const exaggeration = this.shared.exaggeration ?? defaultExaggeration(half, session.info.heights);
+      const whole = session.info.heights ? 0 : (session.info.extent / 2) * patches.frame.scale[0];
+      stage.setRadius(Math.max(Math.hypot(...half), whole) * 1.5);
+      this.home = fitted(
+        [half[0], half[1], half[2] * exaggeration],
+        whole,
+        stage.size[0] / stage.size[1],
+        session.info.heights,
+      );
+      this.setLook({ ...this.look, exaggeration });
+      this.setOrbit(this.shared.camera === undefined ? this.home : this.toDrawn(this.shared.camera));
+      this.shared = {};
+    }
+    this.colour();
+    this.canvas.dataset.triangles = String(patches.triangles);
+    this.refresh();
+    if (patches.fresh)
+      this.dispatchEvent(
+        new CustomEvent("lodestream-drawn", { detail: { moment, level: patches.level, triangles: patches.triangles } }),
+      );
+  }
+
+  private changed(kind: "info" | "moment" | "progress", detail: unknown): void {
+    this.refresh();
+    this.dispatchEvent(new CustomEvent(`lodestream-${kind}`, { detail }));
+  }
+
+  /** Draws the panel with the next frame. */
+  private refresh(): void {
+    if (this.pending !== 0) return;
+    this.pending = requestAnimationFrame(() => {
+      this.pending = 0;
+      const { session } = this;
+      if (session === null) return;
+      const silent =
+        session.progress.state === "receiving" ? Math.floor((performance.now() - this.silentSince) / 1000) : 0;
+      this.focusPanel.draw({
+        info: session.info,
+        moments: session.moments,
+        drawn: session.drawnMoment,
+        drawnLevel: this.latest?.level ?? 0,
+        following: session.following,
+        progress: session.progress,
+        belowPixel: session.stoppedBelowPixel,
+        silent,
+      });
+    });
+  }
+
+  private watchSilence(): void {
+    if (this.session?.progress.state === "receiving" && performance.now() - this.silentSince > 2500) this.refresh();
+  }
+
+  private setLook(look: Look): void {
+    const { session, stage } = this;
+    const before = this.look;
+    if (look.field !== before.field) {
+      session?.setField(look.field);
+      look = { ...look, map: mapFor(look.field, session?.info ?? null), range: null };
+    }
+    this.look = look;
+    if (stage !== null) {
+      stage.material.setMap(look.map);
+      stage.material.set("lines", look.lines ? 1 : 0);
+      stage.material.set("plain", look.field.kind === "none" ? 1 : 0);
+      if (look.exaggeration !== before.exaggeration) stage.setExaggeration(look.exaggeration);
+      if (look.exaggeration !== before.exaggeration) session?.viewChanged();
+    }
+    this.colour();
+    this.share();
+  }
+
+  /** Colours and legend by the range that is chosen or found. */
+  private colour(): void {
+    const { latest, look, session, stage } = this;
+    const found = latest?.colouring.range ?? [Number.NaN, Number.NaN];
+    const range = look.range ?? rangeOf(found[0], found[1], isCentred(look.field));
+    this.lookPanel.draw(look, latest === null ? [Number.NaN, Number.NaN] : range);
+    if (latest === null || stage === null) return;
+    const { low, span } = latest.colouring;
+    stage.material.setRange((range[0] - low) / span, (range[1] - low) / span);
+    stage.draw();
+    const unit =
+      look.field.kind === "slope" ? "degrees" : look.field.kind === "attribute" ? "" : (session?.info?.unit ?? "");
+    this.legend.draw(
+      look.field.kind === "none"
+        ? null
+        : { title: fieldName(look.field), unit, map: look.map as ColourMapName, range, note: "" },
+    );
+  }
+
+  private setOrbit(orbit: Orbit): void {
+    this.orbit = orbit;
+    this.stage?.setOrbit(orbit);
+    this.session?.viewChanged();
+    this.share();
+  }
+
+  private drawScales(): void {
+    const { orbit, frame, session, stage } = this;
+    if (orbit === null || frame === null || stage === null || session?.info == null) return;
+    const perUnit = stage.size[1] / (2 * orbit.distance * Math.tan((VIEW_ANGLE * Math.PI) / 360));
+    const { geographic, unit, georeferenced, heights } = session.info;
+    const scale = geographic ? frame.scale[1] / 111_320 : frame.scale[0];
+    const named = geographic ? "m" : unit || (heights && !georeferenced ? "cells" : "");
+    this.scales.draw(heights || unit !== "" ? perUnit * scale : 0, named, georeferenced ? orbit.azimuth : null);
+  }
+
+  private command(name: Command): void {
+    const { session } = this;
+    switch (name) {
+      case "home":
+        if (this.home !== null) this.setOrbit(this.home);
+        break;
+      case "top":
+        if (this.home !== null) this.setOrbit({ ...this.home, azimuth: -90, elevation: 89.9 });
+        break;
+      case "stop":
+        if (this.focusPanel.canStop) session?.stop();
+        else session?.resume();
+        break;
+      case "lines":
+        this.setLook({ ...this.look, lines: !this.look.lines });
+        break;
+      case "earlier":
+        this.focusPanel.step(-1);
+        break;
+      case "later":
+        this.focusPanel.step(1);
+        break;
+      case "latest":
+        session?.show(null);
+        break;
+      case "probe":
+        if (this.stage !== null) this.point([this.stage.size[0] / 2, this.stage.size[1] / 2]);
+        break;
+      case "exaggerate":
+      case "flatten":
+        this.setLook({
+          ...this.look,
+          exaggeration: Math.min(Math.max(this.look.exaggeration * (name === "flatten" ? 0.8 : 1.25), 0.1), 100),
+        });
+        break;
+    }
+    this.refresh();
+  }
+
+  private point(at: readonly [number, number] | null): void {
+    const { session, stage } = this;
+    if (session === null || stage === null) return;
+    this.probe.point(session, at === null ? null : stage.ray(...at));
+  }
+
+  /** The last place under the pointer, as it is drawn. */
+  private anchor(): [number, number, number] | null {
+    const { frame } = this;
+    const at = this.probe.at;
+    if (frame === null || at === null) return null;
+    const drawn = at.map((value, k) => (value - frame.origin[k as 0 | 1 | 2]) * frame.scale[k as 0 | 1 | 2]) as [
+      number,
+      number,
+      number,
+    ];
+    return [drawn[0], drawn[1], drawn[2] * this.look.exaggeration];
+  }
+
+  /** Writes the view into the address, soon: browsers limit how often that may be done. */
+  private share(): void {
+    if (!this.hasAttribute("share") || this.orbit === null || this.frame === null) return;
+    this.sharing ??= setTimeout(() => {
+      this.sharing = undefined;
+      if (!this.isConnected || this.orbit === null || this.frame === null) return;
+      const { field, map, range, exaggeration, lines } = this.look;
+      const view: SharedView = { camera: this.toSurface(this.orbit), field, map, exaggeration, lines };
+      if (range !== null) view.range = range;
+      history.replaceState(history.state, "", withView(location.hash, view));
+    }, 400);
+  }
+
+  private takeShared(view: SharedView): void {
+    if (view.camera !== undefined && this.frame !== null) this.setOrbit(this.toDrawn(view.camera));
+  }
+
+  /** A camera in the surface's coordinates; its distance in units of x. */
+  private toSurface(orbit: Orbit): Orbit {
+    const { origin, scale } = this.frame!;
+    const target = orbit.target.map(
+      (value, k) => value / scale[k as 0 | 1 | 2] / (k === 2 ? this.look.exaggeration : 1) + origin[k as 0 | 1 | 2],
+    );
+    return { ...orbit, distance: orbit.distance / scale[0], target: target as unknown as Orbit["target"] };
+  }
+
+  private toDrawn(orbit: Orbit): Orbit {
+    const { origin, scale } = this.frame!;
+    const target = orbit.target.map(
+      (value, k) => (value - origin[k as 0 | 1 | 2]) * scale[k as 0 | 1 | 2] * (k === 2 ? this.look.exaggeration : 1),
+    );
+    return { ...orbit, distance: orbit.distance * scale[0], target: target as unknown as Orbit["target"] };
+  }
+
+  /** Where the camera is, in drawn coordinates; for tests. */
+  get cameraPosition(): [number, number, number] | null {
+    return this.orbit === null ? null : positionOf(this.orbit);
+  }
+}

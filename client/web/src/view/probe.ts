@@ -1,0 +1,85 @@
+/** The values under the pointer, as text. */
+
+import { html } from "./dom";
+import { errorText } from "./focus-panel";
+import { formatAt, formatNumber } from "./format";
+import type { Session } from "./session";
+import type { Moment, NodeValues, SurfaceInfo } from "./source";
+
+type Ray = { origin: [number, number, number]; direction: [number, number, number] };
+
+/** Asks for the values under a ray, one question at a time, and shows them. */
+export class Probe {
+  /** The last place that was found, in the surface's coordinates. */
+  at: readonly [number, number, number] | null = null;
+  private waiting: Ray | null = null;
+  private busy = false;
+
+  constructor(private readonly element: HTMLElement) {}
+
+  /** Shows that nothing is under the pointer. */
+  clear(): void {
+    this.at = null;
+    this.element.replaceChildren(
+      html("span", { class: "dim" }, "Point at the surface, or press P in the picture, to read its values."),
+    );
+  }
+
+  /** Shows what a ray meets; null: nothing. */
+  point(session: Session, ray: Ray | null): void {
+    this.waiting = ray;
+    if (ray === null) this.at = null;
+    else if (!this.busy) void this.ask(session);
+  }
+
+  private async ask(session: Session): Promise<void> {
+    this.busy = true;
+    try {
+      while (this.waiting !== null) {
+        const ray = this.waiting;
+        this.waiting = null;
+        const hit = await session.pick(ray);
+        const { info, drawnMoment: moment } = session;
+        if (hit === null || info === null || moment === null) {
+          this.clear();
+          continue;
+        }
+        this.at = hit.at;
+        const [row, column] = [Math.round(hit.row), Math.round(hit.column)];
+        const { shape } = info.blocks[hit.block]!;
+        const values = await session.source
+          .valuesAt(moment.number, hit.block, row % shape[0], column % shape[1])
+          .catch(() => null);
+        if (values === null) this.clear();
+        else this.show(values, info, moment);
+      }
+    } finally {
+      this.busy = false;
+    }
+  }
+
+  private show(of: NodeValues, info: SurfaceInfo, moment: Moment): void {
+    const part = (name: string, value: string): HTMLElement =>
+      html("span", {}, html("span", { class: "dim" }, `${name} `), html("b", {}, value));
+    // As many digits as the error leaves, of a surface that is not exact.
+    const step = of.max > 0 ? of.max / 10 : 0;
+    const text = (value: number): string => (step > 0 ? formatAt(value, step) : formatNumber(value, 10));
+    const names = ["x", "y", info.heights ? "height" : "z"];
+    const unit = (k: number): string => (k === 2 || !info.geographic ? info.unit : "°");
+    this.element.replaceChildren(
+      part(info.blocks.length > 1 ? `block ${of.block}, row` : "row", `${of.row}`),
+      part("column", `${of.column}`),
+      ...of.point.map((value, k) =>
+        part(
+          names[k] ?? `channel ${k}`,
+          `${k < 2 && info.heights ? formatNumber(value, 10) : text(value)} ${unit(k)}`.trim(),
+        ),
+      ),
+      ...of.attributes.map(([name, values]) =>
+        part(name, values.map((value) => (Number.isNaN(value) ? "none" : formatNumber(value, 6))).join(", ")),
+      ),
+      part("error at most", moment.complete && of.max === 0 ? "0: exact" : errorText(of.max, info.unit)),
+      part("RMS", errorText(of.rms, info.unit)),
+    );
+  }
+}

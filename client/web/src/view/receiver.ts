@@ -1,0 +1,230 @@
+/** A stream and its decoder as a `Source` wants them; runs in a worker. */
+
+import type { Header } from "../container/header";
+import { Decoder } from "../decoding/decoder";
+import type { View } from "../decoding/view";
+import { RemoteError } from "../errors";
+import { loadKernels } from "../kernels/instance";
+import { makeTarget, type TargetOptions } from "../planning/target";
+import { Stream } from "../transfer/stream";
+import type { Surface } from "../types";
+import { type Description, describe, infoOf, NO_DESCRIPTION } from "./description";
+import { areHeights, gridOf, placeOf } from "./grids";
+import type { Grid, NodeValues, Progress, Region, SourceEvents, Target } from "./source";
+
+/** Milliseconds over which the rate is measured. */
+const RATE_SPAN = 2000;
+/** Milliseconds for which moments wait for the description. */
+const PATIENCE = 3000;
+
+/** Receives one surface. */
+export class Receiver {
+  private stream: Stream<View> | null = null;
+  private decoder: Decoder | null = null;
+  private views: View[] = [];
+  private description: Description | null = null;
+  private told = false;
+  private target: Target = {};
+  private region: Region | null = null;
+  private rate: number | null = null;
+  private running = false;
+  private began = 0;
+  private failure: { detail: string; code: string } | null = null;
+  private history: { at: number; bytes: number }[] = [];
+  private whole: { moment: number; surface: Surface } | null = null;
+  private headerCame: (header: Header) => void = () => {};
+
+  constructor(private readonly events: SourceEvents) {}
+
+  /** Begins to receive. */
+  async open(url: string, token: string | null): Promise<void> {
+    this.began = performance.now();
+    this.progress();
+    const header = new Promise<Header>((resolve) => {
+      this.headerCame = resolve;
+    });
+    const described = (description: Description): void => {
+      this.description ??= description;
+      this.tell();
+    };
+    describe(url, token, header).then(described, () => described(NO_DESCRIPTION));
+    void header.then(() => setTimeout(() => described(NO_DESCRIPTION), PATIENCE));
+    try {
+      this.decoder = new Decoder(await loadKernels());
+      this.stream = new Stream<View>(url, makeTarget(this.options()), this.decoder, {
+        token: token ?? undefined,
+        limitRate: this.rate ?? undefined,
+        latest: true,
+        onState: () => this.progress(),
+        onProgress: () => {
+          this.look();
+          this.progress();
+        },
+      });
+      await this.run();
+    } catch (error) {
+      this.fail(error);
+    }
+  }
+
+  /** The grids of a moment, see `Source.grids`. */
+  grids(moment: number, level: number): Grid[] {
+    const header = this.decoder!.header!;
+    const surface = this.views[moment]!.surface(level === header.levels ? undefined : level);
+    return surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
+  }
+
+  /** The values of a node, see `Source.valuesAt`. */
+  valuesAt(moment: number, block: number, row: number, column: number): NodeValues {
+    const header = this.decoder!.header!;
+    const view = this.views[moment]!;
+    const single = header.blocks.length === 1 && header.arrangement === null;
+    if (!single && this.whole?.moment !== moment) this.whole = { moment, surface: view.surface() };
+    const surface = single
+      ? view.window([
+          [row, row + 1],
+          [column, column + 1],
+        ])
+      : this.whole!.surface;
+    const own = surface.blocks[single ? 0 : block]!;
+    const node = single ? 0 : row * own.shape[1] + column;
+    if (own.mask?.[node] === 0) throw new Error("expected a point, got a hole");
+    const { components, values } = own.points;
+    const channels = Array.from({ length: components }, (_, k) => Number(values[node * components + k]));
+    const point = areHeights(header)
+      ? [...placeOf(this.metadata, header, row, column), ...channels]
+      : channels.slice(0, 3);
+    const attributes = [...own.attributes].map(([name, array]) => {
+      const count = Math.max(array.components, 1);
+      return [name, Array.from({ length: count }, (_, k) => Number(array.values[node * count + k]))] as const;
+    });
+    return { block, row, column, point, attributes, rms: view.rms, max: view.maxError };
+  }
+
+  /** See `Source`. */
+  focus(region: Region | null): void {
+    this.region = region;
+    const { stream, decoder } = this;
+    if (stream === null || stream.ended !== undefined || decoder?.header?.blocks.length !== 1) return;
+    try {
+      stream.focus(region ?? undefined);
+    } catch (error) {
+      this.fail(error);
+    }
+  }
+
+  /** See `Source`. */
+  setTarget(target: Target): void {
+    this.target = target;
+    this.resume();
+  }
+
+  /** See `Source`. */
+  throttle(rate: number | null): void {
+    this.rate = rate;
+    this.stream?.throttle(rate ?? undefined);
+  }
+
+  /** See `Source`. */
+  stop(): void {
+    void this.stream?.stop();
+  }
+
+  /** See `Source`. */
+  resume(): void {
+    if (this.stream === null) return;
+    this.failure = null;
+    try {
+      this.stream.aim(this.options());
+      void this.run();
+    } catch (error) {
+      this.fail(error);
+    }
+  }
+
+  private get metadata(): Record<string, unknown> {
+    return this.description === NO_DESCRIPTION || this.description === null
+      ? (this.decoder?.metadata ?? {})
+      : this.description.metadata;
+  }
+
+  private options(): TargetOptions {
+    const { level, rms, max, bytes } = this.target;
+    const first = this.decoder?.header?.blocks.length === 1 ? (this.region ?? undefined) : undefined;
+    return { level, untilRms: rms, untilMax: max, maxBytes: bytes, first };
+  }
+
+  /** Takes views until the stream ends; only one of these runs. */
+  private async run(): Promise<void> {
+    const { stream } = this;
+    if (this.running || stream === null) return;
+    this.running = true;
+    try {
+      for (;;) {
+        const { done } = await stream.next();
+        this.look();
+        // A stream that was given another target while it ended goes on.
+        if (done && stream.ended !== undefined) break;
+      }
+    } catch (error) {
+      this.fail(error);
+    } finally {
+      this.running = false;
+    }
+    this.look();
+    this.progress();
+  }
+
+  /** Tells of what has come. */
+  private look(): void {
+    const header = this.decoder?.header;
+    if (header) this.headerCame(header);
+    this.tell();
+  }
+
+  private tell(): void {
+    const { decoder, description } = this;
+    if (decoder?.header == null || description === null) return;
+    if (!this.told) {
+      this.told = true;
+      const size = description.size || (this.stream?.progress.size ?? 0);
+      this.events.info(infoOf(decoder.header, { ...description, size }));
+    }
+    for (const view of decoder.layers.slice(this.views.length)) {
+      const number = this.views.push(view) - 1;
+      const { level, bytes, rms, maxError: max, complete } = view;
+      const seconds = (performance.now() - this.began) / 1000;
+      this.events.moment({ number, level, bytes, seconds, rms, max, complete });
+    }
+  }
+
+  private fail(error: unknown): void {
+    const detail = error instanceof Error ? error.message : String(error);
+    this.failure = { detail, code: error instanceof RemoteError ? error.code : "" };
+    this.progress();
+  }
+
+  private progress(): void {
+    const { stream } = this;
+    const { received = 0, planned = 0 } = stream?.progress ?? {};
+    const now = performance.now();
+    this.history = [...this.history.filter(({ at }) => now - at < RATE_SPAN), { at: now, bytes: received }];
+    const first = this.history[0]!;
+    const rate = now - first.at > 200 ? (1000 * (received - first.bytes)) / (now - first.at) : 0;
+    this.events.progress({ bytes: received, planned: planned ?? 0, rate: Math.max(rate, 0), ...this.state() });
+  }
+
+  private state(): Pick<Progress, "state" | "detail" | "code"> {
+    const { stream, failure } = this;
+    if (failure !== null) return { state: "failed", detail: failure.detail, code: failure.code };
+    const { phase, problem, pause, ended } = stream?.state ?? { phase: "connecting" as const };
+    if (phase === "streaming") return { state: "receiving", detail: "" };
+    if (phase === "reconnecting") {
+      const next = pause === undefined ? "" : `; next attempt in ${pause.toFixed(1)} s`;
+      return { state: "resuming", detail: `${problem ?? "the connection broke"}${next}` };
+    }
+    if (phase !== "ended") return { state: "connecting", detail: problem ?? "" };
+    if (ended === "stopped") return { state: "stopped", detail: "" };
+    return { state: ended === "complete" ? "complete" : "target", detail: "" };
+  }
+}

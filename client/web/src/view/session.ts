@@ -1,0 +1,279 @@
+/** A surface coming into focus on a stage: moments in, pictures out; what the view asks for back to the source. */
+
+import type { Field, FromGeometry, Hit, ToGeometry } from "./geometry-messages";
+import GeometryWorker from "./geometry-worker?worker&inline";
+import { belowPixel, finestDrawn, firstLevel } from "./levels";
+import type { Moment, Progress, Region, Source, SurfaceInfo, Target } from "./source";
+import type { Stage } from "./stage";
+
+type Patches = Extract<FromGeometry, { kind: "patches" }>;
+
+/** What a session tells. */
+export interface SessionEvents {
+  info(info: SurfaceInfo): void;
+  moment(moment: Moment): void;
+  progress(progress: Progress): void;
+  /** Something else is drawn: a picture (`fresh`), or the same in other patches or colours. */
+  drawn(patches: Patches, moment: Moment): void;
+  failed(detail: string): void;
+}
+
+/** How long the view rests before the source is asked for what is in it, in milliseconds. */
+const REST = 400;
+
+/** One source on one stage, until `close`. */
+export class Session {
+  readonly moments: Moment[] = [];
+  info: SurfaceInfo | null = null;
+  progress: Progress = { state: "connecting", bytes: 0, planned: 0, rate: 0, detail: "" };
+  /** Stop when the error is below a pixel, and go on when it is not any more. */
+  stopsBelowPixel = true;
+  /** The transmission was ended since the error is below a pixel. */
+  stoppedBelowPixel = false;
+  private readonly worker = new GeometryWorker();
+  private readonly picks = new Map<number, (hit: Hit | null) => void>();
+  private chosen: number | null = null;
+  private shown: { moment: Moment; level: number } | null = null;
+  private awaited: ((patches: Patches) => void) | null = null;
+  private wanted: number | null = null;
+  private pixels = 0;
+  private asked = 0;
+  private busy = false;
+  private eyeDue = false;
+  private closed = false;
+  private userStopped = false;
+  private triangles: number;
+  private eyeTimer: ReturnType<typeof setTimeout> | undefined;
+  private focusTimer: ReturnType<typeof setTimeout> | undefined;
+  private focused: Region | null = null;
+
+  constructor(
+    readonly source: Source,
+    private readonly stage: Stage,
+    private readonly events: SessionEvents,
+    triangles: number,
+  ) {
+    this.triangles = triangles;
+    this.worker.onmessage = ({ data }: MessageEvent<FromGeometry>) => this.take(data);
+    this.worker.onerror = (event) => events.failed(event.message || "the geometry worker could not be started");
+    this.post({ kind: "most", triangles });
+    source.start({
+      info: (info) => {
+        this.info = info;
+        events.info(info);
+      },
+      moment: (moment) => {
+        this.moments.push(moment);
+        events.moment(moment);
+        this.considerPixels();
+        void this.pump();
+      },
+      progress: (progress) => {
+        this.progress = progress;
+        events.progress(progress);
+      },
+    });
+  }
+
+  /** The moment that is drawn; null: none yet. */
+  get drawnMoment(): Moment | null {
+    return this.shown?.moment ?? null;
+  }
+
+  /** Whether new moments are shown as they come. */
+  get following(): boolean {
+    return this.chosen === null;
+  }
+
+  /** Goes back to a moment, or with null to the latest one and those to come. */
+  show(number: number | null): void {
+    this.chosen = number;
+    void this.pump();
+  }
+
+  /** Colours by another field. */
+  setField(field: Field): void {
+    this.post({ kind: "field", field });
+  }
+
+  /** Draws at most so many triangles. */
+  setTriangles(triangles: number): void {
+    this.triangles = triangles;
+    this.post({ kind: "most", triangles });
+    this.viewChanged();
+  }
+
+  /** The camera has moved or the canvas has another size: soon the worker is told, but not while a picture is blended in. */
+  viewChanged(): void {
+    this.eyeTimer ??= setTimeout(() => {
+      this.eyeTimer = undefined;
+      this.eyeDue = true;
+      if (!this.busy) this.tellEye();
+    }, 120);
+  }
+
+  /** Where a ray meets what is drawn, see `Stage.ray`. */
+  pick(ray: { origin: [number, number, number]; direction: [number, number, number] }): Promise<Hit | null> {
+    this.asked += 1;
+    const id = this.asked;
+    this.post({ kind: "pick", id, ...ray });
+    return new Promise((resolve) => this.picks.set(id, resolve));
+  }
+
+  /** Ends the transmission. */
+  stop(): void {
+    this.userStopped = true;
+    this.stoppedBelowPixel = false;
+    this.source.stop();
+  }
+
+  /** Goes on; what cannot be seen is asked for too. */
+  resume(): void {
+    if (this.stoppedBelowPixel) this.stopsBelowPixel = false;
+    this.userStopped = false;
+    this.stoppedBelowPixel = false;
+    this.source.resume();
+  }
+
+  /** Another target; goes on. */
+  setTarget(target: Target): void {
+    this.userStopped = false;
+    this.stoppedBelowPixel = false;
+    this.source.setTarget(target);
+  }
+
+  /** Ends everything. */
+  close(): void {
+    this.closed = true;
+    clearTimeout(this.eyeTimer);
+    clearTimeout(this.focusTimer);
+    this.source.close();
+    this.worker.terminate();
+    for (const resolve of this.picks.values()) resolve(null);
+  }
+
+  /** Stops below a pixel, or goes on above it. */
+  considerPixels(): void {
+    const last = this.moments.at(-1);
+    if (last === undefined || this.userStopped) return;
+    const below = this.stopsBelowPixel && belowPixel(last, this.pixels);
+    if (below && this.progress.state === "receiving") {
+      this.stoppedBelowPixel = true;
+      this.source.stop();
+    } else if (!below && this.stoppedBelowPixel) {
+      this.stoppedBelowPixel = false;
+      this.source.resume();
+    }
+  }
+
+  private tellEye(): void {
+    if (!this.eyeDue || this.closed || this.shown === null) return;
+    this.eyeDue = false;
+    this.post({ kind: "eye", eye: this.stage.eye() });
+  }
+
+  private post(message: ToGeometry, transfer: Transferable[] = []): void {
+    this.worker.postMessage(message, transfer);
+  }
+
+  /** Draws the moment that is to be seen, at the level that the view needs, if it is not drawn already. */
+  private async pump(): Promise<void> {
+    const { info } = this;
+    const moment =
+      this.chosen === null ? this.moments.at(-1) : this.moments.find(({ number }) => number === this.chosen);
+    if (this.busy || this.closed || info === null || moment === undefined) return;
+    const [width, height] = this.stage.size;
+    const level = Math.min(
+      this.wanted ?? firstLevel(info, width * height),
+      finestDrawn(info, this.triangles),
+      moment.level,
+    );
+    const { shown } = this;
+    if (shown?.moment.number === moment.number && shown.level >= level) return;
+    this.busy = true;
+    try {
+      const grids = await this.source.grids(moment.number, level);
+      if (this.closed) return;
+      const came = new Promise<Patches>((resolve) => {
+        this.awaited = resolve;
+      });
+      const buffers = grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
+        [points, mask, rowsAt, columnsAt, ...attributes.map(({ values }) => values)].flatMap((array) =>
+          array === null ? [] : [array.buffer as ArrayBuffer],
+        ),
+      );
+      const { geographic, heights } = info;
+      const joined = info.joined || info.blocks.length > 1;
+      const diagonal = heights ? 0 : info.extent;
+      const options = { joined, geographic, heights, diagonal, fresh: shown === null };
+      this.post({ kind: "picture", picture: moment.number, level, grids, options }, [...new Set(buffers)]);
+      const patches = await came;
+      if (this.closed) return;
+      this.shown = { moment, level };
+      const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+      const blended = !still && patches.patches.some(({ from }) => from !== null);
+      await new Promise<void>((resolve) => {
+        this.stage.show(patches.patches, true, blended, resolve);
+        this.events.drawn(patches, moment);
+      });
+    } catch (error) {
+      if (!this.closed) this.events.failed(error instanceof Error ? error.message : String(error));
+      return;
+    } finally {
+      this.busy = false;
+    }
+    this.eyeDue ||= this.wanted === null;
+    this.tellEye();
+    void this.pump();
+  }
+
+  private take(message: FromGeometry): void {
+    if (this.closed) return;
+    switch (message.kind) {
+      case "patches":
+        if (message.fresh) {
+          this.awaited?.(message);
+          this.awaited = null;
+        } else if (this.shown !== null) {
+          this.stage.show(message.patches, false, false, () => {});
+          this.events.drawn(message, this.shown.moment);
+        }
+        break;
+      case "wants":
+        this.wanted = message.level;
+        this.pixels = message.pixels;
+        this.considerPixels();
+        this.considerFocus(message.region);
+        void this.pump();
+        break;
+      case "hit":
+        this.picks.get(message.id)?.(message.hit);
+        this.picks.delete(message.id);
+        break;
+      case "failed":
+        this.events.failed(message.detail);
+        break;
+    }
+  }
+
+  /** Asks for what is in the view before the rest, once the view rests and is another than before. */
+  private considerFocus(region: Region | null): void {
+    clearTimeout(this.focusTimer);
+    if (this.focused === region || overlap(this.focused, region) > 0.7) return;
+    this.focusTimer = setTimeout(() => {
+      this.focused = region;
+      this.source.focus(region);
+    }, REST);
+  }
+}
+
+/** Points that two regions share, by the points of both together. */
+function overlap(a: Region | null, b: Region | null): number {
+  if (a === null || b === null) return 0;
+  const size = (of: readonly (readonly [number, number])[]): number =>
+    of.reduce((product, [from, to]) => product * Math.max(0, to - from), 1);
+  const shared = size(
+    [0, 1].map((k) => [Math.max(a[k as 0 | 1][0], b[k as 0 | 1][0]), Math.min(a[k as 0 | 1][1], b[k as 0 | 1][1])]),
+  );
+  return shared / Math.max(size(a) + size(b) - shared, 1);
+}

@@ -1,0 +1,32 @@
+/** What `LodeSource` and its worker say to each other; arrays are transferred, not copied. */
+
+import type { Grid, Moment, NodeValues, Progress, Region, SurfaceInfo, Target } from "./source";
+
+/** A question that has an answer. */
+export type Question =
+  | { readonly kind: "grids"; readonly moment: number; readonly level: number }
+  | {
+      readonly kind: "values";
+      readonly moment: number;
+      readonly block: number;
+      readonly row: number;
+      readonly column: number;
+    };
+
+/** From the page. */
+export type ToSource =
+  | { readonly kind: "open"; readonly url: string; readonly token: string | null }
+  | { readonly kind: "question"; readonly id: number; readonly question: Question }
+  | { readonly kind: "focus"; readonly region: Region | null }
+  | { readonly kind: "target"; readonly target: Target }
+  | { readonly kind: "throttle"; readonly rate: number | null }
+  | { readonly kind: "stop" | "resume" };
+
+/** From the worker. */
+export type FromSource =
+  | { readonly kind: "info"; readonly info: SurfaceInfo }
+  | { readonly kind: "moment"; readonly moment: Moment }
+  | { readonly kind: "progress"; readonly progress: Progress }
+  | { readonly kind: "grids"; readonly id: number; readonly grids: Grid[] }
+  | { readonly kind: "values"; readonly id: number; readonly values: NodeValues }
+  | { readonly kind: "refused"; readonly id: number; readonly detail: string };

@@ -1,0 +1,168 @@
+/**
+ * What the element needs of a surface that comes into focus: its description, the moments of its arrival, and the grids
+ * of any moment. `LodeSource` is one over a stream, HTTP Range or a file; `ArtificialSource` computes one for tests.
+ */
+
+/** Rows and columns, half-open, in indices of the full resolution. */
+export type Region = readonly [readonly [number, number], readonly [number, number]];
+
+/** How far a surface is asked for; of several limits the first that is met ends the transmission. */
+export interface Target {
+  /** Levels up to this one and nothing finer; excludes the other limits. */
+  level?: number;
+  /** An RMS error in the surface's unit. */
+  rms?: number;
+  /** A maximum error in the surface's unit. */
+  max?: number;
+  /** Bytes of the surface. */
+  bytes?: number;
+}
+
+/** One line of the price list: what a layer costs and which error it leaves. */
+export interface Price {
+  /** Bytes from the beginning of the container. */
+  readonly bytes: number;
+  /** Finest level with data. */
+  readonly level: number;
+  readonly rms: number;
+  readonly max: number;
+}
+
+/** One block of a surface: the lengths of its axes, and whether each is followed by its beginning. */
+export interface BlockInfo {
+  readonly shape: readonly [number, number];
+  readonly closed: readonly [boolean, boolean];
+}
+
+/** What is known of a surface before its values. */
+export interface SurfaceInfo {
+  readonly name: string;
+  readonly blocks: readonly BlockInfo[];
+  /** Number of the finest level. */
+  readonly levels: number;
+  /** Range of the heights or diagonal of the bounding box, in the surface's unit. */
+  readonly extent: number;
+  /** Whether the points are heights over x and y that follow rules. */
+  readonly heights: boolean;
+  /** Whether x is east and y north. */
+  readonly georeferenced: boolean;
+  /** Whether x and y are degrees. */
+  readonly geographic: boolean;
+  /** Whether sides of the blocks are joined, so that all of it has to be drawn at one level. */
+  readonly joined: boolean;
+  readonly unit: string;
+  /** Whether the end is exact. */
+  readonly exact: boolean;
+  readonly attributes: readonly string[];
+  /** Bytes of the container. */
+  readonly size: number;
+  /** The price list, or null while it is not known. */
+  readonly prices: readonly Price[] | null;
+}
+
+/** An array beside the points of a grid. */
+export interface AttributeGrid {
+  readonly name: string;
+  /** At least 1. */
+  readonly components: number;
+  /** [row, column, component], in row order; NaN where it has no value. */
+  readonly values: Float64Array;
+}
+
+/** The points of one block at one level. */
+export interface Grid {
+  /** Where the rows stand, in indices of the full resolution; rising. */
+  readonly rowsAt: Float64Array;
+  /** Where the columns stand, likewise. */
+  readonly columnsAt: Float64Array;
+  /** Lengths of the axes at full resolution. */
+  readonly full: readonly [number, number];
+  readonly closed: readonly [boolean, boolean];
+  /** [row, column, xyz] in the surface's unit. */
+  readonly points: Float64Array;
+  /** [row, column], 0 at holes; null: there are none. */
+  readonly mask: Uint8Array | null;
+  readonly attributes: readonly AttributeGrid[];
+}
+
+/** A state of the surface on its way, light enough to be kept for ever. */
+export interface Moment {
+  /** Rises by one from moment to moment. */
+  readonly number: number;
+  /** Finest level with data. */
+  readonly level: number;
+  /** Bytes of the surface that are there. */
+  readonly bytes: number;
+  /** Seconds since the source was opened. */
+  readonly seconds: number;
+  /** Errors at full resolution in the surface's unit; NaN where they are not known. */
+  readonly rms: number;
+  readonly max: number;
+  /** Whether nothing is missing. */
+  readonly complete: boolean;
+}
+
+/** What is known of a node of the full surface. */
+export interface NodeValues {
+  readonly block: number;
+  readonly row: number;
+  readonly column: number;
+  /** Coordinates in the surface's unit. */
+  readonly point: readonly number[];
+  /** Names with the values of their components; NaN where there is none. */
+  readonly attributes: readonly (readonly [string, readonly number[]])[];
+  /** What errors around here do not exceed, or else those of the whole; NaN where they are not known. */
+  readonly rms: number;
+  readonly max: number;
+}
+
+/** How the transmission stands. */
+export interface Progress {
+  readonly state: "connecting" | "receiving" | "waiting" | "resuming" | "stopped" | "target" | "complete" | "failed";
+  /** Bytes received, of layers that are not complete too. */
+  readonly bytes: number;
+  /** Bytes that the target needs; 0 while unknown. */
+  readonly planned: number;
+  /** Bytes per second lately; 0 while unknown. */
+  readonly rate: number;
+  /** A sentence where there is something to say: why it failed, when it tries again. */
+  readonly detail: string;
+  /** A machine's word for a failure, such as `no-token`. */
+  readonly code?: string;
+}
+
+/** What a source tells, as it happens. */
+export interface SourceEvents {
+  /** The description is there, or has become more complete. */
+  info(info: SurfaceInfo): void;
+  moment(moment: Moment): void;
+  progress(progress: Progress): void;
+}
+
+/** A surface on its way. Computes nothing on the thread that uses it. */
+export interface Source {
+  /** Begins; events follow. Called once. */
+  start(events: SourceEvents): void;
+  /**
+   * The grids of all blocks as they were at a moment.
+   *
+   * @param moment - Number of a moment.
+   * @param level - 0 to `levels`.
+   * @throws Error if they cannot be computed, e.g. because the data are damaged.
+   */
+  grids(moment: number, level: number): Promise<Grid[]>;
+  /** The values of a node at full resolution, as they are known at a moment, and the errors that hold there. */
+  valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues>;
+  /** Asks for a region before the rest; null: no longer. Without effect on surfaces of several blocks. */
+  focus(region: Region | null): void;
+  /** Changes the target; goes on if it had ended. */
+  setTarget(target: Target): void;
+  /** Ends the transmission: no more bytes are asked for. */
+  stop(): void;
+  /** Goes on after `stop` or the end of a target. */
+  resume(): void;
+  /** Bytes per second that are asked for at most; null: as fast as it comes. */
+  throttle(rate: number | null): void;
+  /** Frees everything; no event follows. */
+  close(): void;
+}

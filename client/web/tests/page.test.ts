@@ -1,0 +1,69 @@
+import { describe, expect, it } from "vitest";
+import { type ListedSurface, problemOf, Server } from "../src/page/api";
+import { parseConfiguration } from "../src/page/configuration";
+import { matches, nameOf } from "../src/page/names";
+
+const surface: ListedSurface = {
+  id: "5f1c0a9b3d7e42a68c10",
+  url: "/v1/surfaces/5f1c0a9b3d7e42a68c10",
+  name: "Jacksboro",
+  state: "ready",
+  progress: 1,
+  reason: null,
+  created: "2026-01-31T12:00:00.000+00:00",
+  filenames: ["fault_dem.npz"],
+  upload_bytes: 1,
+};
+
+describe("the list", () => {
+  it("is searched by words of names, files and ids", () => {
+    for (const search of ["", "jacks", "DEM jack", "5f1c"]) expect(matches(surface, search)).toBe(true);
+    for (const search of ["jackson", "dem tif"]) expect(matches(surface, search)).toBe(false);
+  });
+
+  it("calls a surface by its name, its files or its id", () => {
+    expect(nameOf(surface)).toBe("Jacksboro");
+    expect(nameOf({ ...surface, name: "" })).toBe("fault_dem.npz");
+    expect(nameOf({ ...surface, name: "", filenames: [""] })).toBe(surface.id);
+  });
+});
+
+describe("the server", () => {
+  it("explains refusals by its problem documents, and those of proxies by their status", () => {
+    const problem = problemOf(401, '{"title": "A token is needed", "code": "no-token", "detail": "none came"}');
+    expect([problem.status, problem.code, problem.message]).toEqual([401, "no-token", "A token is needed: none came"]);
+    expect(problemOf(502, "<html>").code).toBe("http-502");
+  });
+
+  it("stands below any path, and is the only host", () => {
+    const server = new Server("https://host/sub/");
+    expect(server.address("v1/surfaces")).toBe("https://host/sub/v1/surfaces");
+    expect(server.address("/sub/v1/surfaces/1")).toBe("https://host/sub/v1/surfaces/1");
+    expect(() => server.address("https://elsewhere/v1")).toThrow("another host");
+    expect(() => server.address("//elsewhere/v1")).toThrow("another host");
+  });
+});
+
+describe("the configuration of a static host", () => {
+  it("names surfaces", () => {
+    expect(
+      parseConfiguration({
+        surfaces: [
+          { name: "a", src: "a.lode", bytes: 7 },
+          { src: "b.lode", progress: 0.4 },
+        ],
+        live: false,
+      }),
+    ).toEqual([
+      { name: "a", src: "a.lode", bytes: 7, progress: null },
+      { name: "b.lode", src: "b.lode", bytes: null, progress: 0.4 },
+    ]);
+  });
+
+  it.each([null, 3, {}, { surfaces: 3 }, { surfaces: [{}] }, { surfaces: [null] }, { surfaces: [{ src: 5 }] }])(
+    "refuses %j",
+    (value) => {
+      expect(() => parseConfiguration(value)).toThrow(TypeError);
+    },
+  );
+});

@@ -1,0 +1,45 @@
+import { describe, expect, it } from "vitest";
+import { readIndex } from "../src/container";
+import { plan } from "../src/planning/plan";
+import { endOf, type Plan } from "../src/planning/plans";
+import { RangeSet } from "../src/planning/ranges";
+import { makeTarget, type TargetOptions } from "../src/planning/target";
+import { run } from "./python";
+
+interface Case {
+  target: TargetOptions;
+  held: [number, number][];
+  plan?: Plan;
+  error?: string;
+}
+
+const SEED = Number(process.env.SEED ?? Math.floor(Math.random() * 2 ** 30));
+const CONTAINERS = Number(process.env.CONTAINERS ?? 25);
+
+/** What is not a number Python's JSON does not say. */
+function told(made: Plan): unknown {
+  return JSON.parse(JSON.stringify(made));
+}
+
+describe(`plans of random containers, seed ${SEED}`, () => {
+  const lines = run("tests.web.plans", SEED, CONTAINERS).trim().split("\n");
+  const given = lines.map((line) => JSON.parse(line) as { container: string; cases: Case[] });
+
+  it.each(given)("are those of Python", async ({ container, cases }) => {
+    const data = new Uint8Array(Buffer.from(container, "base64"));
+    const index = await readIndex(async (offset, length) => data.subarray(offset, offset + length), data.length);
+    let made = 0;
+    for (const { target, held, plan: expected, error } of cases) {
+      const said = JSON.stringify({ target, held });
+      if (expected === undefined) {
+        expect(() => plan(index, makeTarget(target), new RangeSet(held)), said).toThrow(error?.replaceAll("'", ""));
+        continue;
+      }
+      const found = plan(index, makeTarget(target), new RangeSet(held));
+      expect(told(found), said).toEqual(expected);
+      expect(endOf(found).bytes, said).toBe(endOf(expected).bytes);
+      made += 1;
+    }
+    expect(made).toBeGreaterThan(cases.length / 4);
+  });
+});

@@ -1,0 +1,205 @@
+import { describe, expect, it } from "vitest";
+import { fitted, panned, positionOf, turned, wrapped, zoomed } from "../../src/view/camera";
+import { COLOUR_MAPS, colourAt, rangeOf, stopsOf, textureOf } from "../../src/view/colour-maps";
+import { logScale } from "../../src/view/error-curve";
+import { defaultExaggeration } from "../../src/view/exaggeration";
+import { extremes } from "../../src/view/fields";
+import { formatAt, formatBytes, formatNumber, formatSeconds, roundBelow } from "../../src/view/format";
+import { belowPixel, finestDrawn, firstLevel, pointsAt } from "../../src/view/levels";
+import type { Moment, SurfaceInfo } from "../../src/view/source";
+import { formatView, parseView, type SharedView, withView } from "../../src/view/url-state";
+
+describe("colour maps", () => {
+  it.each(COLOUR_MAPS)("%s begins and ends with its table, and is between its stops in between", (name) => {
+    const stops = stopsOf(name);
+    expect(colourAt(name, 0)).toEqual(stops[0]);
+    expect(colourAt(name, 1)).toEqual(stops.at(-1));
+    expect(colourAt(name, -3)).toEqual(stops[0]);
+    expect(colourAt(name, 7)).toEqual(stops.at(-1));
+    const half = colourAt(name, 0.5 / (stops.length - 1));
+    expect(half).toEqual([0, 1, 2].map((k) => (stops[0]![k]! + stops[1]![k]!) / 2));
+    expect(textureOf(name)).toHaveLength(1024);
+  });
+
+  it("have the range of the values, or one around 0", () => {
+    expect(rangeOf(3, 8, false)).toEqual([3, 8]);
+    expect(rangeOf(-1, 4, true)).toEqual([-4, 4]);
+    expect(rangeOf(10, 10, false)).toEqual([5, 15]);
+    expect(rangeOf(0, 0, true)).toEqual([-1, 1]);
+    expect(rangeOf(Number.NaN, Number.NaN, false)).toEqual([0, 1]);
+  });
+
+  it("a trimmed range leaves single values out", () => {
+    const values = Float64Array.from({ length: 1000 }, (_, k) => (k === 500 ? 1e9 : k));
+    expect(extremes(values, false)).toEqual([0, 1e9]);
+    expect(extremes(values, true)[1]).toBeLessThan(1000);
+    expect(extremes(Float64Array.of(Number.NaN), false)).toEqual([Number.NaN, Number.NaN]);
+  });
+});
+
+describe("the view in the address", () => {
+  const view: SharedView = {
+    camera: { azimuth: -91.3, elevation: 42, distance: 12340, target: [500_013, 4_200_000, 900] },
+    field: { kind: "attribute", name: "wet & dry=?#é", component: 2 },
+    map: "red-blue",
+    range: [-3.5, 1200],
+    exaggeration: 2.5,
+    lines: true,
+  };
+
+  it("comes back as it was", () => {
+    expect(parseView(formatView(view))).toEqual({
+      ...view,
+      camera: { ...view.camera, target: [500_013, 4_200_000, 900] },
+    });
+    for (const kind of ["height", "slope", "change", "none"] as const) {
+      expect(parseView(formatView({ field: { kind } }))).toEqual({ field: { kind } });
+    }
+  });
+
+  it("is short", () => {
+    const camera = {
+      azimuth: -91.34567,
+      elevation: 42.1111,
+      distance: 123.456789,
+      target: [1 / 3, 2 / 3, 1e6 / 3] as const,
+    };
+    expect(formatView({ camera, map: "viridis" }).length).toBeLessThan(70);
+    const back = parseView(formatView({ camera })).camera!;
+    expect(Math.abs(back.target[2] - camera.target[2])).toBeLessThan(camera.distance / 1000);
+  });
+
+  it.each([
+    "v=1,2,3",
+    "v=0,0,-5,0,0,0",
+    "v=0,90,5,0,0,0",
+    "v=a,b,c,d,e,f",
+    "m=nothing",
+    "r=2,1",
+    "x=0",
+    "x=NaN",
+    "c=a:1:%",
+    "&&=&",
+  ])("leaves out what is not valid: %s", (text) => {
+    expect(parseView(text)).toEqual({});
+  });
+
+  it("leaves alone what belongs to the page", () => {
+    expect(withView("#s=ab%20c&v=1,2,3,4,5,6&x=9", { exaggeration: 2 })).toBe("#s=ab%20c&x=2");
+    expect(withView("", { lines: true })).toBe("#l=1");
+  });
+});
+
+describe("the camera", () => {
+  const orbit = { azimuth: 30, elevation: 20, distance: 4, target: [1, 2, 3] as const };
+  const apart = (a: readonly number[], b: readonly number[]): number =>
+    Math.hypot(...a.map((value, k) => value - b[k]!));
+
+  it("keeps its distance when it turns, and never tips over", () => {
+    expect(apart(positionOf(turned(orbit, 77, -13)), orbit.target)).toBeCloseTo(4, 12);
+    expect(turned(orbit, 0, 1000).elevation).toBeLessThan(90);
+    expect(wrapped(540)).toBe(-180);
+    expect(turned(orbit, 720, 0).azimuth).toBeCloseTo(30, 12);
+  });
+
+  it("pans across the line of sight", () => {
+    const moved = panned(orbit, 0.2, -0.1);
+    const sight = positionOf(orbit).map((value, k) => value - orbit.target[k]!);
+    const shift = moved.target.map((value, k) => value - orbit.target[k]!);
+    expect(sight.reduce((sum, value, k) => sum + value * shift[k]!, 0)).toBeCloseTo(0, 10);
+    expect(apart(moved.target, orbit.target)).toBeGreaterThan(0.1);
+  });
+
+  it("zooms towards a place that stays where it is seen", () => {
+    const place = [1.5, 2.2, 3.1] as const;
+    const nearer = zoomed(orbit, 0.5, place);
+    const direction = (of: typeof orbit | typeof nearer) => {
+      const position = positionOf(of);
+      const to = place.map((value, k) => value - position[k]!);
+      return to.map((value) => value / Math.hypot(...to));
+    };
+    expect(apart(direction(orbit), direction(nearer))).toBeLessThan(1e-12);
+  });
+
+  it("sees a whole box, of narrow views too", () => {
+    expect(fitted([1, 1, 1], 0, 0.5, false).distance).toBeCloseTo(2 * fitted([1, 1, 1], 0, 2, false).distance, 12);
+    expect(fitted([0, 0, 1], 1.7, 1, false).distance).toBeGreaterThan(4);
+  });
+});
+
+describe("levels", () => {
+  const info: SurfaceInfo = {
+    name: "",
+    blocks: [{ shape: [4097, 4097], closed: [false, false] }],
+    levels: 12,
+    extent: 1,
+    heights: true,
+    georeferenced: false,
+    geographic: false,
+    joined: false,
+    unit: "",
+    exact: true,
+    attributes: [],
+    size: 0,
+    prices: null,
+  };
+
+  it("the first picture has about as many points as the view has pixels", () => {
+    const level = firstLevel(info, 800 * 600);
+    expect(pointsAt(info, level)).toBeLessThanOrEqual(800 * 600);
+    expect(pointsAt(info, level + 1)).toBeGreaterThan(800 * 600);
+  });
+
+  it("joined blocks are drawn at a level with few enough triangles", () => {
+    const level = finestDrawn({ ...info, joined: true }, 4_000_000);
+    expect(2 * pointsAt(info, level)).toBeLessThanOrEqual(4_000_000);
+    expect(finestDrawn({ ...info, blocks: [{ shape: [9, 9], closed: [true, true] }], joined: true }, 4_000_000)).toBe(
+      12,
+    );
+  });
+
+  it("an error is below a pixel where all of it is, and where it is known", () => {
+    const moment: Moment = { number: 0, level: 3, bytes: 1, seconds: 0, rms: 0.1, max: 0.5, complete: false };
+    expect(belowPixel(moment, 1.9)).toBe(true);
+    expect(belowPixel(moment, 2.1)).toBe(false);
+    expect(belowPixel(moment, 0)).toBe(false);
+    expect(belowPixel({ ...moment, max: Number.NaN }, 0.001)).toBe(false);
+  });
+
+  it("relief is exaggerated by a round number where it could not be seen", () => {
+    expect(defaultExaggeration([1, 0.8, 0.1], true)).toBe(1);
+    expect(defaultExaggeration([1, 0.8, 0.01], true)).toBe(10);
+    expect(defaultExaggeration([1, 0.8, 0.001], false)).toBe(1);
+    expect(defaultExaggeration([1, 1, 0], true)).toBe(1);
+  });
+});
+
+describe("numbers", () => {
+  it("as text", () => {
+    expect([0, 812, 34_100, 999_600, 1_200_000].map(formatBytes)).toEqual([
+      "0 B",
+      "812 B",
+      "34.1 kB",
+      "1.00 MB",
+      "1.20 MB",
+    ]);
+    expect([0, 1.23456, 1234.56, 0.00123456, Number.NaN].map((value) => formatNumber(value))).toEqual([
+      "0",
+      "1.235",
+      "1235",
+      "0.001235",
+      "unknown",
+    ]);
+    expect(formatAt(12.3456, 0.01)).toBe("12.346");
+    expect(formatAt(Number.NaN, 1)).toBe("none");
+    expect([0.424, 12.4, 200].map(formatSeconds)).toEqual(["0.42 s", "12 s", "3 min 20 s"]);
+    expect([0.7, 1, 3, 77].map(roundBelow)).toEqual([0.5, 1, 2, 50]);
+  });
+
+  it("on a logarithmic axis, 0 at its end", () => {
+    const scale = logScale([0, 3, 800], 0, 300);
+    expect([scale.low, scale.high]).toEqual([0, 3]);
+    expect([0, 1, 10, 1000, 1e9].map((value) => Math.round(scale.place(value)))).toEqual([0, 0, 100, 300, 300]);
+    expect(logScale([], 0, 1).high).toBe(1);
+  });
+});

@@ -1,0 +1,1 @@
+"""What the tests of `client/web` ask of the Python library: the same decisions, and servers."""
