@@ -58,9 +58,10 @@ $(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES)
 	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page -- --logLevel warn
 	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
 
+# Not `npm ci`: that refuses where a registry lacks what a package has for another platform. The versions are the lock file's.
 $(WEB)/node_modules/.package-lock.json: $(WEB)/package-lock.json | $(STAMP)
 	@command -v npm > /dev/null || { echo "The page is built with Node 20 or newer, and npm: there is none" >&2; exit 1; }
-	@cd $(WEB) && npm ci --silent --no-audit --no-fund
+	@cd $(WEB) && npm install --no-save --silent --no-audit --no-fund
 
 C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
