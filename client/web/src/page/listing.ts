@@ -133,7 +133,11 @@ export class Listing {
     remove.addEventListener("click", () => void this.remove(surface, name));
     const actions = html("td", { class: "actions" });
     if (surface.state === "waiting" || surface.state === "missing") {
-      const retry = html("button", { type: "button", class: "plain", "aria-label": `Build ${name} again` }, "Retry");
+      const retry = html(
+        "button",
+        { type: "button", class: "plain", "aria-label": `Retry the build of ${name}` },
+        "Retry",
+      );
       retry.addEventListener("click", () => void this.retry(surface));
       actions.append(retry);
     }

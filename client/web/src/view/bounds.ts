@@ -40,6 +40,9 @@ export interface FrameOptions {
   readonly diagonal: number;
 }
 
+/** So many times higher than wide are surfaces of x, y, z whose z has another unit. */
+const OTHER_UNIT = 10;
+
 /** How high relief of an unknown unit is drawn, where 2 is the largest extent of x and y. */
 const FITTED = 0.4;
 
@@ -47,17 +50,18 @@ const FITTED = 0.4;
  * The frame in which what lies in a box is drawn about 2 units large around 0.
 .
  *
- * Heights that range over more than x and y have another unit than these, such as metres over degrees: they are drawn so
- * that the relief can be seen.
+ * Heights that range over more than x and y have another unit than these, such as metres over degrees, and so have z that
+ * range over ten times as much: they are drawn so that the relief can be seen.
  */
 export function frameOf(box: Box, { geographic, heights, diagonal }: FrameOptions): Frame {
   const origin = ([0, 1, 2] as const).map((k) => (box[0][k] + box[1][k]) / 2) as [number, number, number];
   const metres = geographic ? [DEGREE * Math.max(Math.cos((origin[1] * Math.PI) / 180), 0.01), DEGREE, 1] : [1, 1, 1];
-  const sides = [0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!);
-  const across = Math.max(...sides, diagonal / 2) || box[1][2] - box[0][2] || 1;
+  const sides = Math.max(...[0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!));
+  const height = box[1][2] - box[0][2];
+  const fitted = sides > 0 && height > sides * (heights ? 1 : OTHER_UNIT);
+  const across = (fitted ? sides : Math.max(sides, diagonal / 2)) || height || 1;
   const scale = metres.map((unit) => (2 * unit) / across) as [number, number, number];
-  const high = (box[1][2] - box[0][2]) * scale[2];
-  if (heights && high > 2) scale[2] *= FITTED / high;
+  if (fitted) scale[2] *= FITTED / (height * scale[2]);
   return { origin, scale };
 }
 

@@ -17,8 +17,8 @@ export interface Description {
 /** Nothing is known. */
 export const NO_DESCRIPTION: Description = { metadata: {}, prices: null, size: 0 };
 
-/** Bytes at the end of a container that are asked for first: footer, index and metadata of small ones. */
-const TAIL = 16_384;
+/** Bytes at the end of a container that are asked for first, beside a 512th of it: footer, index and metadata of most. */
+const TAIL = 2048;
 /** The largest end that is asked for; larger indexes come with the stream, if at all. */
 const LARGEST_TAIL = 1 << 20;
 
@@ -52,7 +52,7 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
     return { data: new Uint8Array(await answer.arrayBuffer()), size };
   };
   const { size } = await part(0, 1);
-  let first = Math.max(0, size - TAIL);
+  let first = Math.max(0, size - TAIL - Math.ceil(size / 512));
   let { data } = await part(first, size);
   const footer = parseFooter(data.subarray(data.length - FOOTER_LENGTH), size - FOOTER_LENGTH);
   // The metadata stand right before the index and have at most 64 KiB.

@@ -47,7 +47,7 @@ export class Geometry {
   private most = DEFAULT_TRIANGLES;
   private chosen: Strides | null = null;
 
-  /** How coordinates are drawn; the same for all pictures. */
+  /** How coordinates are drawn; the same for all pictures, unless early ones are of quite another size. */
   get frame(): Frame {
     if (this.fixed === null) throw new Error("expected a picture first");
     return this.fixed;
@@ -72,7 +72,8 @@ export class Geometry {
     this.before = !fresh && gridsFit(this.grids, grids) ? this.grids : null;
     this.grids = grids;
     this.joined = joined;
-    this.fixed ??= frameOf(this.box, options);
+    const fitting = frameOf(this.box, options);
+    if (this.fixed === null || isOther(this.fixed, fitting)) this.fixed = fitting;
     this.ends = boundaryNormals(grids, this.fixed);
     const shapes = grids.map(({ rowsAt, columnsAt }) => [rowsAt.length, columnsAt.length] as const);
     this.size = patchSize(shapes.map((shape, k) => quadsOf(shape, grids[k]!.closed)));
@@ -282,6 +283,11 @@ export class Geometry {
     if (ranges.length === 0) return [Number.NaN, Number.NaN];
     return [Math.min(...ranges.map(([low]) => low)), Math.max(...ranges.map(([, high]) => high))];
   }
+}
+
+/** Whether a surface has turned out so much larger or smaller that it has to be drawn anew in another frame. */
+function isOther(before: Frame, now: Frame): boolean {
+  return before.scale.some((scale, k) => now.scale[k]! > 2.5 * scale || now.scale[k]! < 0.4 * scale);
 }
 
 /** Points of the picture before where it has them, else those of now. */

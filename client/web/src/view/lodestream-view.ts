@@ -180,6 +180,8 @@ export class LodestreamView extends HTMLElement {
     this.session?.close();
     this.session = null;
     this.orbit = null;
+    this.home = null;
+    this.frame = null;
     this.latest = null;
     this.notice.textContent = "";
     const { src, stage } = this;
@@ -243,26 +245,11 @@ export class LodestreamView extends HTMLElement {
   private drawn(patches: Patches, moment: Moment): void {
     const { stage, session } = this;
     if (stage === null || session?.info == null) return;
-    const first = this.latest === null;
+    const before = this.latest === null ? null : this.frame;
     this.latest = patches;
-    this.frame = patches.frame;
-    if (first) {
-      const half = ([0, 1, 2] as const).map(
-        (k) => ((patches.box[1][k] - patches.box[0][k]) / 2) * patches.frame.scale[k],
-      ) as [number, number, number];
-      const exaggeration = this.shared.exaggeration ?? defaultExaggeration(half, session.info.heights);
-      const whole = session.info.heights ? 0 : (session.info.extent / 2) * patches.frame.scale[0];
-      stage.setRadius(Math.max(Math.hypot(...half), whole) * 1.5);
-      this.home = fitted(
-        [half[0], half[1], half[2] * exaggeration],
-        whole,
-        stage.size[0] / stage.size[1],
-        session.info.heights,
-      );
-      this.setLook({ ...this.look, exaggeration });
-      this.setOrbit(this.shared.camera === undefined ? this.home : this.toDrawn(this.shared.camera));
-      this.shared = {};
-    }
+    if (before === null || before.scale.some((scale, k) => scale !== patches.frame.scale[k]))
+      this.reframe(patches, session.info);
+    else this.frame = patches.frame;
     this.colour();
     this.canvas.dataset.triangles = String(patches.triangles);
     this.refresh();
@@ -270,6 +257,30 @@ export class LodestreamView extends HTMLElement {
       this.dispatchEvent(
         new CustomEvent("lodestream-drawn", { detail: { moment, level: patches.level, triangles: patches.triangles } }),
       );
+  }
+
+  /** Places the camera: to see all, or where it was if it has been moved. */
+  private reframe({ frame, box }: Patches, info: SurfaceInfo): void {
+    const first = this.frame === null || this.home === null;
+    const kept = this.orbit !== null && this.orbit !== this.home && !first ? this.toSurface(this.orbit) : null;
+    this.frame = frame;
+    const half = ([0, 1, 2] as const).map((k) => ((box[1][k] - box[0][k]) / 2) * frame.scale[k]) as [
+      number,
+      number,
+      number,
+    ];
+    const even = frame.scale[0] === frame.scale[2];
+    const whole = info.heights || !even ? 0 : (info.extent / 2) * frame.scale[0];
+    this.stage?.setRadius(Math.max(Math.hypot(...half), whole) * 1.5);
+    const exaggeration = first
+      ? (this.shared.exaggeration ?? defaultExaggeration(half, info.heights))
+      : this.look.exaggeration;
+    const [width, height] = this.stage?.size ?? [1, 1];
+    this.home = fitted([half[0], half[1], half[2] * exaggeration], whole, width / height, info.heights);
+    this.setLook({ ...this.look, exaggeration });
+    const wanted = kept ?? (first ? this.shared.camera : undefined);
+    this.setOrbit(wanted === undefined ? this.home : this.toDrawn(wanted));
+    if (first) this.shared = {};
   }
 
   private changed(kind: "info" | "moment" | "progress", detail: unknown): void {

@@ -38,10 +38,11 @@ in vec2 line;
 out vec4 colour;
 void main() {
   vec3 normal = normalize(normalInView);
-  if (dot(normal, inView) > 0.0) normal = -normal;
+  // The side that is seen, from the triangle itself: at the brink of a ridge the normal may already point away.
+  if (dot(normal, cross(dFdx(inView), dFdy(inView))) < 0.0) normal = -normal;
   float at = clamp((value - range.x) / (range.y - range.x), 0.0, 1.0);
   vec3 base = plain > 0.5 || value < -1e20 ? blank : texture(map, vec2((at * 255.0 + 0.5) / 256.0, 0.5)).rgb;
-  float lit = 0.36 + 0.76 * max(dot(normal, light), 0.0);
+  float lit = 0.42 + 0.7 * max(dot(normal, light), 0.0);
   vec3 shade = base * lit + 0.05 * pow(max(dot(normal, normalize(light + vec3(0.0, 0.0, 1.0))), 0.0), 24.0);
   if (lines > 0.5) {
     vec2 width = fwidth(line);

@@ -155,7 +155,7 @@ export class Session {
   /** Stops below a pixel, or goes on above it. */
   considerPixels(): void {
     const last = this.moments.at(-1);
-    if (last === undefined || this.userStopped) return;
+    if (last === undefined || last.complete || this.userStopped) return;
     const below = this.stopsBelowPixel && belowPixel(last, this.pixels);
     if (below && this.progress.state === "receiving") {
       this.stoppedBelowPixel = true;
