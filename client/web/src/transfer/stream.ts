@@ -289,6 +289,10 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     if (this.current.phase !== "streaming") this.tell({ phase: "streaming" });
   }
 
+  get portion(): number {
+    return this.link?.portion ?? Number.POSITIVE_INFINITY;
+  }
+
   async pace(size: number): Promise<void> {
     const { link } = this;
     if (link === undefined) return;
