@@ -7,6 +7,15 @@ static int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands,
                            uint8_t *data, int64_t data_count, double *costs, int64_t costs_count, uint16_t *symbols,
                            int64_t symbols_count, int64_t *state, int64_t state_count, int64_t budget);
 
+#include "block_coder.h"
+
+/* A table of bitplanes.c names the functions of both directions: those that write become empty. */
+#define code_block(reads, ...)                                                                                         \
+    do {                                                                                                               \
+        if (reads)                                                                                                     \
+            code_block(true, __VA_ARGS__);                                                                             \
+    } while (0)
+
 #include "bitplanes.c"
 
 /* `size` numbers of known, sign and early; returns how many runs are done. */

@@ -1,31 +1,12 @@
-import { createHash } from "node:crypto";
 import { beforeAll, describe, expect, it } from "vitest";
 import { Decoder } from "../src/decoding";
 import { loadKernels } from "../src/kernels/instance";
-import type { Surface, Values } from "../src/types";
-import { containerOf, EXPECTED, NAMES } from "./golden";
+import { containerOf, digests, EXPECTED, NAMES } from "./golden";
 
 let kernels: WebAssembly.Module;
 beforeAll(async () => {
   kernels = await loadKernels();
 });
-
-function bytesOf(values: Values): Uint8Array {
-  return new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
-}
-
-/** Of each block, the digest of its points (or of z alone) and then its attributes. */
-export function digests(surface: Surface, heights = false): string[] {
-  return surface.blocks.map(({ points, attributes }) => {
-    const hash = createHash("sha256");
-    const size = points.values.BYTES_PER_ELEMENT;
-    const bytes = bytesOf(points.values);
-    if (heights) for (let at = 2 * size; at < bytes.length; at += 3 * size) hash.update(bytes.subarray(at, at + size));
-    else hash.update(bytes);
-    for (const { values } of attributes.values()) hash.update(bytesOf(values));
-    return hash.digest("hex").slice(0, 20);
-  });
-}
 
 describe("golden containers", () => {
   it.each(NAMES)("%s is the same bit for bit at every layer and level", (name) => {

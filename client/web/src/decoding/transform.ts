@@ -66,16 +66,12 @@ export function inverseStep(arena: Arena, plane: Plane, axis: 0 | 1, step: AxisS
 /** One forward step of a line of points; returns nodes, then details. */
 function forwardStep(arena: Arena, points: Int32Array, step: AxisStep, [a, b]: Predictor): Int32Array {
   const { midpoints, run } = step;
-  const room = midpoints + run + 2 * REACH + 5 + 16;
   return arena.scope(() => {
     const table = arena.putI64(extension(step));
     const line = arena.take(4 * points.length);
-    const work = arena.take(4 * room);
+    const work = arena.take(4 * (points.length + 2 * REACH));
     arena.i32(line, points.length).set(points);
-    for (let done = 0; done < run; ) {
-      const result = arena.kernels.forward(line, points.length, midpoints, run, table, a, b, done, work, room);
-      done = accepted(result, "forward");
-    }
+    arena.kernels.forward(line, points.length, midpoints, run, table, a, b, work);
     return arena.i32(line, points.length).slice();
   });
 }

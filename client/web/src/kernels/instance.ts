@@ -63,16 +63,14 @@ export interface KernelExports {
   ): number;
   forward(
     x: number,
-    columns: number,
+    length: number,
     midpoints: number,
     run: number,
     table: number,
     a: number,
     b: number,
-    from: number,
     work: number,
-    workCount: number,
-  ): number;
+  ): void;
   mask(
     rows: number,
     columns: number,
