@@ -155,6 +155,11 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.current = { phase: "idle", transport: this.transport };
   }
 
+  /** The URL of the surface or file; undefined for a file of this machine. */
+  get url(): string | undefined {
+    return this.roads?.url;
+  }
+
   /** What to receive, where to stop, and in which order. */
   get target(): Target {
     return this.reception.target;
