@@ -3,9 +3,10 @@
 import { OptionError } from "./errors";
 import type { Ended } from "./planning/plans";
 import { makeTarget, type TargetOptions } from "./planning/target";
-import { type Channel, LocalChannel, WorkerChannel, type WorkerLike } from "./transfer/channel";
-import type { Description, Kept, Opening, Told } from "./transfer/host";
+import { sourceUrl } from "./transfer/addresses";
+import { type Channel, WorkerChannel, type WorkerLike } from "./transfer/channel";
 import type { Price } from "./transfer/prices";
+import type { Description, Kept, Opening, Told } from "./transfer/questions";
 import type { SocketClass } from "./transfer/socket";
 import type { PlainStreamOptions, Progress, StreamState } from "./transfer/stream";
 import type { Region, Surface, ViewInfo } from "./types";
@@ -233,6 +234,8 @@ export class SurfaceStream implements AsyncIterableIterator<SurfaceView> {
       const { default: StreamWorker } = await import("./transfer/worker?worker&inline");
       return new WorkerChannel(new StreamWorker(), tell);
     }
+    // Apart, so that a page that has workers does not load the decoder twice.
+    const { LocalChannel } = await import("./transfer/local-channel");
     return new LocalChannel(tell, { WebSocket, fetch });
   }
 
@@ -272,7 +275,7 @@ export function connect(
   options: ConnectOptions = {},
 ): SurfaceStream {
   makeTarget(target);
-  const place = source instanceof Blob ? source : new URL(source, globalThis.document?.baseURI).href;
+  const place = source instanceof Blob ? source : sourceUrl(source, globalThis.document?.baseURI);
   const { token, transport, silence, deadline, closeTimeout, limitRate, window, latest, pauses } = options;
   const plain = { token, transport, silence, deadline, closeTimeout, limitRate, window, latest, pauses };
   const { kept, keep = false, maxVertices, onBytes } = options;

@@ -313,7 +313,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
 
   take(receive: () => View[]): void {
     let views: View[];
-    const before = this.reception.wireBytes;
+    const before = this.progress;
     try {
       views = receive();
     } catch (error) {
@@ -324,7 +324,9 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       else this.views.push(...views);
       this.waiting.wake();
     }
-    if (this.reception.wireBytes > before) this.options.onProgress?.(this.progress);
+    const now = this.progress;
+    const moved = (["wireBytes", "received", "planned", "size"] as const).some((key) => now[key] !== before[key]);
+    if (moved) this.options.onProgress?.(now);
   }
 
   async room(): Promise<void> {

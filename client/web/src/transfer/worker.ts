@@ -1,6 +1,7 @@
 /** The worker of a `SurfaceStream`: it receives and decodes, so that the page's thread only moves messages. */
 
-import { type Asked, serveHost } from "./channel";
+import type { Asked } from "./channel";
+import { serveHost } from "./serve-host";
 
 const scope = self as unknown as {
   postMessage(message: unknown, transfer: Transferable[]): void;
