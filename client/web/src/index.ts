@@ -1,6 +1,18 @@
 /** Lodestream in a browser or in Node: containers, their decoding, plans and transfer. */
+export { type ConnectOptions, connect, SurfaceStream, SurfaceView } from "./connect";
 export * from "./container";
 export * from "./decoding";
 export * from "./errors";
 export { loadKernels } from "./kernels/instance";
+export { plan } from "./planning/plan";
+export type { Ended, Mark, Plan } from "./planning/plans";
+export { type Place, RangeSet } from "./planning/ranges";
+export { makeTarget, type TargetOptions, tolerance } from "./planning/target";
+export type { WorkerLike } from "./transfer/channel";
+export type { Price } from "./transfer/prices";
+export type { Description, Kept } from "./transfer/questions";
+export type { Transport } from "./transfer/roads";
+export { serveHost } from "./transfer/serve-host";
+export type { SocketClass } from "./transfer/socket";
+export type { Phase, Progress, StreamState } from "./transfer/stream";
 export * from "./types";

@@ -155,6 +155,11 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.current = { phase: "idle", transport: this.transport };
   }
 
+  /** The URL of the surface or file; undefined for a file of this machine. */
+  get url(): string | undefined {
+    return this.roads?.url;
+  }
+
   /** What to receive, where to stop, and in which order. */
   get target(): Target {
     return this.reception.target;
@@ -289,6 +294,10 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     if (this.current.phase !== "streaming") this.tell({ phase: "streaming" });
   }
 
+  get portion(): number {
+    return this.link?.portion ?? Number.POSITIVE_INFINITY;
+  }
+
   async pace(size: number): Promise<void> {
     const { link } = this;
     if (link === undefined) return;
@@ -304,7 +313,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
 
   take(receive: () => View[]): void {
     let views: View[];
-    const before = this.reception.wireBytes;
+    const before = this.progress;
     try {
       views = receive();
     } catch (error) {
@@ -315,7 +324,9 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       else this.views.push(...views);
       this.waiting.wake();
     }
-    if (this.reception.wireBytes > before) this.options.onProgress?.(this.progress);
+    const now = this.progress;
+    const moved = (["wireBytes", "received", "planned", "size"] as const).some((key) => now[key] !== before[key]);
+    if (moved) this.options.onProgress?.(now);
   }
 
   async room(): Promise<void> {
