@@ -16,15 +16,16 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
 from .requests import api, problems
-from .requests.answers import Answer, Incoming
+from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Flow, Identity, Progress
 from .requests.bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
-from .stream.aio_stream import Stream, connect
+from .stream.aio_stream import Stream
+from .stream.options import ConnectKeywords, ConnectOptions
 
 __all__ = [
     "Stream",
@@ -40,6 +41,15 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+
+def connect(url: str, **options: Unpack[ConnectKeywords]) -> Stream:
+    """Receive a surface; to be entered with ``async with``.
+
+    Parameters and errors are those of `lodestream_client.sync.connect`. The connection is opened, and errors of the
+    server are raised, on entering.
+    """
+    return Stream(url, ConnectOptions(**options))
 
 
 async def upload(
@@ -146,10 +156,10 @@ async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
                 async with client.stream(content=content, **api.request_options(step, url, token)) as response:
-                    incoming = Incoming(response, step.most, step.url, url, token)
+                    incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
-                        async for piece in response.aiter_raw():
-                            if not incoming.take(piece):
+                        async for chunk in response.aiter_raw():
+                            if not incoming.take(chunk):
                                 break
                 answer = incoming.answer()
             except httpx.HTTPError as error:

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
 from .requests import api, problems
-from .requests.answers import Answer, Incoming
+from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Flow, Identity, Progress
 from .requests.bodies import Asked, Closure, Source, opened, prepared
-from .stream.sync_stream import Stream, connect
+from .stream.options import ConnectKeywords, ConnectOptions
+from .stream.sync_stream import Stream
 
 __all__ = [
     "Stream",
@@ -39,6 +40,64 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+
+def connect(url: str, **options: Unpack[ConnectKeywords]) -> Stream:
+    """Receive a surface.
+
+    If the connection breaks, the stream reconnects by itself; data that have arrived are not sent again.
+
+    Parameters
+    ----------
+    url : str
+        URL of the surface, ``http(s)://HOST/v1/surfaces/ID``, or of a container file on any web server.
+    **options
+        The following, by keyword; see `ConnectOptions`.
+    target : Target or None
+        What to receive, where to stop, and in which order; None: the whole surface.
+    token : str or None
+        Token, if the server needs one.
+    transport : "auto", "ws" or "http", default "auto"
+        WebSocket, or HTTP Range requests; ``auto``: WebSocket, or HTTP Range if WebSockets do not get through.
+    silence : float, default 30
+        Seconds without data after which a connection counts as lost. If it is not replaced, `SilenceError` is raised.
+    deadline : float, default 60
+        Seconds without data for which the client tries to reconnect before it raises the error; 0: never reconnect.
+    close_timeout : float, default 5
+        Seconds that closing may take.
+    limit_rate : float or None
+        Receive at most so many bytes a second.
+    window : int or None
+        Bytes that may be in flight, and that may still arrive after `Stream.stop`. None: as `limit_rate` needs, or as
+        measured.
+    store : Store or None
+        Storage for received data; data that it has are not requested.
+    container, size : str or None, int or None
+        SHA-256 and size of the container whose data the store has.
+    progress : callable or None
+        Called as ``progress(received, planned)`` with bytes of the surface, whenever data arrive; ``planned`` is None
+        until it is known.
+    sink : callable or None
+        Called as ``sink(offset, data)`` with new bytes of the container as they arrive, before they are decoded;
+        `Stream.identity` identifies the container.
+    max_vertices : int or None
+        Limit on the memory of the surface, checked with its header before memory is allocated: 128 bytes for each
+        vertex, plus 16 MiB. None: what fits the memory available to this process.
+
+    Returns
+    -------
+    Stream
+
+    Raises
+    ------
+    UnreachableError
+        If there is no connection.
+    NotFoundError, RemoteError, RemoteProtocolError
+        If the server refuses, or is not a Lodestream server.
+    TooLargeError
+        If the surface needs more memory than allowed.
+    """
+    return Stream(url, ConnectOptions(**options))
 
 
 def upload(
@@ -189,10 +248,10 @@ def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOU
             content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
             try:
                 with client.stream(content=content, **api.request_options(step, url, token)) as response:
-                    incoming = Incoming(response, step.most, step.url, url, token)
+                    incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
-                        for piece in response.iter_raw():
-                            if not incoming.take(piece):
+                        for chunk in response.iter_raw():
+                            if not incoming.take(chunk):
                                 break
                 answer = incoming.answer()
             except httpx.HTTPError as error:

@@ -18,9 +18,9 @@ from . import addresses
 if TYPE_CHECKING:
     import httpx
 
-__all__ = ["LONGEST_ANSWER", "LONGEST_PROBLEM", "Answer", "Incoming", "check_figures", "parse", "withheld"]
+__all__ = ["LONGEST_ANSWER", "LONGEST_PROBLEM", "Answer", "Head", "Incoming", "check_figures", "parse", "withheld"]
 
-#: The most bytes of an answer that are read, where it is no part of a container; and of one that says what is wrong.
+#: The most bytes of an answer that are read, where it is not data of a container; and of one that says what is wrong.
 LONGEST_ANSWER = 16 * 1024 * 1024
 LONGEST_PROBLEM = 64 * 1024
 
@@ -53,13 +53,37 @@ class Answer:
     withheld: str = ""
 
 
+@dataclass(frozen=True)
+class Head:
+    """An answer up to its body.
+
+    Attributes
+    ----------
+    status, reason : int, str
+        The status line.
+    headers : mapping
+        By names in lower case.
+    url : str
+        The URL that answered, to which redirects may have led.
+    """
+
+    status: int
+    reason: str
+    headers: Mapping[str, str] = field(repr=False)
+    url: str
+
+    @classmethod
+    def of(cls, response: httpx.Response) -> Head:
+        """The head of an answer of httpx."""
+        return cls(response.status_code, response.reason_phrase, dict(response.headers), str(response.url))
+
+
 class Incoming:
     """An answer whose body has not been read yet.
 
     Parameters
     ----------
-    response : httpx.Response
-        Read as far as its headers.
+    head : Head
     most : int
         Most bytes of a body, unless it is a problem document.
     asked, given : str
@@ -73,22 +97,28 @@ class Incoming:
         If the body is encoded, or longer than `most`.
     """
 
-    def __init__(self, response: httpx.Response, most: int, asked: str, given: str, token: str | None) -> None:
-        self._response = response
+    def __init__(self, head: Head, most: int, asked: str, given: str, token: str | None) -> None:
+        self._head = head
         self._asked = asked
-        self._fine = 200 <= response.status_code < 300
+        self._fine = 200 <= head.status < 300
         self._most = most if self._fine else LONGEST_PROBLEM
-        self._withheld = withheld(token, given, asked, str(response.url))
+        self._withheld = withheld(token, given, asked, head.url)
         self._body = bytearray()
-        coding = str(response.headers.get("content-encoding", "identity"))
+        coding = head.headers.get("content-encoding", "identity")
         self._read = coding == "identity"
         if self._fine and not self._read:
             raise RemoteProtocolError(f"expected an unencoded answer of {asked}, got one encoded with {coding}")
 
-    def take(self, piece: bytes) -> bool:
-        """Take a piece of the body; returns whether more is needed."""
+    def take(self, chunk: bytes) -> bool:
+        """Take a chunk of the body; returns whether more is needed.
+
+        Raises
+        ------
+        RemoteProtocolError
+            If the body is longer than allowed.
+        """
         if self._read:
-            self._body += piece
+            self._body += chunk
         if len(self._body) <= self._most:
             return self._read
         if self._fine:
@@ -98,9 +128,8 @@ class Incoming:
 
     def answer(self) -> Answer:
         """The complete answer."""
-        response = self._response
-        headers = dict(response.headers)
-        return Answer(response.status_code, response.reason_phrase, headers, bytes(self._body), self._withheld)
+        head = self._head
+        return Answer(head.status, head.reason, head.headers, bytes(self._body), self._withheld)
 
 
 def withheld(token: str | None, given: str, asked: str, landed: str) -> str:

@@ -149,9 +149,7 @@ class Description:
         return self.state == "ready"
 
 
-def client_options(
-    url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False, home: Callable[[], str] | None = None
-) -> dict[str, Any]:
+def client_options(url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False) -> dict[str, Any]:
     """Arguments for an httpx client of the server at `url`.
 
     Parameters
@@ -161,13 +159,11 @@ def client_options(
         Seconds for each step.
     asynchronous : bool
         Whether it is an asyncio client.
-    home : callable, optional
-        Returns the URL whose origin may receive the token, if that is not always `url`.
     """
 
     def guard(request: httpx.Request) -> None:
         # httpx itself lets a token go on from a host's port 80 to its port 443; here an origin is an origin.
-        if not addresses.same_origin(str(request.url), home() if home is not None else url):
+        if not addresses.same_origin(str(request.url), url):
             request.headers.pop("Authorization", None)
 
     async def guard_later(request: httpx.Request) -> None:

@@ -23,9 +23,11 @@ from lodestream.protocol.handshake import from_address
 from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Event, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
-from lodestream_client import aio, sync
-from lodestream_client.stream import transport
+from lodestream_client import sync
+from lodestream_client.stream import effects, transport
+from lodestream_client.stream.aio_io import AsyncIO
 from lodestream_client.stream.stream import BaseStream
+from lodestream_client.stream.sync_io import SyncIO
 from tests.links import Fault, Link, linked
 
 Terrain = NDArray[np.float32]
@@ -54,20 +56,20 @@ class Dialled:
 def dialled(monkeypatch: pytest.MonkeyPatch) -> list[Dialled]:
     """All handshakes of a test's streams."""
     found: list[Dialled] = []
-    plain, other = sync.Stream._dial, aio.Stream._dial
+    plain, other = SyncIO._dial, AsyncIO._dial
 
-    def note(url: str, subprotocol: str | None) -> str | None:
-        found.append(Dialled(opening_of(url), subprotocol))
-        return subprotocol
+    def note(asked: effects.Dial, answer: effects.Dialled) -> effects.Dialled:
+        found.append(Dialled(opening_of(asked.url), answer.subprotocol))
+        return answer
 
-    def dial(self: sync.Stream, url: str) -> str | None:
-        return note(url, plain(self, url))
+    def dial(self: SyncIO, asked: effects.Dial) -> effects.Dialled:
+        return note(asked, plain(self, asked))
 
-    async def dial_later(self: aio.Stream, url: str) -> str | None:
-        return note(url, await other(self, url))
+    async def dial_later(self: AsyncIO, asked: effects.Dial) -> effects.Dialled:
+        return note(asked, await other(self, asked))
 
-    monkeypatch.setattr(sync.Stream, "_dial", dial)
-    monkeypatch.setattr(aio.Stream, "_dial", dial_later)
+    monkeypatch.setattr(SyncIO, "_dial", dial)
+    monkeypatch.setattr(AsyncIO, "_dial", dial_later)
     return found
 
 

@@ -185,6 +185,27 @@ def test_a_cancelled_stream_closes_its_connection(surface: str) -> None:
     assert stream.ended == "stopped"
 
 
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_an_iteration_that_is_cancelled_may_be_continued(surface: str, terrain: Terrain, transport: Any) -> None:
+    async def impatient() -> tuple[list[ls.View], client.Stream, int]:
+        views, cancelled = [], 0
+        async with client.connect(surface, transport=transport, window=1024, limit_rate=100_000.0) as stream:
+            while stream.ended is None:
+                try:
+                    async with asyncio.timeout(0.02):
+                        views.append(await anext(stream))
+                except TimeoutError:
+                    cancelled += 1
+                except StopAsyncIteration:
+                    break
+        return views, stream, cancelled
+
+    views, stream, cancelled = asyncio.run(impatient())
+    assert cancelled > 0
+    assert stream.ended == "complete"
+    assert np.array_equal(views[-1].points, terrain)
+
+
 def test_upload_tells_progress_and_list_and_delete_follow(server: str, terrain_file: Path) -> None:
     stages: list[tuple[str, float]] = []
     surface = sync.upload(

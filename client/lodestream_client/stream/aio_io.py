@@ -1,0 +1,132 @@
+"""Carries out the effects of a `Core`, and awaits them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, assert_never
+
+from ..requests import api
+from ..requests.answers import Head
+from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .websocket_options import socket_options
+
+if TYPE_CHECKING:
+    import httpx
+    from websockets.asyncio.client import ClientConnection
+
+    from .session import Session
+
+__all__ = ["AsyncIO"]
+
+
+class AsyncIO:
+    """One WebSocket or one answer over HTTP at a time.
+
+    Parameters
+    ----------
+    session : Session
+        Whose messages are sent.
+
+    Attributes
+    ----------
+    wake : Event
+        Ends a `Wait` when it is set.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.wake = asyncio.Event()
+        self._session = session
+        self._socket: ClientConnection | None = None
+        self._client: httpx.AsyncClient | None = None
+        self._response: httpx.Response | None = None
+        self._body: AsyncIterator[bytes] | None = None
+
+    async def perform(self, effect: Effect) -> Any:
+        """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
+        match effect:
+            case Dial():
+                return await self._dial(effect)
+            case Hear(until):
+                return await self._hear(self._left(until))
+            case Send():
+                return await self.send()
+            case Get():
+                return await self._get(effect)
+            case Read():
+                assert self._body is not None, "a body is read of an open answer"
+                return await anext(self._body, b"")
+            case Wait(until):
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(self._left(until)):
+                        await self.wake.wait()
+            case HangUp():
+                await self.hang_up(effect)
+            case _:
+                assert_never(effect)
+        return None
+
+    def _left(self, until: float) -> float:
+        return max(until - self._session.clock(), 0.0)
+
+    async def _dial(self, dial: Dial) -> Dialled:
+        from websockets.asyncio.client import ClientConnection, connect
+        from websockets.exceptions import WebSocketException
+
+        landed = [dial.url]
+        try:
+            # Awaited, not iterated: whether and when a connection is tried again is decided in one place.
+            self._socket = await connect(dial.url, **socket_options(dial, ClientConnection, landed))
+        except (OSError, WebSocketException) as error:
+            raise DialError(landed[-1]) from error
+        return Dialled(self._socket.subprotocol, landed[-1])
+
+    async def _hear(self, seconds: float) -> bytes | None:
+        assert self._socket is not None, "a message is expected of an open connection"
+        try:
+            async with asyncio.timeout(seconds):
+                return await self._socket.recv(decode=False)
+        except TimeoutError:
+            return None
+
+    async def send(self) -> None:
+        """Carry out `Send`."""
+        from websockets.exceptions import ConnectionClosed
+
+        for message in self._session.messages():
+            with suppress(ConnectionClosed):
+                if self._socket is not None:
+                    await self._socket.send(message)
+
+    async def _get(self, get: Get) -> Head:
+        import httpx
+
+        await self.hang_up(HangUp())
+        if self._client is None:
+            self._client = httpx.AsyncClient(**api.client_options(self._session.url, asynchronous=True))
+        request = self._client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
+        self._response = await self._client.send(request, stream=True)
+        self._body = self._response.aiter_raw()
+        return Head.of(self._response)
+
+    async def hang_up(self, how: HangUp) -> None:
+        """Carry out `HangUp`."""
+        if self._socket is not None and how.abort:
+            self._socket.transport.abort()
+        elif self._socket is not None and how.wait:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(how.wait):
+                    await self._socket.wait_closed()
+        socket, self._socket = self._socket, None
+        response, self._response, self._body = self._response, None, None
+        if socket is not None:
+            await socket.close()
+        if response is not None:
+            await response.aclose()
+
+    async def close(self) -> None:
+        """Close everything, for good."""
+        await self.hang_up(HangUp())
+        if self._client is not None:
+            await self._client.aclose()

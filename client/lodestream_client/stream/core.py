@@ -1,0 +1,119 @@
+"""The core of a stream: decides what to do next, and does nothing itself.
+
+`Core.effect` is what is to be done now. Whoever has done it says so by `Core.done` or `Core.failed`, and looks again.
+All of the policy is here and below: transports, reconnecting, deadlines, pacing, stopping and closing.
+"""
+
+from __future__ import annotations
+
+from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError
+
+from . import over_http, over_websocket
+from .effects import Effect, Flow, HangUp, Wait
+from .session import Session
+
+__all__ = ["Core"]
+
+
+class Core:
+    """A stream as a sequence of effects.
+
+    An effect that was interrupted, for example because a task was cancelled, remains the next one and is carried out
+    again.
+
+    Parameters
+    ----------
+    session : Session
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._flow = self._travel()
+        self._effect: Effect | None = None
+        self._begun = False
+
+    @property
+    def met(self) -> bool:
+        """Whether the server has answered as expected."""
+        return self.session.transports.met
+
+    @property
+    def effect(self) -> Effect | None:
+        """What is to be done next; None if the stream is over. The first look begins the stream.
+
+        Raises
+        ------
+        LodestreamError
+            At the first look, as `done`.
+        """
+        if not self._begun:
+            self._begun = True
+            self.done(None)
+        return self._effect
+
+    def done(self, result: object) -> None:
+        """Declare that the effect has been carried out.
+
+        Parameters
+        ----------
+        result : object
+            What the class of the effect documents.
+
+        Raises
+        ------
+        LodestreamError
+            If the stream ends with an error; there is no further effect then.
+        """
+        self._effect = None
+        try:
+            self._effect = self._flow.send(result)
+        except StopIteration:
+            return
+
+    def failed(self, error: Exception) -> None:
+        """Declare that the effect could not be carried out.
+
+        Parameters
+        ----------
+        error : Exception
+            The error of the library; those that the class of the effect does not document are raised again.
+
+        Raises
+        ------
+        LodestreamError
+            If the stream ends with an error; there is no further effect then.
+        """
+        self._effect = None
+        try:
+            self._effect = self._flow.throw(error)
+        except StopIteration:
+            return
+
+    def _travel(self) -> Flow[None]:
+        """Receive over one connection after the other, until the target is met or the deadline is over."""
+        session = self.session
+        session.transports.start(session.clock())
+        while True:
+            before, session.withheld = session.reception.cached.total, ""
+            try:
+                if session.transports.transport == "ws":
+                    yield from over_websocket.receive(session)
+                else:
+                    yield from over_http.receive(session)
+                return
+            except LodestreamError as error:
+                if isinstance(error, RemoteError | InputError | NotFoundError):
+                    error.args = (f"{error}{session.withheld}", *error.args[1:])
+                yield HangUp(abort=True)
+                if session.over():
+                    return
+                progressed = session.reception.cached.total > before
+                try:
+                    pause = session.transports.failed(error, session.clock(), progressed=progressed)
+                except LodestreamError:
+                    session.truncate()
+                    raise
+            left = session.reception.tick(session.clock())
+            yield Wait(session.clock() + (pause if left is None else min(pause, left)))
+            if session.over():
+                return

@@ -1,0 +1,57 @@
+"""The options of `connect`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias, TypedDict
+
+from lodestream.target import Target
+from lodestream.transfer.receiver_state import Sink, Store
+
+from .transport import Transport
+
+__all__ = ["ConnectKeywords", "ConnectOptions", "Received"]
+
+#: Called as ``progress(received, planned)`` with bytes of the surface, whenever some have come; ``planned`` is None
+#: until it is known.
+Received: TypeAlias = Callable[[int, "int | None"], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConnectOptions:
+    """The options of `connect`, where they are described, with their defaults."""
+
+    target: Target | None = None
+    token: str | None = None
+    transport: Transport = "auto"
+    silence: float = 30.0
+    deadline: float = 60.0
+    close_timeout: float = 5.0
+    limit_rate: float | None = None
+    window: int | None = None
+    store: Store | None = None
+    container: str | None = None
+    size: int | None = None
+    progress: Received | None = None
+    sink: Sink | None = None
+    max_vertices: int | None = None
+
+
+class ConnectKeywords(TypedDict, total=False):
+    """The same as keywords, so that type checkers know those of `connect`."""
+
+    target: Target | None
+    token: str | None
+    transport: Transport
+    silence: float
+    deadline: float
+    close_timeout: float
+    limit_rate: float | None
+    window: int | None
+    store: Store | None
+    container: str | None
+    size: int | None
+    progress: Received | None
+    sink: Sink | None
+    max_vertices: int | None

@@ -1,0 +1,138 @@
+"""Receiving by HTTP Range requests, until the stream ends or a request fails."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from lodestream.errors import LodestreamError, TruncatedStreamError
+from lodestream.protocol.messages import MIN_WINDOW
+from lodestream.transfer.range_download import RangeDownload
+
+from ..errors import SilenceError
+from ..requests import addresses, problems
+from ..requests.answers import LONGEST_PROBLEM, Head, Incoming
+from .effects import Flow, Get, HangUp, Read
+
+if TYPE_CHECKING:
+    from lodestream.transfer.range_download import RangeRequest
+    from lodestream.transfer.receiver_state import DownloadEvent
+
+    from .session import Session
+
+__all__ = ["receive"]
+
+# Statuses of answers that say something of the file asked for; with others, the body says what is wrong.
+_OF_THE_FILE = {200, 206, 416}
+
+
+def receive(session: Session) -> Flow[None]:
+    """Request what is missing, one range after the other.
+
+    Raises
+    ------
+    UnreachableError, SilenceError, TruncatedStreamError
+        If there is no connection, nothing comes for too long, or an answer breaks off.
+    LodestreamError
+        What the server refuses, or what is wrong with what it sent.
+    """
+    if session.ranges is None:
+        session.ranges = RangeDownload(session.reception)
+    download, url = session.ranges, addresses.container_url(session.url)
+    while True:
+        # First: what was asked to stop has stopped, even if all that there is has come.
+        left = _tick(session, download)
+        if session.ended is not None:
+            break
+        turns = session.turns
+        request = _next_request(session, download)
+        if request is None:
+            break
+        try:
+            head = yield from _answered(session, Get(url, request.headers, session.patience(left)))
+            url = head.url
+            download.answer(head.status, head.headers, session.clock())
+            session.transports.met = True
+            yield from _body(session, download, turns)
+        except SilenceError:
+            _tick(session, download)
+            if session.ended is None:
+                raise
+        if session.ended is not None:
+            break
+        if _elsewhere(session, download, turns):
+            download.leave()
+            yield HangUp()
+        else:
+            download.finish(session.clock())
+    yield HangUp()
+
+
+def _answered(session: Session, request: Get) -> Flow[Head]:
+    """The head of an answer that is about the file; any other is raised."""
+    import httpx
+
+    headers = {**request.headers, **session.authorization(request.url)}
+    try:
+        head: Head = yield Get(request.url, headers, request.seconds)
+        session.landed(request.url, head.url)
+        session.connections += head.status in _OF_THE_FILE
+        if head.status in _OF_THE_FILE:
+            return head
+        incoming = Incoming(head, LONGEST_PROBLEM, request.url, session.url, None)
+        while (chunk := (yield Read())) and incoming.take(chunk):
+            pass
+    except httpx.HTTPError as error:
+        raise problems.from_connection(error, session.url) from error
+    answer = incoming.answer()
+    failure: LodestreamError = problems.from_response(answer.status, answer.reason, answer.content, head.url)
+    raise failure
+
+
+def _body(session: Session, download: RangeDownload, turns: int) -> Flow[None]:
+    """Read an answer to its end, or until the stream ends or something else comes first."""
+    while chunk := (yield from _chunk(session)):
+        yield from session.pace(len(chunk))
+        session.take(partial(download.receive, chunk))
+        _tick(session, download)
+        if session.ended is not None or _elsewhere(session, download, turns):
+            return
+
+
+def _chunk(session: Session) -> Flow[bytes]:
+    import httpx
+
+    try:
+        chunk: bytes = yield Read()
+    except httpx.TimeoutException as error:
+        raise session.silent() from error
+    except httpx.HTTPError as error:
+        raise TruncatedStreamError(f"expected the rest of an answer of {session.url}, got none: {error}") from error
+    return chunk
+
+
+def _elsewhere(session: Session, download: RangeDownload, turns: int) -> bool:
+    """Whether another region comes first by now, and too much of this answer is left to wait for its end."""
+    return session.turns != turns and download.left > MIN_WINDOW
+
+
+def _next_request(session: Session, download: RangeDownload) -> RangeRequest | None:
+    made: list[RangeRequest | None] = []
+
+    def ask() -> list[DownloadEvent]:
+        request, events = download.request(session.clock())
+        made.append(request)
+        return events
+
+    session.take(ask)
+    return made[0]
+
+
+def _tick(session: Session, download: RangeDownload) -> float | None:
+    with session.lock:
+        left = session.reception.tick(session.clock())
+        if session.stopped:
+            download.stop()
+        elif left == 0:
+            download.stop("seconds")
+        return left

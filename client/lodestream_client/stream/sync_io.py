@@ -1,0 +1,132 @@
+"""Carries out the effects of a `Core`, and blocks meanwhile."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, Any, assert_never
+
+from ..requests import api
+from ..requests.answers import Head
+from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .websocket_options import socket_options
+
+if TYPE_CHECKING:
+    import httpx
+    from websockets.sync.client import ClientConnection
+
+    from .session import Session
+
+__all__ = ["SyncIO"]
+
+
+class SyncIO:
+    """One WebSocket or one answer over HTTP at a time.
+
+    Parameters
+    ----------
+    session : Session
+        Whose messages are sent.
+
+    Attributes
+    ----------
+    wake : Event
+        Ends a `Wait` when it is set.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.wake = threading.Event()
+        self._session = session
+        self._opened = ExitStack()  # closes the WebSocket or the answer that is open
+        self._socket: ClientConnection | None = None
+        self._client: httpx.Client | None = None
+        self._body: Iterator[bytes] = iter(())
+
+    def perform(self, effect: Effect) -> Any:
+        """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
+        match effect:
+            case Dial():
+                return self._dial(effect)
+            case Hear(until):
+                return self._hear(self._left(until))
+            case Send():
+                return self.send()
+            case Get():
+                return self._get(effect)
+            case Read():
+                return next(self._body, b"")
+            case Wait(until):
+                self.wake.wait(self._left(until))
+            case HangUp():
+                self.hang_up(effect)
+            case _:
+                assert_never(effect)
+        return None
+
+    def _left(self, until: float) -> float:
+        return max(until - self._session.clock(), 0.0)
+
+    def _dial(self, dial: Dial) -> Dialled:
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import ClientConnection, connect
+
+        landed = [dial.url]
+        # As a context manager, which is how connections of websockets want to be held; its closing is what ours does.
+        try:
+            opening = connect(dial.url, **socket_options(dial, ClientConnection, landed))
+            self._socket = self._opened.enter_context(opening)
+        except (OSError, WebSocketException) as error:
+            raise DialError(landed[-1]) from error
+        return Dialled(self._socket.subprotocol, landed[-1])
+
+    def _hear(self, seconds: float) -> bytes | None:
+        assert self._socket is not None, "a message is expected of an open connection"
+        try:
+            return self._socket.recv(seconds, decode=False)
+        except TimeoutError:
+            return None
+
+    def send(self) -> None:
+        """Carry out `Send`."""
+        from websockets.exceptions import ConnectionClosed
+
+        with self._session.lock:
+            for message in self._session.messages():
+                with suppress(ConnectionClosed):
+                    if self._socket is not None:
+                        self._socket.send(message)
+
+    def _get(self, get: Get) -> Head:
+        import httpx
+
+        self.hang_up(HangUp())
+        if self._client is None:
+            self._client = httpx.Client(**api.client_options(self._session.url))
+        answer = self._opened.enter_context(
+            self._client.stream("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
+        )
+        self._body = answer.iter_raw()
+        return Head.of(answer)
+
+    def hang_up(self, how: HangUp) -> None:
+        """Carry out `HangUp`."""
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            if self._socket is not None and how.abort:
+                with suppress(OSError):
+                    self._socket.socket.shutdown(socket.SHUT_RDWR)
+            elif self._socket is not None and how.wait:
+                with suppress(TimeoutError, ConnectionClosed):
+                    self._socket.recv(how.wait, decode=False)
+        finally:
+            self._socket, self._body = None, iter(())
+            self._opened.close()
+
+    def close(self, how: HangUp) -> None:
+        """Close everything, for good."""
+        self.hang_up(how)
+        if self._client is not None:
+            self._client.close()
