@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import OptionError
+from lodestream.quality import Quality
 from lodestream.target import Region, Target, Tolerance
 
 from ..requests import addresses
@@ -37,7 +38,7 @@ __all__ = [
     "parse_source",
     "parse_surface",
     "parse_tolerance",
-    "precisions",
+    "quality_of",
     "surface_options",
     "target_of",
     "token_of",
@@ -130,12 +131,10 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     return checked
 
 
-def _precision(text: str) -> tuple[str | None, Tolerance]:
-    # A name may hold an equals sign, a tolerance does not.
-    name, equals, tolerance = text.rpartition("=")
-    if equals and not name:
+def _precision(text: str) -> str:
+    if "" in Quality.parse([text]).attributes:
         raise OptionError(f"expected P or NAME=P, got {text!r}")
-    return name or None, Tolerance.parse(tolerance)
+    return text
 
 
 parse_tolerance = _checked(Tolerance.parse)
@@ -257,20 +256,16 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
     return options
 
 
-def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
-    """The precision of the points, and those of attributes by name.
+def quality_of(args: argparse.Namespace) -> Quality:
+    """The quality that ``--precision`` and ``--rms`` ask for.
 
-    Ends the program if one is given twice, or one of the points together with ``--rms``.
+    Ends the program if a precision is given twice, or one of the points together with ``--rms``.
     """
-    found: dict[str | None, Tolerance] = {}
-    for name, tolerance in args.precisions:
-        if name in found:
-            args.parser.error(f"argument --precision: {'P' if name is None else name} given twice")
-        found[name] = tolerance
-    points = found.pop(None, None)
-    if points is not None and args.rms is not None:
-        args.parser.error("argument --rms: not allowed with a --precision of the points")
-    return points, {str(name): tolerance for name, tolerance in found.items()}
+    try:
+        return Quality.parse(args.precisions, None if args.rms is None else str(args.rms))
+    except OptionError as error:
+        args.parser.error(f"argument --precision: {error}")
+        raise  # not reached: the parser has ended the program
 
 
 def _region(text: str) -> Region:

@@ -13,7 +13,7 @@ from lodestream.errors import OptionError
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
-from .arguments import Subparsers, add_command, add_json_option, add_surface_options, precisions, surface_options
+from .arguments import Subparsers, add_command, add_json_option, add_surface_options, quality_of, surface_options
 from .inputs import input_files
 
 __all__ = ["register", "run"]
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     require("encoding")
     options = surface_options(args)
-    precision, attribute_precision = precisions(args)
+    quality = quality_of(args)
     if args.out != "-":
         require_folder(Path(args.out))
 
@@ -61,9 +61,7 @@ def run(args: argparse.Namespace) -> int:
         task = progress.add_task("encoding", total=1.0, figures="")
         container = ls.encode(
             surface,
-            precision,
-            rms=args.rms,
-            attribute_precision=attribute_precision,
+            quality=quality,
             progress=lambda fraction: progress.update(task, completed=fraction),
         )
     if args.out == "-":

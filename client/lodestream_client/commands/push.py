@@ -15,7 +15,7 @@ from .arguments import (
     add_surface_options,
     add_token_option,
     parse_server,
-    precisions,
+    quality_of,
     surface_options,
     token_of,
 )
@@ -49,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Upload, wait, print the address."""
     options = surface_options(args)
-    precision, attribute_precision = precisions(args)
+    quality = quality_of(args)
 
     from .. import sync
 
@@ -68,9 +68,9 @@ def run(args: argparse.Namespace) -> int:
         surface = sync.upload(
             args.url,
             *sources,
-            precision=precision,
-            rms=args.rms,
-            attribute_precision=attribute_precision,
+            precision=quality.precision,
+            rms=quality.rms,
+            attribute_precision=quality.attributes,
             closed=args.closed,
             name=args.name,
             options=options,

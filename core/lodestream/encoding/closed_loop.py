@@ -23,7 +23,7 @@ from ..transform.pyramid import PADDING, allocate, bare_level, inverse_level, ta
 from .noise_shaping import feedback_rules
 from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
 
-__all__ = ["ClosedLoop", "quantise"]
+__all__ = ["ClosedLoop", "choose_indices"]
 
 #: The step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
@@ -172,7 +172,7 @@ class _Coder:
         return slice(top, top + rows), slice(left, left + columns)
 
 
-def quantise(
+def choose_indices(
     table: TileTable,
     loops: Sequence[ClosedLoop],
     canvases: Sequence[NDArray[np.int32]],

@@ -13,7 +13,8 @@ from ..container.model import Header
 from ..decoding.reconstruction import Values
 from ..residual import chunk_coder
 from ..surface import Block, Surface
-from .preparation import Preparation, given_channel
+from .holes import given_channel
+from .prepared import Prepared
 
 __all__ = ["as_returned", "chunk_size", "encode_chunks"]
 
@@ -21,7 +22,7 @@ __all__ = ["as_returned", "chunk_size", "encode_chunks"]
 _TABLES, _WORTH = 8, 0.01
 
 
-def encode_chunks(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
     """The section's chunks; and of each channel whether it is exact then.
 
     A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
@@ -29,7 +30,7 @@ def encode_chunks(prepared: Preparation, header: Header, restored: list[Values])
 
     Parameters
     ----------
-    prepared : Preparation
+    prepared : Prepared
     header : Header
     restored : list of Values, one for each block
         What comes back without these chunks.
@@ -39,7 +40,7 @@ def encode_chunks(prepared: Preparation, header: Header, restored: list[Values])
     return chunks, coder.exact
 
 
-def chunk_size(prepared: Preparation, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
+def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
     """The smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
@@ -75,7 +76,7 @@ def chunk_size(prepared: Preparation, header: Header, restored: list[Values], co
 class _ChunkCoder:
     """Makes chunks; ``exact`` says of each channel whether it is exact with those so far."""
 
-    def __init__(self, prepared: Preparation, header: Header, restored: list[Values]) -> None:
+    def __init__(self, prepared: Prepared, header: Header, restored: list[Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
         rough = [prepared.precision is not None or prepared.rms is not None] * prepared.geometric
         rough += [False] * (prepared.point_channels - prepared.geometric)

@@ -42,8 +42,8 @@ from ..problems import (
 )
 from ..storage import damage
 from ..storage.containers import OpenContainer
-from .files import ready, still_there
 from .routing import Parts
+from .sending import ready, still_there
 
 __all__ = ["router"]
 
