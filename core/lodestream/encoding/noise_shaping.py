@@ -17,8 +17,8 @@ from ..quantization.band_steps import Quantiser, lifting_steps_along
 
 __all__ = ["FILTERS", "feedback_rules"]
 
-#: Of nodes and of details, by the axis's lifting steps from there to the finest level: f_1, f_2 and g; with further ones
-#: the same filter, and g doubles with each.
+#: Of nodes and of details, by the axis's lifting steps from there to the finest level: f_1, f_2 and g; with further
+#: ones the same filter, and g doubles with each.
 FILTERS = np.array(
     [
         [(0, 0, 1), (0.1716, 0, 1.4571), (0.2404, 0, 2.5997), (0.2608, 0, 5.0327), (0.2661, 0, 9.9806)],
@@ -40,8 +40,8 @@ def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32
     -------
     float32, shape (band, 6)
         How far below an index its point lies in the odd quantiser, and the weight of a squared error, both in
-        quantization steps; f_1 and f_2 along axis 0; f_1 and f_2 along axis 1. A weight of one is that of a squared error of
-        `Quantiser.base` in one point of the surface.
+        quantization steps; f_1 and f_2 along axis 0; f_1 and f_2 along axis 1. A weight of one is that of a squared
+        error of `Quantiser.base` in one point of the surface.
     """
     steps = table.steps(quantiser)
     found: dict[tuple[int, int, tuple[bool, bool]], tuple[float, ...]] = {}  # many tiles have bands of the same kind
