@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..grid.layout import REMEMBERED, Band, Layout
 from ..kernels import PASSES_STATE
-from ..quantization.band_steps import Quantiser, step_of
+from ..quantization.band_steps import Quantiser, band_step
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
 from .dequantize import UNANNOUNCED, spread_bands
@@ -95,7 +95,7 @@ class TileTable:
             for band in bands:
                 key = tile.level, band.grid, band.kind
                 if key not in found:
-                    found[key] = step_of(band, tile.level, self.layout, quantiser)
+                    found[key] = band_step(band, tile.level, self.layout, quantiser)
         return np.array(
             [
                 found[tile.level, band.grid, band.kind]
