@@ -174,7 +174,7 @@ class Preparation:
         raise IndexError(channel)
 
     def coordinates(self, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
-        """Lattice coordinates of a channel, one array for each grid of the layout; what is shared agrees."""
+        """Lattice coordinates of a channel, shape (row, column) of each grid of the layout; what is shared agrees."""
         arrays = [allocate(grid.shape) for grid in self.layout.grids]
         interfaces = len(arrays) - len(self.patches)
         if self.arrangement is None:

@@ -110,7 +110,7 @@ class AxisStep:
         return self.run < self.coarse
 
     def extension(self, reach: int) -> NDArray[np.int64]:
-        """Details beyond the ends of the run, see `extension`."""
+        """Details beyond the ends of the run, shape (2 reach, 2); see `extension`."""
         return extension(self.midpoints, self.left, self.right, self.wraps, reach)
 
 

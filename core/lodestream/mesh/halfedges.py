@@ -70,7 +70,10 @@ def find_pieces(twins: NDArray[np.int32], piece: NDArray[np.int32]) -> int:
 
 
 def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertices: int) -> NDArray[np.int64]:
-    """Number pieces that share a vertex alike: for each piece the number of its part, in order."""
+    """Number pieces that share a vertex alike: for each piece the number of its part, in order, shape (piece,).
+
+    `corners` has shape (F, 3) or (F, 4), `piece` shape (F,).
+    """
     part = np.arange(pieces)
     if pieces < 2:
         return part

@@ -77,7 +77,7 @@ class Part:
         return Part(block, points, faces, cells, bool(faces.get("joined", blocks > 1)))
 
     def border(self) -> NDArray[np.int64]:
-        """The points that may lie at the place of others: valid ones with fewer than four faces."""
+        """The points that may lie at the place of others, shape (point,): valid ones with fewer than four faces."""
         if not self.joins or self.block.points.ndim != 3:
             return self.points[:0, 0]
         border = on_border(self.cells, self.block.shape)
@@ -92,7 +92,10 @@ def wraps(block: Block, axis: int) -> bool:
 
 
 def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which nodes of a grid have fewer than four faces, from the cells that have one; fewer cells on open axes."""
+    """Which nodes of a grid of this shape have fewer than four faces, from the cells that have one.
+
+    `cells` is bool of shape (row of cells, column of cells), one fewer on open axes.
+    """
     full = np.zeros(shape, np.bool_)
     full[: cells.shape[0], : cells.shape[1]] = cells
     for axis in (0, 1):

@@ -149,13 +149,13 @@ def is_divided(header: Header) -> bool:
 
 
 def no_errors(header: Header) -> NDArray[np.uint8]:
-    """As `layer_codes` of a layer without errors."""
+    """As `layer_codes` of a layer without errors: shape (cell, 2)."""
     count = _cell_counts(header.shape, CELL, None).size
     return np.full((count, 2), _NOTHING, np.uint8)
 
 
 def serialize_window_errors(layers: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Payload of the section from the codes of each layer, see `layer_codes`."""
+    """Payload of the section from the codes of each layer, shape (cell, 2), see `layer_codes`."""
     out = FieldWriter()
     out.byte(CELL[0] | CELL[1] << 4)
     for row in np.stack(layers, axis=1):

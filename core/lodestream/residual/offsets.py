@@ -56,13 +56,13 @@ def code_offsets(
 
 
 def places_of(values: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Patterns as whole numbers in the order of the values."""
+    """Patterns of values of any shape as whole numbers in the order of the values."""
     signed = values.view(np.int32).astype(np.int64)
     return np.where(signed < 0, ~(signed & 0x7FFFFFFF), signed)
 
 
 def values_at(places: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Undo `places_of`; places may be any numbers."""
+    """Undo `places_of`, of any shape; places may be any numbers."""
     inside = np.clip(places, -(2**31), 2**31 - 1)
     patterns = np.where(inside < 0, ~inside | 2**31, inside)
     return patterns.astype(np.uint32).view(np.float32)

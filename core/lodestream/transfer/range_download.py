@@ -158,6 +158,8 @@ class RangeDownload:
             If the server does not support Range, or the answer does not match the request.
         RemoteError
             With the code ``other-container`` if the file has changed.
+        TruncatedStreamError
+            If the file ends before what was asked for.
         """
         asked = self._asked
         if asked is None:

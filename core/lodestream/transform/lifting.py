@@ -58,7 +58,10 @@ def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
 
 
 def inverse_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
-    """Undo `forward_step` in place; what comes out is within +-`CLAMP`, for any magnitudes below 2^29."""
+    """Undo `forward_step` in place, on shape (row, column).
+
+    What comes out is within +-`CLAMP`, for any magnitudes below 2^29.
+    """
     _step(values, axis, step, predictor, True)
 
 

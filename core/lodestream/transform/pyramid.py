@@ -45,7 +45,7 @@ _NORM_LEVELS = 6
 
 
 def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
-    """An int32 array for a channel's coefficients.
+    """An int32 array of this shape, (row, column), for a channel's coefficients.
 
     It is a window of a slightly wider one: rows then never lie a power of two apart, where a column's samples would
     compete for the same lines of the cache.
@@ -55,7 +55,7 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
 
 
 def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
-    """A copy from `allocate`."""
+    """A copy from `allocate`, shape (row, column)."""
     copy = allocate(array.shape)
     copy[...] = array
     return copy
@@ -111,9 +111,10 @@ def inverse(
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
-    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
-    lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
-    ``level``.
+    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2). Without ``whole``,
+    the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count lattice steps, those
+    above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than ``level``.
+
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
 
@@ -136,7 +137,10 @@ def inverse(
 def inverse_level(
     array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
 ) -> None:
-    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place."""
+    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place.
+
+    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2).
+    """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in (1, 0):
         if steps[axis].midpoints:
@@ -146,7 +150,10 @@ def inverse_level(
 
 
 def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
-    """Turn a level of a grid into nodes of the level below and details before the third step, in place."""
+    """Turn a level of a grid, shape (row, column), into nodes of the level below and details before the third step.
+
+    In place; the details are what a third step that predicts nothing would leave.
+    """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in range(2):
         if steps[axis].midpoints:
@@ -177,7 +184,10 @@ def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: t
 
 
 def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches."""
+    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches.
+
+    The arrays have the shape (row, column) of each grid.
+    """
     for k, grid in enumerate(layout.grids):
         rows, columns = layout.shape(k, 0)
         for side, source in enumerate(grid.sources):
@@ -201,7 +211,10 @@ def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source,
 def take_details(
     arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], patch: int, level: int
 ) -> None:
-    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already."""
+    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already.
+
+    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2).
+    """
     grid, steps = layout.grids[patch], layout.steps(patch, level)
     if grid.interface:
         return
