@@ -151,7 +151,7 @@ def _parse_patch(
         sides.append(side)
     wraps = [w and n == count for w, n, count in zip(whole, lengths[::-1], shape, strict=True)]
     if flags > 127 or min(lengths) < 1 or (closed[0] and not wraps[0]) or (closed[1] and not wraps[1]):
-        raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
+        raise CorruptStreamError(f"expected a patch of a block of {shape[0]} x {shape[1]}, got another", start)
     top, bottom, left, right = sides
     return Patch(
         block,

@@ -74,11 +74,13 @@ class TileTable:
                 stride, across = width + 2, (width + 7) // 8
                 place = size + 2 * stride + 2
                 flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
+                # Children are later tiles: they look the place of their parents up here.
                 own[band.grid, kind] = band, place, stride
                 parent = above.get((band.grid, kind))
                 joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
                 rows.append((place, stride, height, width, flags, *joined, kind))
                 origins.append((number, band.rows[0], band.columns[0]))
+                # Two rows and two columns of zeros around each band: contexts read beyond its sides without asking.
                 size += (height + 4) * stride + 2
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))

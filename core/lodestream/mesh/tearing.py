@@ -11,7 +11,7 @@ from .. import kernels
 from .halfedges import Corners
 from .model import Mesh
 from .patchwork import Quads
-from .walks import parts
+from .walks import batches
 
 __all__ = ["equal_rows", "sort_attributes", "tear"]
 
@@ -22,7 +22,7 @@ def rows_of_vertices(corners: Corners, rows: NDArray[np.int32], row_of: NDArray[
     Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face; of no use when they differ.
     """
     row_of[:] = -1
-    return all(kernels.mesh_rows(corners[part], rows[part], row_of) for part in parts(len(corners)))
+    return all(kernels.mesh_rows(corners[batch], rows[batch], row_of) for batch in batches(len(corners)))
 
 
 def equal_rows(values: NDArray[Any]) -> NDArray[np.int32]:
@@ -72,7 +72,7 @@ def tear(quads: Quads, twins: NDArray[np.int32]) -> NDArray[np.int64]:
     Gives for each attribute the number of such edges, shape (attribute,).
     """
     torn, there = np.zeros(len(quads.attributes), np.int64), np.empty(len(quads.attributes), np.int64)
-    for part in parts(len(quads.corners)):
-        kernels.mesh_tear(quads.attributes, part.start, part.stop, twins, there)
+    for batch in batches(len(quads.corners)):
+        kernels.mesh_tear(quads.attributes, batch.start, batch.stop, twins, there)
         torn += there
     return torn

@@ -1,4 +1,4 @@
-"""Values that lie on one lattice chunk by chunk, each chunk with an offset of its own, as some compressors leave them.
+"""Values that lie on one lattice stretch by stretch, each with an offset of its own, as some compressors leave them.
 
 LERC, for one, quantises blocks of 8 x 8 heights from the least of each. Such values are float32(n step + offset) with
 a whole n, and the offset is that of a value before, more often than not of the last one. What is known of an offset is

@@ -68,6 +68,7 @@ def inverse_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
 def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: bool) -> None:
     if not step.midpoints:
         return
+    # A transposed or reversed view: the kernel takes rows with their samples side by side.
     if values.strides[1] != values.itemsize or values.strides[0] < 0:
         packed = values.copy(order="C")
         _step(packed, axis, step, predictor, inverse)
@@ -80,7 +81,7 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
     for part in _parts(axis, lines, step.length):
         plane = values[:, part] if axis == 0 else values[part]
         done = 0
-        while done < step.run:
+        while done < step.run:  # very long axes take several calls, between which an interruption is heard
             done = kernels.lift(inverse, axis, plane, step.midpoints, step.run, table, *predictor, done, work)
 
 

@@ -81,6 +81,7 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     fitted = set(fitted_steps(layout))
     for level in range(layout.levels, 0, -1):
         for axis in range(2):
+            # All patches have one predictor, and all interfaces another: a short side alone is no sample to fit it to.
             corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
             for which in (axis, INTERFACES) if axis == 0 else (axis,):
                 if fit and (level - 1, which) in fitted:
@@ -126,6 +127,7 @@ def inverse(
     for finer in range(1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
+                # The first level with details missing: from here on in eighths, clipped to what the kernel takes.
                 corner = _corner(arrays[k], layout.shape(k, whole))
                 np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
                 corner <<= FRACTION_BITS
@@ -142,7 +144,7 @@ def inverse_level(
     ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2).
     """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
-    for axis in (1, 0):
+    for axis in (1, 0):  # the forward transform's axes in reverse: rounding makes the order matter
         if steps[axis].midpoints:
             inverse_step(
                 corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
@@ -230,6 +232,7 @@ def take_details(
         if points.size == 1:
             target[step.coarse :] = 0  # a pole
             continue
+        # The interface is whole at this level, so its own forward step tells the details: they are never sent twice.
         line = points.reshape(1, -1).copy()
         forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
         target[step.coarse :] = line[0, step.coarse :]
@@ -246,24 +249,24 @@ class _Sample(NamedTuple):
     details: NDArray[np.int32]
     largest: int
 
-    def patches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
+    def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
         """Factors and details, so many as a kernel takes at once."""
         for start in range(0, self.details.size, _AT_ONCE):
-            patch = slice(start, start + _AT_ONCE)
-            yield self.first[patch], self.second[patch], self.details[patch]
+            batch = slice(start, start + _AT_ONCE)
+            yield self.first[batch], self.second[batch], self.details[batch]
 
     def bits(self, a: int, b: int) -> float:
         """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
         total = np.zeros(1)
-        for patch in self.patches():
-            kernels.predictor_bits(*patch, self.largest, a, b, total)
+        for batch in self.batches():
+            kernels.predictor_bits(*batch, self.largest, a, b, total)
         return float(total[0])
 
     def moments(self, a: float, b: float, weighted: bool) -> list[float]:
         """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
         sums = np.zeros(5)
-        for patch in self.patches():
-            kernels.predictor_moments(*patch, a, b, weighted, sums)
+        for batch in self.batches():
+            kernels.predictor_moments(*batch, a, b, weighted, sums)
         found: list[float] = sums.tolist()
         return found
 
@@ -278,6 +281,7 @@ def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]
             costs[ab] = sample.bits(*ab)
         return costs[ab]
 
+    # Bits are not convex in (a, b), and bumpy from rounding: several starts, then a search in steps that get smaller.
     best = min([*_CANDIDATES, *_least_squares(sample)], key=bits)
     for reach in (4, 2, 1):
         around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
@@ -307,9 +311,9 @@ def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sam
     largest, height = 0, max(1, _AT_ONCE // width)
     for start in range(0, count, height):
         stop = min(start + height, count)
-        patch = slice(start * width, stop * width)
+        batch = slice(start * width, stop * width)
         planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
-        largest = max(largest, kernels.predictor_factors(*planes, first[patch], second[patch], details[patch]))
+        largest = max(largest, kernels.predictor_factors(*planes, first[batch], second[batch], details[batch]))
     return _Sample(first, second, details, largest)
 
 
@@ -321,7 +325,7 @@ def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
         uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
-            break
+            break  # one factor is all but a multiple of the other: nothing tells a from b
         a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
         found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
     return found
@@ -343,6 +347,7 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
         for patch, grid in enumerate(layout.grids):
             for side, source in enumerate(grid.sources):
                 if source is not None and source.grid == number and not grid.interface:
+                    # Across the side its points count as nodes of the patch; a pole's only point does so all along it.
                     across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
                     return norms * points * _line_norms(layout, predictors, patch)[across, :, 0][:, None, None]
     return norms
