@@ -300,7 +300,7 @@ class RangeDownload:
 
         def read(offset: int, length: int) -> bytes:
             for gap in store.ranges.missing(offset, min(length, size - offset)):
-                raise _MissingError(*gap)
+                raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
 
         self._needed = None
