@@ -77,7 +77,7 @@ class TileCoder:
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
         """The bytes of the next ``passes`` passes of a tile of which ``first`` remain.
 
-        ``costs``, float64, shape (pass,), are filled with the bits that each pass takes.
+        ``costs``, float64, shape (pass,), get by its number the bits written when each pass ended.
         """
         tiles = self.tiles[channel]
         if tile >= tiles.large:
