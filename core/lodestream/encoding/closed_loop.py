@@ -55,7 +55,8 @@ class ClosedLoop:
     ) -> NDArray[np.int32]:
         """The index of every coefficient, flat; and what the reader will have of the grids, into ``reconstructions``.
 
-        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        The result has the shape (`TileTable.size`,), ``reconstructions`` (row, column) each. For ``steps`` and
+        ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         table, predictors = self._table, self._predictors
         for reconstruction in reconstructions:

@@ -61,7 +61,7 @@ class IndexChooser:
     def begin(self, steps: NDArray[np.int64], rules: NDArray[np.float32]) -> None:
         """Choose all indices anew; what was learned of the last ones serves, with other quantization steps, too.
 
-        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        For the shapes of ``steps`` and ``rules`` see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         self._steps, self._rules = steps, rules
         self._relative = np.zeros(self._table.size)
@@ -75,9 +75,9 @@ class IndexChooser:
 
         Parameters
         ----------
-        numbers : int64
+        numbers : int64, shape (chosen band,)
             Of the bands in the table.
-        coefficients : int32, flat, see `tiles.gather`
+        coefficients : int32, shape (`TileTable.size`,), see `tiles.gather`
             What the indices are to stand for.
         """
         bands = self._table.bands[numbers]
@@ -90,7 +90,7 @@ class IndexChooser:
             )
 
     def end(self) -> NDArray[np.int32]:
-        """All indices, flat; what they cost is estimated from them when others are chosen."""
+        """All indices, shape (`TileTable.size`,); what they cost is estimated from them when others are chosen."""
         self._bits = -np.log2(self._counts / self._counts.sum(axis=2, keepdims=True))
         chosen = self.chosen
         del self.chosen, self._relative, self._classes

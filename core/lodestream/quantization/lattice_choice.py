@@ -53,6 +53,11 @@ def choose_lattices(
     list of Lattice
         The channels' own lattices where found (attributes: always when found; coordinates: unless the precision
         allows a coarser one), otherwise one step for all coordinates.
+
+    Raises
+    ------
+    InputError
+        If a value is above `LARGEST_VALUE` in magnitude.
     """
     count = 1 if points.ndim == 2 else points.shape[2]
     spans = []
