@@ -60,7 +60,7 @@ class TileCurve:
 
 
 def hull_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope: 0.0) -> NDArray[np.float64]:
-    """Gain for each bit of every pass, the same for all passes of a run; it falls from run to run.
+    """Gain for each bit of every pass, shape (pass,): the same for all passes of a run, falling from run to run.
 
     Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
     where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): ``worth(s)``, and a share of
