@@ -113,7 +113,7 @@ def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.Monke
                 channels = [slice(k, k + 1) for k in range(geometric)]
                 expected += [plain_distances(original[..., own], shown[..., own], known) for own in channels]
             for at_once in (1, 16):
-                monkeypatch.setattr(distortion, "_PARTS", at_once)
+                monkeypatch.setattr(distortion, "_CELLS", at_once)
                 found = coordinate_distances([Original(original, mask)], lattices, [numbers], [3] * geometric)
                 assert found == expected
 
