@@ -84,37 +84,37 @@ async def retry(
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``."""
+    """All surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`."""
     return await _run(api.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface."""
+    """State and description of one surface; errors as in `lodestream_client.sync`."""
     return await _run(api.describe(url), url, token)
 
 
 async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
     """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
-    `max_vertices` limits the memory of the container's tables, see `connect`.
+    `max_vertices` limits the memory of the container's tables, see `connect`. Errors as in `lodestream_client.sync`.
     """
     return await _run(api.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file."""
+    """What identifies a surface's container, or a container file; errors as in `lodestream_client.sync`."""
     return await _run(api.identify(url), url, token)
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server."""
+    """Delete a surface from its server; errors as in `lodestream_client.sync`."""
     await _run(api.delete(url), url, token)
 
 
 async def fetch_range(
     url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT
 ) -> bytes:
-    """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
+    """Fetch bytes of a surface's container over HTTP; see `lodestream_client.sync.fetch_range`."""
     return await _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 

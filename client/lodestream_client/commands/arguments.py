@@ -6,7 +6,7 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import OptionError
@@ -38,6 +38,8 @@ __all__ = [
     "parse_surface",
     "parse_tolerance",
     "precisions",
+    "standard_input_once",
+    "standard_output_once",
     "surface_options",
     "target_of",
     "token_of",
@@ -50,7 +52,13 @@ _PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20
 
 
 def parse_size(text: str) -> int:
-    """Read a number of bytes, such as ``20000``, ``20kB`` or ``1MiB``."""
+    """Read a number of bytes, such as ``20000``, ``20kB`` or ``1MiB``.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     number, unit = _amount(text)
     factor = _PREFIXES.get(unit.lower().removesuffix("b"))
     if factor is None:
@@ -62,7 +70,13 @@ def parse_size(text: str) -> int:
 
 
 def parse_rate(text: str) -> float:
-    """Read a rate such as ``64kbit``, ``1mbit/s`` or ``200kB``; bytes per second."""
+    """Read a rate such as ``64kbit``, ``1mbit/s`` or ``200kB``; bytes per second.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     number, unit = _amount(text)
     bits = unit.lower().endswith("bit")
     prefix = unit.lower().removesuffix("bit") if bits else unit.removesuffix("B").lower()
@@ -79,7 +93,13 @@ def _amount(text: str) -> tuple[float, str]:
 
 
 def parse_pair(text: str) -> tuple[str, str]:
-    """Read ``KEY=VALUE``."""
+    """Read ``KEY=VALUE``.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"expected KEY=VALUE, got {text!r}")
@@ -87,7 +107,13 @@ def parse_pair(text: str) -> tuple[str, str]:
 
 
 def parse_seconds(text: str) -> float:
-    """Read a number of seconds, 0 or more."""
+    """Read a number of seconds, 0 or more.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     try:
         value = float(text)
     except ValueError:
@@ -176,6 +202,19 @@ def token_of(args: argparse.Namespace) -> str | None:
     """The token given, or the environment's."""
     token: str | None = args.token or os.environ.get("LODESTREAM_TOKEN")
     return token or None
+
+
+def standard_input_once(args: argparse.Namespace, names: Sequence[str]) -> tuple[str, ...]:
+    """The names of files to read; ends the program if standard input (``-``) is named twice."""
+    if names.count("-") > 1:
+        args.parser.error("standard input (-) is named twice")
+    return tuple(names)
+
+
+def standard_output_once(args: argparse.Namespace, what: str) -> None:
+    """End the program if standard output is to be both OUT, which is `what`, and the JSON object."""
+    if args.out == "-" and args.json:
+        args.parser.error(f"argument --json: standard output is used for the {what}")
 
 
 def add_rate_option(parser: argparse.ArgumentParser) -> None:

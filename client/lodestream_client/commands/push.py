@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from lodestream.target import Tolerance
 
 from ..terminal.output import human_size, note_details, print_json, progress_bar, say
 from .arguments import (
@@ -16,15 +20,17 @@ from .arguments import (
     add_token_option,
     parse_server,
     precisions,
+    standard_input_once,
     surface_options,
     token_of,
 )
 from .inputs import input_files
 
 if TYPE_CHECKING:
-    from ..requests.bodies import Source
+    from ..requests.api import Description
+    from ..requests.bodies import Closure, Source
 
-__all__ = ["register", "run"]
+__all__ = ["PushOptions", "register", "run"]
 
 
 def register(subparsers: Subparsers) -> None:
@@ -46,18 +52,62 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Upload, wait, print the address."""
+@dataclass(frozen=True)
+class PushOptions:
+    """What the command line asks of an upload: names of `files`, ``-`` for standard input, to the server at `url`."""
+
+    files: tuple[str, ...]
+    url: str
+    precision: Tolerance | None
+    rms: Tolerance | None
+    attribute_precision: Mapping[str, Tolerance]
+    closed: Closure
+    name: str | None
+    format_options: Mapping[str, str]
+    wait: bool
+    token: str | None
+    json: bool
+
+
+def _options(args: argparse.Namespace) -> PushOptions:
+    """The options; ends the program if the command line is wrong."""
     options = surface_options(args)
     precision, attribute_precision = precisions(args)
+    return PushOptions(
+        standard_input_once(args, args.files),
+        args.url,
+        precision,
+        args.rms,
+        attribute_precision,
+        args.closed,
+        args.name,
+        options,
+        not args.no_wait,
+        token_of(args),
+        args.json,
+    )
 
+
+def run(args: argparse.Namespace) -> int:
+    """Upload, wait, print the address."""
+    options = _options(args)
+    surface = _uploaded(options)
+    note_details(surface.details)
+    if options.json:
+        print_json({**surface.details, "url": surface.url})
+    else:
+        say(surface.url)
+    return 0
+
+
+def _uploaded(options: PushOptions) -> Description:
     from .. import sync
 
-    with input_files(args.parser, args.files) as files, ExitStack() as stack, progress_bar() as bar:
+    with input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
         # Standard input has no name of its own to tell.
         sources: list[Source] = [
             stack.enter_context(path.open("rb")) if name == "-" else path
-            for name, path in zip(args.files, files.paths, strict=True)
+            for name, path in zip(options.files, files.paths, strict=True)
         ]
         total = human_size(sum(Path(path).stat().st_size for path in files.paths))
         task = bar.add_task("sending", total=1.0, figures=total)
@@ -65,22 +115,16 @@ def run(args: argparse.Namespace) -> int:
         def progress(stage: str, fraction: float) -> None:
             bar.update(task, description=stage, completed=fraction, figures=total if stage == "sending" else "")
 
-        surface = sync.upload(
-            args.url,
+        return sync.upload(
+            options.url,
             *sources,
-            precision=precision,
-            rms=args.rms,
-            attribute_precision=attribute_precision,
-            closed=args.closed,
-            name=args.name,
-            options=options,
-            wait=not args.no_wait,
+            precision=options.precision,
+            rms=options.rms,
+            attribute_precision=options.attribute_precision,
+            closed=options.closed,
+            name=options.name,
+            options=options.format_options,
+            wait=options.wait,
             progress=progress,
-            token=token_of(args),
+            token=options.token,
         )
-    note_details(surface.details)
-    if args.json:
-        print_json({**surface.details, "url": surface.url})
-    else:
-        say(surface.url)
-    return 0

@@ -70,7 +70,7 @@ _MOST_PAGES = 10_000
 
 _MOVED = (301, 302, 303, 307, 308)
 
-#: Seconds for each step of a request: connecting, one piece sent, one piece received.
+#: Seconds for each step of a request: connecting, one chunk sent, one chunk received.
 TIMEOUT = 30.0
 
 
@@ -202,7 +202,7 @@ def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
     if call.parameters:
         options["params"] = dict(call.parameters)
     if call.body is not None and len(call.body.files) > 1:
-        options["files"] = call.body.parts()
+        options["files"] = call.body.form()
     elif call.body is not None:
         headers["Content-Length"] = str(call.body.size)
         headers["Content-Type"] = "application/octet-stream"
@@ -251,7 +251,13 @@ def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str
 
 
 def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
-    """All surfaces of a server, page by page."""
+    """All surfaces of a server, page by page.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If there are too many pages, one of another server, or one that is no list.
+    """
     page: str | None = addresses.surfaces_url(url)
     surfaces: list[Description] = []
     seen = set[str]()
@@ -300,7 +306,15 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
 
 
 def identify(url: str) -> Flow[Identity]:
-    """What identifies a surface's container, or a file."""
+    """What identifies a surface's container, or a file.
+
+    Raises
+    ------
+    RemoteError
+        With the code ``not-ready`` if the surface cannot be streamed now.
+    RemoteProtocolError
+        If the server does not tell the container's SHA-256 and size.
+    """
     if addresses.is_surface(url):
         surface = yield from describe(url)
         container, size = surface.details.get("container"), surface.details.get("bytes")
@@ -332,13 +346,21 @@ def delete(url: str) -> Flow[None]:
 
 
 def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
-    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file."""
+    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If the server does not support Range.
+    CorruptStreamError
+        If there are fewer bytes.
+    """
     address = addresses.container_url(url)
     headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
     response = _refuse((yield Call("GET", address, headers=headers, partial=True, most=length)), address)
     if response.status != 206:
         raise RemoteProtocolError(
-            f"expected part of the container from {address}, got all of it: Range is not supported"
+            f"expected a range of the container from {address}, got all of it: Range is not supported"
         )
     if len(response.content) != length:
         raise CorruptStreamError(f"expected {length} bytes of the container, got {len(response.content)}", offset)
