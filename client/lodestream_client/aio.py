@@ -20,10 +20,11 @@ from typing import Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
-from .requests import api, problems
+from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
-from .requests.api import Description, Flow, Identity, Progress
+from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
+from .requests.calls import Flow
 from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
 
@@ -112,7 +113,7 @@ async def delete(url: str, *, token: str | None = None) -> None:
 
 
 async def fetch_range(
-    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = calls.TIMEOUT
 ) -> bytes:
     """Fetch bytes of a surface's container over HTTP; see `lodestream_client.sync.fetch_range`."""
     return await _run(api.fetch_range(url, offset, length), url, token, timeout)
@@ -138,24 +139,24 @@ async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress 
         raise
 
 
-async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
+async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = calls.TIMEOUT) -> T:
     import httpx
 
     answer: Answer | None = None
-    async with httpx.AsyncClient(**api.client_options(url, timeout, asynchronous=True)) as client:
+    async with httpx.AsyncClient(**calls.client_options(url, timeout, asynchronous=True)) as client:
         while True:
             try:
                 step = flow.send(answer)
             except StopIteration as end:
                 result: T = end.value
                 return result
-            if isinstance(step, api.Pause):
+            if isinstance(step, calls.Pause):
                 await asyncio.sleep(step.seconds)
                 answer = None
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
-                async with client.stream(content=content, **api.request_options(step, url, token)) as response:
+                async with client.stream(content=content, **calls.request_options(step, url, token)) as response:
                     incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
                         async for chunk in response.aiter_raw():

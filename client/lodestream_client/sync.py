@@ -18,10 +18,11 @@ from typing import Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
-from .requests import api, problems
+from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
-from .requests.api import Description, Flow, Identity, Progress
+from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Closure, Source, opened, prepared
+from .requests.calls import Flow
 from .stream.options import ConnectKeywords, ConnectOptions
 from .stream.sync_stream import Stream
 
@@ -266,7 +267,9 @@ def delete(url: str, *, token: str | None = None) -> None:
     _run(api.delete(url), url, token)
 
 
-def fetch_range(url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT) -> bytes:
+def fetch_range(
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = calls.TIMEOUT
+) -> bytes:
     """Fetch bytes of a surface's container over HTTP.
 
     Parameters
@@ -292,24 +295,24 @@ def fetch_range(url: str, offset: int, length: int, *, token: str | None = None,
     return _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 
-def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
+def _run(flow: Flow[T], url: str, token: str | None, timeout: float = calls.TIMEOUT) -> T:
     import httpx
 
     answer: Answer | None = None
-    with httpx.Client(**api.client_options(url, timeout)) as client:
+    with httpx.Client(**calls.client_options(url, timeout)) as client:
         while True:
             try:
                 step = flow.send(answer)
             except StopIteration as end:
                 result: T = end.value
                 return result
-            if isinstance(step, api.Pause):
+            if isinstance(step, calls.Pause):
                 time.sleep(step.seconds)
                 answer = None
                 continue
             content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
             try:
-                with client.stream(content=content, **api.request_options(step, url, token)) as response:
+                with client.stream(content=content, **calls.request_options(step, url, token)) as response:
                     incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
                         for chunk in response.iter_raw():

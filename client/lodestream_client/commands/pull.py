@@ -289,7 +289,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     from lodestream.container import ByteRange, read_metadata
 
     from .. import sync
-    from ..requests import api
+    from ..requests.calls import TIMEOUT
 
     place = stream.metadata_place
     if place is None:  # over HTTP layers may come before it is known
@@ -298,7 +298,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     if (data := kept.read(*place)) is not None:
         return read_metadata(data, ByteRange(*place)), 0
     try:
-        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else api.TIMEOUT)
+        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else TIMEOUT)
     except LodestreamError as error:
         if isinstance(error, NotFoundError) and not hurried:
             raise
