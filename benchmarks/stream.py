@@ -95,8 +95,8 @@ async def stopped(served: Served, rate: float | None, window: int | None) -> tup
         async for _ in stream:
             if time.monotonic() >= until or stream.received > 600_000:
                 break
-        assert stream._download is not None
-        credit, before, now = stream._download.credit, stream.data_bytes, time.monotonic()
+        assert stream._session.download is not None
+        credit, before, now = stream._session.download.credit, stream.data_bytes, time.monotonic()
         await stream.stop()
         async for _ in stream:
             pass

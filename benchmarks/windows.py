@@ -15,7 +15,7 @@ from lodestream.container.sections import FOOTER_LENGTH
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.transfer.range_download import RangeDownload
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 
 from .arrays import fractal
 from .measure import note, table
@@ -111,7 +111,7 @@ def shares(points: Any, container: bytes, index: Index, place: tuple[int, int], 
 
 def read_over_range(container: bytes, target: ls.Target) -> int:
     """Bytes of the answers that a client of HTTP Range gets."""
-    reception = Reception(target)
+    reception = ReceiverState(target)
     download = RangeDownload(reception)
     while (request := download.request()[0]) is not None:
         body = container[request.offset : request.offset + request.length]

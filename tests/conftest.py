@@ -81,7 +81,7 @@ def one_fork_server() -> Iterator[None]:
     take turns in a process of pytest-xdist.
     """
     from lodestream_server.builds import jobs
-    from lodestream_server.builds.processes import ForkServer
+    from lodestream_server.builds.fork_control import ForkServer
     from tests.server.builds import slow
 
     class Shared(ForkServer):

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         UnsupportedVersionError,
     )
     from .formats import read, write
+    from .quality import Quality
     from .surface import Block, Surface
     from .target import Target, Tolerance
     from .transform import paper
@@ -59,6 +60,7 @@ _HOMES = {
     "TruncatedStreamError": "errors",
     "UnavailableError": "errors",
     "UnsupportedVersionError": "errors",
+    "Quality": "quality",
     "read": "formats",
     "write": "formats",
     "coarsen": "transform.least_squares",
@@ -79,6 +81,7 @@ __all__ = [
     "NotFoundError",
     "OptionError",
     "ProtocolError",
+    "Quality",
     "RemoteError",
     "StreamError",
     "Surface",

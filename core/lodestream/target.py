@@ -42,6 +42,27 @@ class Tolerance:
             raise OptionError(f"expected an error of 0 or more, got {self.value}")
 
     @classmethod
+    def of(cls, error: Tolerance | float | str) -> Tolerance:
+        """What somebody wrote for an error: a tolerance, a number in the surface's unit, or a text for `parse`.
+
+        >>> Tolerance.of("1e-3d")
+        Tolerance(value=0.001, relative=True)
+
+        Raises
+        ------
+        OptionError
+            If it is neither, or no number of 0 or more.
+        """
+        if isinstance(error, str):
+            return cls.parse(error)
+        if isinstance(error, Tolerance):
+            return error
+        try:
+            return cls(float(error))
+        except TypeError:
+            raise OptionError(f"expected a number such as 0.5, a text or a Tolerance, got {error!r}") from None
+
+    @classmethod
     def parse(cls, text: str) -> Tolerance:
         """Parse ``0.5`` (in the surface's unit) or ``1e-3d`` (1e-3 times the extent).
 

@@ -24,7 +24,7 @@ from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
 from .operation.settings import Settings
-from .routes import files, interface, pages, streams, surfaces
+from .routes import files, interface, levels, pages, streams, surfaces
 from .routes.routing import State
 from .storage.containers import Containers
 from .storage.storage import Storage
@@ -98,7 +98,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     problems.install(app)
-    routers = (pages.router, surfaces.router, files.router, streams.router)
+    routers = (pages.router, surfaces.router, files.router, levels.router, streams.router)
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]

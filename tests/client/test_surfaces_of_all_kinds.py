@@ -271,7 +271,7 @@ def test_precisions_that_cannot_be(run: Run, server: str, files: Path, tmp_path:
         (("intensity=",), 2, "expected a number"),
         (("=0.5",), 2, "expected P or NAME=P"),
         (("0.5", "0.6"), 2, "P given twice"),
-        (("intensity=1", "intensity=1"), 2, "intensity given twice"),
+        (("intensity=1", "intensity=1"), 2, "'intensity' given twice"),
     ):
         given = [word for value in words for word in ("--precision", value)]
         found, _, err = run("encode", files / "scan.pcd", out, *given)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import formats
-from lodestream.encoding.preparation import Preparation
+from lodestream.encoding.lattice_coordinates import lattice_coordinates
+from lodestream.encoding.prepared import prepare
 from lodestream.errors import FormatWarning
 from lodestream.surface import Block, Surface
 
@@ -205,10 +206,10 @@ def test_levels_are_within_the_lattice_of_the_optimum_of_the_filled_grid(name: s
     decoder = ls.Decoder()
     decoder.feed(streamed(row))
     decoder.finish()
-    prepared = Preparation(surface, (None, {}))
+    prepared = prepare(surface, ls.Quality())
     assert decoder.header is not None
     for channel, lattice in enumerate(decoder.header.lattices[:3]):  # those of attributes follow
-        filled = prepared.coordinates(channel, lattice)[0]
+        filled = lattice_coordinates(prepared, channel, lattice)[0]
         for number, optimum in enumerate(ls.hierarchy(filled, surface.closed)):
             level = decoder.surface(number)
             if level.mask is None and surface.mask is not None:

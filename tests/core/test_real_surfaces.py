@@ -17,7 +17,8 @@ import lodestream as ls
 from lodestream import formats
 from lodestream.coordinates.height_fields import coordinates, to_xyz
 from lodestream.coordinates.seams import restore
-from lodestream.encoding.preparation import Preparation
+from lodestream.encoding.lattice_coordinates import lattice_coordinates
+from lodestream.encoding.prepared import prepare
 from lodestream.errors import FormatError, FormatWarning
 from lodestream.surface import Surface
 
@@ -154,10 +155,10 @@ def test_levels_of_small_surfaces_are_within_the_lattice_of_the_optimum_of_the_f
     decoder = ls.Decoder()
     decoder.feed(container)
     decoder.finish()
-    prepared = Preparation(surface, (None, {}))
+    prepared = prepare(surface, ls.Quality())
     assert decoder.header is not None
     for channel, lattice in enumerate(decoder.header.lattices):
-        filled = prepared.coordinates(channel, lattice)[0]
+        filled = lattice_coordinates(prepared, channel, lattice)[0]
         for number, optimum in enumerate(ls.hierarchy(filled, surface.closed)):
             level = decoder.surface(number)
             if level.mask is None and surface.mask is not None:

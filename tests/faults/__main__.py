@@ -2,6 +2,8 @@
 
 ``python -m tests.faults 'repair, flipped upload' --seconds 300``
 ``python -m tests.faults upload 'fsync records' --part 0.2``
+
+All of them take some time. With ``--journal FILE`` each run goes on where the last one with that file has ended.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from .run import SCENARIOS, Session, run
+from .run import SCENARIOS, Session, in_memory, run
 
 
 def main() -> int:
@@ -27,22 +29,24 @@ def main() -> int:
     parser.add_argument("--part", type=float, default=1.0, help="what part of them, drawn at random (default: 1)")
     parser.add_argument("--seed", type=int, default=1, help="for drawing them (default: 1)")
     parser.add_argument("--seconds", type=float, help="the longest time that it may take")
+    parser.add_argument("--journal", type=Path, help="a file of what was tried; what it has is not tried again")
+    parser.add_argument("--sessions", type=int, help="how many are tried at the same time (default: processors + 1)")
     args = parser.parse_args()
     scenarios = args.scenario or SCENARIOS
-    with tempfile.TemporaryDirectory() as folder:
-        if args.list:
-            with Session(Path(folder)) as session:
-                names = [str(case) for case in session.everything(scenarios)]
-            print("\n".join(name for name in names if all(word in name for word in args.words)))
-            return 0
-        report = run(
-            Path(folder),
-            args.part,
-            args.seconds,
-            seed=args.seed,
-            scenarios=scenarios,
-            chosen=lambda case: all(word in str(case) for word in args.words),
-        )
+    if args.list:
+        with tempfile.TemporaryDirectory(dir=in_memory()) as folder, Session(Path(folder)) as session:
+            names = [str(case) for case in session.everything(scenarios)]
+        print("\n".join(name for name in names if all(word in name for word in args.words)))
+        return 0
+    report = run(
+        args.part,
+        args.seconds,
+        seed=args.seed,
+        scenarios=scenarios,
+        chosen=lambda case: all(word in str(case) for word in args.words),
+        journal=args.journal,
+        sessions=args.sessions,
+    )
     print("\n".join(map(str, report.problems)))
     print("\n".join(report.facts()))
     return 1 if report.problems else 0

@@ -25,7 +25,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from lodestream_server.builds import forkserver, jobs, processes, worker
+from lodestream_client import program
+from lodestream_server.builds import fork_control, forkserver, jobs, worker
+from lodestream_server.storage import records
 
 __all__ = ["DIED", "main"]
 
@@ -33,6 +35,8 @@ __all__ = ["DIED", "main"]
 DIED = 70
 
 _MODULES = (
+    "anyio._backends._asyncio",
+    "encodings.idna",
     "lodestream_client.__main__",
     "lodestream_client.program",
     "lodestream_server.app",
@@ -40,6 +44,8 @@ _MODULES = (
     "lodestream_server.maintenance.repair",
     "lodestream_server.running",
     "lodestream_server.commands.token",
+    "uvicorn.lifespan.on",
+    "uvicorn.loops.asyncio",
     "uvicorn.protocols.http.auto",
     "uvicorn.protocols.websockets.websockets_sansio_impl",
 )
@@ -103,7 +109,7 @@ class _Forked:
         return code
 
 
-class _ForkServer(processes.ForkServer):
+class _ForkServer(fork_control.ForkServer):
     """Has one fork server already; when that has died, it starts another as it always does."""
 
     def __init__(self, preload: Callable[[], object] | None, forked: _Forked) -> None:
@@ -112,7 +118,7 @@ class _ForkServer(processes.ForkServer):
 
     def _start(self) -> Any:
         forked, self._forked = self._forked, None
-        return super()._start() if forked is None else processes._Started(forked, forked.control)
+        return super()._start() if forked is None else fork_control.Started(forked, forked.control)
 
 
 def main() -> None:
@@ -121,10 +127,15 @@ def main() -> None:
     for module in _MODULES:
         import_module(module)
     worker.preload()
+    # What each process would make first: both take as long as looking through a small folder.
+    records._adapter()
+    parser = program.build_parser()
+    names: Any = program
+    names.build_parser = lambda _: parser
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     # A fork server that is started anew belongs to the shim, too.
-    shim: Any = processes
+    shim: Any = fork_control
     shim._ENVIRONMENT += ("LODE_FAULT_CONTROL", "LODE_FAULT_CALLS")
     # What shim.c asks for: from which lines a call comes. The processes of builds keep this file open, and no other.
     faulthandler.register(signal.SIGUSR2, ctypes.CDLL(None).lode_calls(), all_threads=False)
@@ -154,8 +165,10 @@ def _run(arguments: list[str], log: str) -> dict[str, Any]:
 def _be(arguments: list[str], log: str) -> int:
     from lodestream_client.__main__ import main
 
-    # Killed with the process that it comes from: it is in no group of anybody's.
-    os.setsid()
+    # A group of its own, to be killed as a whole, but no session: Linux gives each of those the processor in turn, so
+    # that whoever runs many of them in the background would take it from everybody else. Killed with the process that
+    # it comes from: it is in no group of anybody's.
+    os.setpgid(0, 0)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     said = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     nothing = os.open(os.devnull, os.O_RDONLY)

@@ -128,8 +128,6 @@ class Talk:
         self.case = ""
         self.lenient = False
         self.no_tokens = False
-        paths = http.get("/openapi.json").raise_for_status().json()["paths"]
-        self.retries = "/v1/surfaces/{surface}/retry" in paths
 
     def say(self, kind: str, text: str, case: str | None = None) -> None:
         """Note a problem."""
@@ -196,13 +194,10 @@ class Talk:
             entry = self.quiet(surface)
             if entry is None or entry["state"] == "ready" or time.monotonic() > until:
                 return entry
-            if self.retries:
-                if tries == _RETRIES:
-                    return entry
-                tries += 1
-                self.ask("POST", f"/v1/surfaces/{surface}/retry", (200, 202, 409))
-            elif entry["state"] == "failed":
+            if tries == _RETRIES:
                 return entry
+            tries += 1
+            self.ask("POST", f"/v1/surfaces/{surface}/retry", (200, 202, 409))
             time.sleep(0.1 + 0.2 * tries)
 
     def check(self, only: str | None = None) -> None:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
+import queue
 import random
+import shutil
+import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,12 +29,15 @@ from .rest import Rest
 from .shim import Site
 from .steps import STEPS
 
-__all__ = ["SCENARIOS", "Report", "Session", "run"]
+__all__ = ["SCENARIOS", "Journal", "Report", "Session", "in_memory", "run"]
 
 SCENARIOS = ("operation", "start", "repair")
 
 # So many on one server before it is started again and compared with all that it has acknowledged.
 _TOGETHER = 25
+
+# A few folders of a few hundred kilobytes for each session, with what is left of them until they are removed.
+_ROOM = 1 << 30
 
 
 @dataclass
@@ -178,16 +188,74 @@ class Session:
         work.problems.clear()
 
 
+class Journal:
+    """What came of cases, in a file: a later run with the same file tries the others only.
+
+    Parameters
+    ----------
+    path : Path or None
+        None keeps nothing.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._known: dict[str, tuple[bool, list[Problem]]] = {}
+        if path is not None and path.exists():
+            for line in path.read_text().splitlines():
+                name, reached, problems = json.loads(line)
+                self._known[name] = reached, [Problem(*words) for words in problems]
+
+    def take(self, cases: Sequence[Case], report: Report) -> list[Case]:
+        """Those that are still to be tried; what came of the others is added to a report."""
+        left: list[Case] = []
+        for case in cases:
+            known = self._known.get(str(case))
+            if known is None:
+                left.append(case)
+            else:
+                report.outcomes.append(Outcome(case, known[0]))
+                report.problems += known[1]
+        return left
+
+    def add(self, outcomes: Sequence[Outcome], problems: Sequence[Problem]) -> None:
+        """Write down what came of cases that were tried together."""
+        if self._path is None or not outcomes:
+            return
+        by_case: dict[str, list[tuple[str, str, str]]] = {str(outcome.case): [] for outcome in outcomes}
+        for problem in problems:
+            # One that is seen when everything is compared is put to the last of them.
+            name = problem.case if problem.case in by_case else str(outcomes[-1].case)
+            by_case[name].append((problem.case, problem.kind, problem.text))
+        with self._lock, self._path.open("a") as file:
+            for outcome in outcomes:
+                file.write(json.dumps([str(outcome.case), outcome.reached, by_case[str(outcome.case)]]) + "\n")
+
+
 def run(
-    folder: Path,
     part: float = 1.0,
     seconds: float | None = None,
     *,
     seed: int = 1,
     scenarios: Collection[str] = SCENARIOS,
     chosen: Callable[[Case], bool] = lambda case: True,
+    journal: Path | None = None,
+    sessions: int | None = None,
 ) -> Report:
     """Try a part of all cases, drawn at random, or as many as the seconds allow.
+
+    Parameters
+    ----------
+    part : float
+    seconds : float or None
+    seed : int
+    scenarios : collection of str
+    chosen : callable
+        Whether a case is one of them.
+    journal : Path or None
+        A file of cases that were tried before, see `Journal`.
+    sessions : int or None
+        How many cases are tried at the same time; None: as many as there are processors, and one that waits.
 
     Raises
     ------
@@ -195,11 +263,64 @@ def run(
         When calls cannot be made to fail on this machine.
     """
     started = time.monotonic()
+    until = None if seconds is None else started + seconds
+    kept = Journal(journal)
+    with tempfile.TemporaryDirectory(dir=in_memory()) as folder:
+        with Session(Path(folder) / "first") as session:
+            report = session.report
+            cases = [case for case in session.everything(scenarios) if chosen(case)]
+            report.cases = len(cases)
+            random.Random(seed).shuffle(cases)
+            cases = kept.take(cases[: round(part * len(cases))], report)
+            batches = _batches(cases, random.Random(seed))
+        count = sessions or (os.cpu_count() or 1) + 1
+        with ThreadPoolExecutor(count) as pool:
+            working = [
+                pool.submit(_work, Path(folder) / f"session{number}", batches, until, kept, report)
+                for number in range(min(count, batches.qsize()))
+            ]
+            for one in working:
+                one.result()
+    report.problems = sorted(set(report.problems))  # some are seen twice, before and after a restart
+    report.seconds = time.monotonic() - started
+    return report
+
+
+def in_memory() -> str | None:
+    """A folder for files in memory, if there is one with room: what fails is called for, whatever is below it."""
+    place = Path("/dev/shm")
+    try:
+        room = os.access(place, os.W_OK) and shutil.disk_usage(place).free > _ROOM
+    except OSError:
+        return None
+    return str(place) if room else None
+
+
+def _batches(cases: Sequence[Case], draw: random.Random) -> queue.SimpleQueue[list[Case]]:
+    """Cases to be tried together, in any order: those in operation share a server."""
+    result: list[list[Case]] = []
+    for alike in (True, False):
+        some = [case for case in cases if (case.scenario == "operation") == alike]
+        result += [some[start : start + _TOGETHER] for start in range(0, len(some), _TOGETHER)]
+    draw.shuffle(result)
+    batches: queue.SimpleQueue[list[Case]] = queue.SimpleQueue()
+    for batch in result:
+        batches.put(batch)
+    return batches
+
+
+def _work(
+    folder: Path, batches: queue.SimpleQueue[list[Case]], until: float | None, journal: Journal, report: Report
+) -> None:
     with Session(folder) as session:
-        cases = [case for case in session.everything(scenarios) if chosen(case)]
-        session.report.cases = len(cases)
-        random.Random(seed).shuffle(cases)
-        session.run(cases[: round(part * len(cases))], None if seconds is None else started + seconds)
-    session.report.problems = sorted(set(session.report.problems))  # some are seen twice, before and after a restart
-    session.report.seconds = time.monotonic() - started
-    return session.report
+        while until is None or time.monotonic() < until:
+            try:
+                batch = batches.get_nowait()
+            except queue.Empty:
+                return
+            session.run(batch, until)
+            outcomes, problems = session.report.outcomes, session.report.problems
+            journal.add(outcomes, problems)
+            report.outcomes += outcomes
+            report.problems += problems
+            session.report = Report()

@@ -174,8 +174,6 @@ def _delete_unfinished(work: Operation) -> None:
 
 
 def _retry(work: Operation) -> None:
-    if not work.talk.retries:
-        return
     body, _ = work.fresh()
     surface = work.sent(body[:-1], None)
     work.talk.quiet(surface)

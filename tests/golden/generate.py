@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.encoding import encoder, large_units, preparation, stages
+from lodestream.encoding import allocated, encoder, large_units, prepared, quantized, transformed
 from lodestream.encoding.allocation import TileCurve, assign_layers
 from lodestream.entropy.tile_coder import TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
@@ -83,13 +83,13 @@ class Crafted:
                 patch.setattr(large_units, "_LARGE", 1)
                 patch.setattr(large_units, "_MOST", float("inf"))
             if self.tile:
-                patch.setattr(preparation, "tile_exponents", lambda *_: self.tile)
+                patch.setattr(prepared, "tile_exponents", lambda *_: self.tile)
             if self.factor > 1:
                 patch.setattr(encoder, "_COARSER", ())  # no container of fewer bits is tried
-                patch.setattr(stages, "gather", gathered)
+                patch.setattr(transformed, "gather", gathered)
             if self.ones:
-                patch.setattr(stages, "planes_of", planes)
-                patch.setattr(stages, "assign_layers", assigned)
+                patch.setattr(quantized, "planes_of", planes)
+                patch.setattr(allocated, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)
             yield
 

@@ -8,13 +8,14 @@ that reached new code, with changes. What a fault came of is kept in ``build/ker
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from . import scenes
@@ -104,8 +105,12 @@ def fuzz(program: Path, kernel: str, beginnings: Path, seconds: float, cases: in
     return Fuzzed(kernel, done_, accepted, kept, taken, None)
 
 
-def fuzz_all(names: Sequence[str], seconds: float, cases: int = 2**62, seed: int = 1) -> list[Fuzzed]:
+def fuzz_all(
+    names: Sequence[str], seconds: float, cases: int = 2**62, seed: int = 1, kept: Path | None = None
+) -> list[Fuzzed]:
     """Fuzz several kernels, all together for so many seconds, as many at a time as there are processors.
+
+    In the folder `kept` is noted which kernels had so many cases: they are not called again with the same folder.
 
     Raises
     ------
@@ -118,8 +123,18 @@ def fuzz_all(names: Sequence[str], seconds: float, cases: int = 2**62, seed: int
     program, beginnings = fuzzer(compiler), seeds()
     processors = min(os.cpu_count() or 1, len(names))
     each = seconds * processors / len(names)
+
+    def work(name: str) -> Fuzzed:
+        file = None if kept is None else kept / f"{name}.json"
+        if file is not None and file.exists():
+            return Fuzzed(**json.loads(file.read_text()))
+        found = fuzz(program, name, beginnings, each, cases, seed)
+        if file is not None and found.fault is None and found.cases >= cases:
+            file.write_text(json.dumps(asdict(found)))
+        return found
+
     with ThreadPoolExecutor(processors) as pool:
-        return list(pool.map(lambda name: fuzz(program, name, beginnings, each, cases, seed), names))
+        return list(pool.map(work, names))
 
 
 def main() -> int:

@@ -28,12 +28,18 @@ __all__ = ["TESTS", "main", "run_tests"]
 TESTS = ("tests/core/container/test_golden.py", "tests/core/entropy/test_mask.py", "tests/kernels/test_refusals.py")
 #: With these they run every line of the kernels; that takes minutes more.
 MORE_TESTS = tuple(
-    f"tests/core/test_{name}.py"
-    for name in (
-        *("picture", "bitplanes_kernel", "lifting", "exactness", "single_error", "mesh_walks", "mesh_lattice"),
-        *("hostile_walks", "mesh_attributes", "spreading", "rate_distortion", "bitplanes", "fill", "lzf", "transform"),
-        *("kernel_calls", "large_units"),
+    f"tests/core/{folder}/test_{name}.py"
+    for folder, names in (
+        ("decoding", ("kernel_calls",)),
+        ("encoding", ("single_error", "rate_distortion", "fill", "large_units")),
+        ("entropy", ("bitplanes_kernel", "dequantize", "bitplanes")),
+        ("formats", ("lzf",)),
+        ("mesh", ("mesh_walks", "hostile_walks", "mesh_attributes")),
+        ("quantization", ("distortion", "mesh_lattice")),
+        ("residual", ("chunk_coder",)),
+        ("transform", ("lifting", "pyramid")),
     )
+    for name in names
 )
 
 _SECONDS = 60.0

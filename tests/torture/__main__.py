@@ -3,11 +3,15 @@
 Without names every part runs, and docs/reliability.md is written, again whenever a part ends: a run that is interrupted
 leaves what there is. ``--seconds 300 fuzz=600`` is the most that each part may take which can be cut short; it then
 says how far it came. ``--count`` makes each part that many times as large.
+
+A machine that is not free for so long: ``--resume FOLDER`` keeps what was done in a folder, and goes on from there when
+it is given again, for the same program. What a part had begun is begun again, but for faults, fuzz and kernels.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import platform
 import signal
@@ -43,7 +47,10 @@ def main() -> int:
     parser.add_argument(
         "--page", type=Path, help="where to write the page (default: docs/reliability.md, for all parts)"
     )
+    parser.add_argument("--resume", metavar="FOLDER", type=Path, help="keep what is done there, and go on from there")
     args = parser.parse_args()
+    if args.resume is not None and not _of_this_program(args.resume):
+        parser.error(f"expected a folder of runs of this program, got {args.resume}, of another version")
     unknown = sorted(set(args.part) - PARTS.keys())
     if unknown:
         parser.error(f"expected parts of {', '.join(PARTS)}, got {', '.join(unknown)}")
@@ -57,7 +64,7 @@ def main() -> int:
     print("\n".join(page.machine), flush=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        Lanes(page.begun, page.ended).run(wishes)
+        Lanes(page.begun, page.ended, args.resume).run(wishes)
     except KeyboardInterrupt:
         print(f"\n{page.state()}")
         return 130
@@ -125,6 +132,22 @@ class Page:
             new = self._path.with_suffix(".new")
             new.write_text(before + _MARK + "\n".join(lines) + "\n")
             new.replace(self._path)
+
+
+def _of_this_program(folder: Path) -> bool:
+    """Whether what is kept in a folder, which is made if it is not there, is of these sources."""
+    root = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for path in sorted(
+        path for part in ("core", "server", "client", "tests") for path in (root / part).rglob("*.[pch]*")
+    ):
+        if path.suffix in (".py", ".c", ".h"):
+            digest.update(f"{path.relative_to(root)} {path.stat().st_size}\n".encode() + path.read_bytes())
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "program"
+    if not file.exists():
+        file.write_text(digest.hexdigest())
+    return file.read_text() == digest.hexdigest()
 
 
 def _limit(text: str) -> tuple[str, float]:

@@ -74,18 +74,21 @@ class Fuzzed:
     memory: int
 
 
-def run(target: str, count: int, seconds: float | None = None, seed: int = 1) -> Fuzzed:
+def run(target: str, count: int, seconds: float | None = None, seed: int = 1, folder: Path | None = None) -> Fuzzed:
     """Fuzz a target in a process of its own.
+
+    A run with the folder of another one goes on with its corpus, and its cases count.
 
     Raises
     ------
     AssertionError
         When it found a fault: with what the process said.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        state = Path(folder, "state.json")
+    with _folder(folder) as folder:
+        folder.mkdir(exist_ok=True)
+        state = folder / "state.json"
         command = [sys.executable, "-m", "tests.torture.fuzz", target, "--count", str(count), "--seed", str(seed)]
-        command += ["--folder", folder, *(["--seconds", str(seconds)] if seconds is not None else [])]
+        command += ["--folder", str(folder), *(["--seconds", str(seconds)] if seconds is not None else [])]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         started = time.monotonic()
         with subprocess.Popen(
@@ -96,7 +99,7 @@ def run(target: str, count: int, seconds: float | None = None, seed: int = 1) ->
         found = (
             json.loads(state.read_text()) if state.exists() else {"cases": 0, "taken": 0, "fuzzer": "?", "memory": 0}
         )
-        faults = [repr(path.read_bytes()[:4000]) for path in Path(folder).glob("fault-*")]
+        faults = [repr(path.read_bytes()[:4000]) for path in folder.glob("fault-*")]
         # The fuzzer's own diary is of no interest where there is a traceback.
         said = said[said.rfind("Traceback (most recent call last)") :] if "Traceback" in said else said
         assert process.returncode == 0, f"{target}, after {found['cases']:,} cases: {said[:4000]} {faults}"
@@ -110,6 +113,8 @@ class _Tally:
         self._target = target
         self._state = folder / "state.json"
         self._found: dict[str, Any] = {"fuzzer": fuzzer, "cases": 0, "taken": 0, "memory": 0}
+        if self._state.exists():  # of an earlier run
+            self._found |= json.loads(self._state.read_text())
 
     @property
     def cases(self) -> int:
@@ -141,7 +146,8 @@ def _loop(target: Target, count: int, seconds: float, seed: int, folder: Path) -
         raise TimeoutError(f"expected an end within {PATIENCE} s")
 
     signal.signal(signal.SIGALRM, too_long)
-    tally, random_, corpus = _Tally(target, "own mutations", folder), random.Random(seed), target.corpus()
+    tally, corpus = _Tally(target, "own mutations", folder), target.corpus()
+    random_ = random.Random(seed + tally.cases)
     until = time.monotonic() + seconds
     while tally.cases < count and time.monotonic() < until:
         data = mutate(random_.choice(corpus), random_)
@@ -162,9 +168,14 @@ def _atheris(name: str, count: int, seconds: float, seed: int, folder: Path) -> 
     with atheris.instrument_imports(include=_INSTRUMENTED):
         from .targets import TARGETS, mutate
     target = TARGETS[name]
+    _measure_memory_once()
     tally = _Tally(target, "atheris", folder)
     corpus = folder / "corpus"
-    corpus.mkdir()
+    corpus.mkdir(exist_ok=True)
+    seed += tally.cases
+    left = count - tally.cases
+    if left <= 0:
+        return
     known = target.corpus()
     for number, data in enumerate(known):
         (corpus / str(number)).write_bytes(data)
@@ -185,11 +196,26 @@ def _atheris(name: str, count: int, seconds: float, seed: int, folder: Path) -> 
         if tally.cases == count:
             tally.write()
 
-    arguments = [sys.argv[0], str(corpus), f"-runs={count}", f"-seed={seed}", f"-timeout={PATIENCE}", "-max_len=65536"]
-    arguments += [f"-rss_limit_mb={MEMORY >> 20}", f"-artifact_prefix={folder}/fault-", "-print_final_stats=0"]
+    arguments = [sys.argv[0], str(corpus), f"-runs={left}", f"-seed={seed}", f"-timeout={PATIENCE}", "-max_len=65536"]
+    # A change that `mutate` makes is one or several already, and each is mended anew.
+    arguments += [
+        "-mutate_depth=1",
+        f"-rss_limit_mb={MEMORY >> 20}",
+        f"-artifact_prefix={folder}/fault-",
+        "-print_final_stats=0",
+    ]
     arguments += [f"-max_total_time={max(1, int(seconds))}"] if seconds != float("inf") else []
     atheris.Setup(arguments, once, custom_mutator=change)
     atheris.Fuzz()
+
+
+def _measure_memory_once() -> None:
+    from lodestream.container import capacity  # not before its lines are counted
+
+    # Each decoder reads several files for it, in which nothing changes: a sixth of the time of a case.
+    limit = capacity.memory_limit()
+    names: Any = capacity
+    names.memory_limit = lambda: limit
 
 
 def main() -> None:
@@ -210,6 +236,7 @@ def main() -> None:
         else:
             from .targets import TARGETS
 
+            _measure_memory_once()
             _loop(TARGETS[args.target], args.count, args.seconds, args.seed, folder)
             print((folder / "state.json").read_text())
 

@@ -1,7 +1,7 @@
 """The parts of ``make torture``: each does what it is told for a while and says what it did.
 
-``python -m tests.torture.parts NAME COUNT SECONDS FILE`` writes what one did into a file; SECONDS may be ``-``. A part
-imports what it needs when it runs: the others would take longer to load than many a part to begin.
+``python -m tests.torture.parts NAME COUNT SECONDS FILE KEPT`` writes what one did into a file; SECONDS and KEPT may be
+``-``. A part imports what it needs when it runs: the others would take longer to load than many a part to begin.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +75,8 @@ class Part:
         How many there are without other wishes.
     work : callable (folder, count, seconds) -> (cases, facts)
         Does so many, or as many as the seconds allow; raises where anything is wrong.
+    continues : bool
+        What it leaves in its folder says how far it came: with the same folder it goes on from there.
     """
 
     name: str
@@ -81,13 +84,18 @@ class Part:
     unit: str
     count: int
     work: Callable[[Path, int, float | None], tuple[int, tuple[str, ...]]]
+    continues: bool = False
 
-    def run(self, count: int, seconds: float | None) -> Result:
-        """Do it."""
+    def run(self, count: int, seconds: float | None, kept: Path | None = None) -> Result:
+        """Do it; a part that continues keeps in a folder how far it came, if there is one for that."""
         started = time.monotonic()
-        with tempfile.TemporaryDirectory() as folder:
+        with ExitStack() as held:
+            if kept is not None and self.continues:
+                folder = kept
+            else:
+                folder = Path(held.enter_context(tempfile.TemporaryDirectory()))
             try:
-                cases, facts = self.work(Path(folder), count, seconds)
+                cases, facts = self.work(folder, count, seconds)
                 failure = None
             except Exception:
                 cases, facts, failure = 0, (), traceback.format_exc()
@@ -206,7 +214,7 @@ def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
     from tests.faults.shim import CannotError
 
     try:
-        report = faults.run(folder, count / 100, seconds)
+        report = faults.run(count / 100, seconds, journal=folder / "journal")
     except CannotError as error:
         return 0, (f"skipped: {error}",)
     # The figures come last: of many problems the page shows the end.
@@ -222,7 +230,7 @@ def _fuzz(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[s
 
     def work(name: str) -> None:
         try:
-            found[name] = fuzz.run(name, count, seconds)
+            found[name] = fuzz.run(name, count, seconds, folder=folder / name)
         except BaseException as error:
             found[name] = error
 
@@ -250,7 +258,8 @@ def _kernels(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
 
     if sanitizing_compiler() is None:
         return 0, ("skipped: there is neither a gcc nor a clang with sanitizers",)
-    found = fuzz_all(list(declarations()), math.inf if seconds is None else seconds, count, seed=time.time_ns() % 2**32)
+    limit, seed = math.inf if seconds is None else seconds, time.time_ns() % 2**32
+    found = fuzz_all(list(declarations()), limit, count, seed, kept=folder)
     assert not any(item.fault for item in found), "\n".join(str(item) for item in found if item.fault)
     return min(item.cases for item in found), tuple(map(str, found))
 
@@ -274,18 +283,29 @@ PARTS = {
         Part("kills", "Kill -9 under upload, build, stream and delete", "kills", 200, _kills),
         Part("disk", "A disk that is full most of the time", "requests", 2000, _disk),
         Part("history", "One history through disasters, every acknowledged state in order", "disasters", 200, _history),
-        Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults),
-        Part("fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz),
+        Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults, continues=True),
+        Part(
+            "fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz, continues=True
+        ),
         Part("decoders", "The compiled decoder and the reference", "surfaces", 2000, _decoders),
-        Part("kernels", "Any calls of the C kernels, under sanitizers", "cases of each", 1_000_000, _kernels),
+        Part(
+            "kernels",
+            "Any calls of the C kernels, under sanitizers",
+            "cases of each",
+            1_000_000,
+            _kernels,
+            continues=True,
+        ),
     )
 }
 
 
 def main() -> None:
     """Do one part."""
-    name, count, seconds, file = sys.argv[1:]
-    result = PARTS[name].run(int(count), None if seconds == "-" else float(seconds))
+    name, count, seconds, file, kept = sys.argv[1:]
+    result = PARTS[name].run(
+        int(count), None if seconds == "-" else float(seconds), None if kept == "-" else Path(kept)
+    )
     Path(file).write_text(result.to_json())
 
 

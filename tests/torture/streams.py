@@ -234,8 +234,8 @@ async def _one(url: str, container: bytes, seed: int, expected: dict[ls.Target, 
             else:
                 report.problems.append(f"seed {seed}: other points")
         reception = stream._reception
-        if reception.data_bytes != reception.held.total:
-            report.problems.append(f"seed {seed}: {reception.data_bytes} bytes for {reception.held.total}")
+        if reception.data_bytes != reception.cached.total:
+            report.problems.append(f"seed {seed}: {reception.data_bytes} bytes for {reception.cached.total}")
         report.connections += stream.connections
 
 

@@ -22,8 +22,7 @@ import numpy as np
 
 import lodestream as ls
 from lodestream import formats
-from lodestream.container import FrameReader, headers, read_index, sections
-from lodestream.container import Header as ContainerHeader
+from lodestream.container import FrameReader, Header, headers, read_index, sections
 from lodestream.container.frames import section_extent
 from lodestream.container.index import parse_root
 from lodestream.container.sections import FOOTER_LENGTH, SIGNATURE
@@ -43,10 +42,10 @@ from lodestream.protocol.messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     MessageError,
     Open,
+    Opened,
     Segments,
     Stop,
 )
@@ -241,7 +240,7 @@ def _container(data: bytes) -> bool:
     return whole
 
 
-def _points(header: ContainerHeader) -> int:
+def _points(header: Header) -> int:
     return max(1, header.channels) * sum(rows * columns for (rows, columns), _ in header.blocks)
 
 
@@ -264,7 +263,7 @@ def _messages() -> tuple[bytes, ...]:
         Credit(2**40),
         Stop(),
         Bye(),
-        Header("ab" * 32, 1000, 900, 1.5, (950, 40), (900, 50), True),
+        Opened("ab" * 32, 1000, 900, 1.5, (950, 40), (900, 50), True),
         Segments(7, bytes(range(50))),
         Layer(1, 2, 3, 0.5, 0.25),
         End("complete"),

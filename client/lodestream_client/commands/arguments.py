@@ -6,21 +6,26 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import OptionError
+from lodestream.quality import Quality
 from lodestream.target import Region, Target, Tolerance
 
 from ..requests import addresses
 
 if TYPE_CHECKING:
+    from ..requests.memory import Closure
+
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
     Subparsers = Any
 
 __all__ = [
     "Subparsers",
+    "SurfaceOptions",
     "add_command",
     "add_json_option",
     "add_rate_option",
@@ -37,7 +42,7 @@ __all__ = [
     "parse_source",
     "parse_surface",
     "parse_tolerance",
-    "precisions",
+    "quality_of",
     "standard_input_once",
     "standard_output_once",
     "surface_options",
@@ -156,12 +161,10 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     return checked
 
 
-def _precision(text: str) -> tuple[str | None, Tolerance]:
-    # A name may hold an equals sign, a tolerance does not.
-    name, equals, tolerance = text.rpartition("=")
-    if equals and not name:
+def _precision(text: str) -> str:
+    if "" in Quality.parse([text]).attributes:
         raise OptionError(f"expected P or NAME=P, got {text!r}")
-    return name or None, Tolerance.parse(tolerance)
+    return text
 
 
 parse_tolerance = _checked(Tolerance.parse)
@@ -283,11 +286,35 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def surface_options(args: argparse.Namespace) -> dict[str, str]:
-    """The ``-o`` options.
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How files become a surface, as the command line says.
 
-    Ends the program if a key is given twice.
+    Attributes
+    ----------
+    quality : Quality
+    closed : "auto", "none", "rows", "cols" or "both"
+    name : str or None
+        Name of the surface.
+    format_options : mapping of str to str
+        The ``-o`` options.
     """
+
+    quality: Quality
+    closed: Closure
+    name: str | None
+    format_options: Mapping[str, str]
+
+
+def surface_options(args: argparse.Namespace) -> SurfaceOptions:
+    """The options that `add_surface_options` adds.
+
+    Ends the program if they are wrong, for example if a key is given twice.
+    """
+    return SurfaceOptions(quality_of(args), args.closed, args.name, _format_options(args))
+
+
+def _format_options(args: argparse.Namespace) -> dict[str, str]:
     options: dict[str, str] = {}
     for key, value in args.options:
         if key in options:
@@ -296,20 +323,16 @@ def surface_options(args: argparse.Namespace) -> dict[str, str]:
     return options
 
 
-def precisions(args: argparse.Namespace) -> tuple[Tolerance | None, dict[str, Tolerance]]:
-    """The precision of the points, and those of attributes by name.
+def quality_of(args: argparse.Namespace) -> Quality:
+    """The quality that ``--precision`` and ``--rms`` ask for.
 
-    Ends the program if one is given twice, or one of the points together with ``--rms``.
+    Ends the program if a precision is given twice, or one of the points together with ``--rms``.
     """
-    found: dict[str | None, Tolerance] = {}
-    for name, tolerance in args.precisions:
-        if name in found:
-            args.parser.error(f"argument --precision: {'P' if name is None else name} given twice")
-        found[name] = tolerance
-    points = found.pop(None, None)
-    if points is not None and args.rms is not None:
-        args.parser.error("argument --rms: not allowed with a --precision of the points")
-    return points, {str(name): tolerance for name, tolerance in found.items()}
+    try:
+        return Quality.parse(args.precisions, None if args.rms is None else str(args.rms))
+    except OptionError as error:
+        args.parser.error(f"argument --precision: {error}")
+        raise  # not reached: the parser has ended the program
 
 
 def _region(text: str) -> Region:

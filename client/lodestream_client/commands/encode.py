@@ -6,22 +6,21 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import OptionError
-from lodestream.target import Tolerance
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
 from .arguments import (
     Subparsers,
+    SurfaceOptions,
     add_command,
     add_json_option,
     add_surface_options,
-    precisions,
     standard_input_once,
     standard_output_once,
     surface_options,
@@ -31,7 +30,7 @@ from .inputs import input_files
 if TYPE_CHECKING:
     from lodestream.surface import Surface
 
-__all__ = ["EncodeOptions", "register", "run"]
+__all__ = ["EncodeOptions", "read_surface", "register", "run"]
 
 
 def register(subparsers: Subparsers) -> None:
@@ -55,12 +54,7 @@ class EncodeOptions:
 
     files: tuple[str, ...]
     out: str
-    precision: Tolerance | None
-    rms: Tolerance | None
-    attribute_precision: Mapping[str, Tolerance]
-    closed: str
-    name: str | None
-    format_options: Mapping[str, str]
+    surface: SurfaceOptions
     json: bool
 
 
@@ -69,19 +63,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     standard_output_once(args, "container")
-    options = surface_options(args)
-    precision, attribute_precision = precisions(args)
-    return EncodeOptions(
-        standard_input_once(args, args.files),
-        args.out,
-        precision,
-        args.rms,
-        attribute_precision,
-        args.closed,
-        args.name,
-        options,
-        args.json,
-    )
+    return EncodeOptions(standard_input_once(args, args.files), args.out, surface_options(args), args.json)
 
 
 @interruptible()
@@ -94,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if options.out != "-":
         require_folder(Path(options.out))
     started = time.monotonic()
-    surface = _read(options)
+    surface = read_surface(options.files, options.surface)
     container = _encoded(surface, options)
     if options.out == "-":
         sys.stdout.buffer.write(container)
@@ -105,10 +87,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _read(options: EncodeOptions) -> Surface:
+def read_surface(names: Sequence[str], options: SurfaceOptions) -> Surface:
+    """Read the surface of one or several files; ``-`` is standard input.
+
+    Raises
+    ------
+    OptionError
+        If an option is none of the format.
+    LodestreamError, OSError
+        From `lodestream.read`.
+    """
     import lodestream as ls
 
-    with input_files(options.files) as files:
+    with input_files(names) as files:
         first, *more = files.paths
         format_options = _format_options(options.format_options)
         surface = ls.read(first, *more, closed=options.closed, filename=files.filename, **format_options)
@@ -124,9 +115,7 @@ def _encoded(surface: Surface, options: EncodeOptions) -> bytes:
         task = progress.add_task("encoding", total=1.0, figures="")
         return ls.encode(
             surface,
-            options.precision,
-            rms=options.rms,
-            attribute_precision=options.attribute_precision,
+            quality=options.surface.quality,
             progress=lambda fraction: progress.update(task, completed=fraction),
         )
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.target import Tolerance
-
 from ..terminal.output import human_size, note_details, print_json, progress_bar, say
 from .arguments import (
     Subparsers,
+    SurfaceOptions,
     add_command,
     add_json_option,
     add_surface_options,
     add_token_option,
     parse_server,
-    precisions,
     standard_input_once,
     surface_options,
     token_of,
@@ -28,7 +25,7 @@ from .inputs import input_files
 
 if TYPE_CHECKING:
     from ..requests.api import Description
-    from ..requests.bodies import Closure, Source
+    from ..requests.bodies import Source
 
 __all__ = ["PushOptions", "register", "run"]
 
@@ -58,12 +55,7 @@ class PushOptions:
 
     files: tuple[str, ...]
     url: str
-    precision: Tolerance | None
-    rms: Tolerance | None
-    attribute_precision: Mapping[str, Tolerance]
-    closed: Closure
-    name: str | None
-    format_options: Mapping[str, str]
+    surface: SurfaceOptions
     wait: bool
     token: str | None
     json: bool
@@ -71,17 +63,10 @@ class PushOptions:
 
 def _options(args: argparse.Namespace) -> PushOptions:
     """The options; ends the program if the command line is wrong."""
-    options = surface_options(args)
-    precision, attribute_precision = precisions(args)
     return PushOptions(
         standard_input_once(args, args.files),
         args.url,
-        precision,
-        args.rms,
-        attribute_precision,
-        args.closed,
-        args.name,
-        options,
+        surface_options(args),
         not args.no_wait,
         token_of(args),
         args.json,
@@ -103,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
 def _uploaded(options: PushOptions) -> Description:
     from .. import sync
 
+    wanted = options.surface
     with input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
         # Standard input has no name of its own to tell.
         sources: list[Source] = [
@@ -118,12 +104,12 @@ def _uploaded(options: PushOptions) -> Description:
         return sync.upload(
             options.url,
             *sources,
-            precision=options.precision,
-            rms=options.rms,
-            attribute_precision=options.attribute_precision,
-            closed=options.closed,
-            name=options.name,
-            options=options.format_options,
+            precision=wanted.quality.precision,
+            rms=wanted.quality.rms,
+            attribute_precision=wanted.quality.attributes,
+            closed=wanted.closed,
+            name=wanted.name,
+            options=wanted.format_options,
             wait=options.wait,
             progress=progress,
             token=options.token,

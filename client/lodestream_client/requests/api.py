@@ -187,10 +187,10 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
     """Description of a container file on any web server."""
     from lodestream.container import describe
     from lodestream.transfer.range_download import RangeDownload
-    from lodestream.transfer.receiver_state import Reception
+    from lodestream.transfer.receiver_state import ReceiverState
 
     # Of the coarsest level nothing needs to come before the index.
-    reception = Reception(Target(level=0), max_vertices=max_vertices)
+    reception = ReceiverState(Target(level=0), max_vertices=max_vertices)
     download = RangeDownload(reception)
     while reception.index is None:
         request, _ = download.request()

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from lodestream.errors import InputError, OptionError
-from lodestream.target import Tolerance
 
 from .memory import Asked, Closure, encoded, in_memory
 
@@ -155,14 +154,11 @@ def _is_container(file: BinaryIO) -> bool:
 def _parameters(asked: Asked) -> dict[str, str | list[str]]:
     """The query of an upload."""
     parameters: dict[str, str | list[str]] = {}
-    if asked.precision is not None and asked.rms is not None:
-        raise OptionError("expected either a precision or a root mean square error, got both")
-    precisions = [] if asked.precision is None else [_tolerance(asked.precision)]
-    precisions += [f"{attribute}={_tolerance(value)}" for attribute, value in asked.attribute_precision.items()]
+    precisions, rms = asked.quality.texts()
     if precisions:
         parameters["precision"] = precisions
-    if asked.rms is not None:
-        parameters["rms"] = _tolerance(asked.rms)
+    if rms is not None:
+        parameters["rms"] = rms
     if asked.closed != "auto":
         parameters["closed"] = asked.closed
     if asked.name:
@@ -172,7 +168,3 @@ def _parameters(asked: Asked) -> dict[str, str | list[str]]:
             raise OptionError(f"{key} is not an option of a format")
         parameters[key] = value
     return parameters
-
-
-def _tolerance(error: Tolerance | float | str) -> str:
-    return str(error if isinstance(error, Tolerance) else Tolerance.parse(str(error)))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from lodestream.errors import InputError, OptionError
+from lodestream.quality import Quality
 from lodestream.target import Tolerance
 
 if TYPE_CHECKING:
@@ -40,6 +41,17 @@ class Asked:
     name: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
     attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
+
+    @property
+    def quality(self) -> Quality:
+        """How closely the surface is to be kept.
+
+        Raises
+        ------
+        OptionError
+            If an error is no number of 0 or more, or both a precision and a root mean square error are asked for.
+        """
+        return Quality.of(self.precision, self.rms, self.attribute_precision)
 
 
 def in_memory(source: object) -> bool:
@@ -101,9 +113,7 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
     surface.metadata = _noted(surface)
     return encode(
         surface,
-        asked.precision,
-        rms=asked.rms,
-        attribute_precision=asked.attribute_precision,
+        quality=asked.quality,
         progress=None if progress is None else (lambda fraction: progress("encoding", fraction)),
     )
 

@@ -106,7 +106,7 @@ class Core:
         session = self.session
         session.transports.start(session.clock())
         while True:
-            before, session.withheld = session.reception.held.total, ""
+            before, session.withheld = session.reception.cached.total, ""
             try:
                 if session.transports.transport == "ws":
                     yield from over_websocket.receive(session)
@@ -119,7 +119,7 @@ class Core:
                 yield HangUp(abort=True)
                 if session.over():
                     return
-                progressed = session.reception.held.total > before
+                progressed = session.reception.cached.total > before
                 try:
                     pause = session.transports.failed(error, session.clock(), progressed=progressed)
                 except LodestreamError:

@@ -16,7 +16,7 @@ from lodestream.errors import RemoteError
 from lodestream.target import Region
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.range_download import RangeDownload
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 
 from ..errors import SilenceError
 from ..requests import addresses, answers, problems
@@ -54,7 +54,7 @@ class Session:
         Seconds without data after which a connection counts as lost.
     transports : Transports
         Which transport comes next, and when.
-    reception : Reception
+    reception : ReceiverState
         What has arrived.
     download : Download or None
         The last connection by WebSocket.
@@ -88,7 +88,7 @@ class Session:
         rate = options.limit_rate
         self._link = Link(rate) if rate is not None else None
         self.window = window_for(rate) if options.window is None and rate is not None else options.window
-        self.reception = Reception(
+        self.reception = ReceiverState(
             options.target,
             store=options.store,
             container=options.container,

@@ -11,7 +11,7 @@ from .session import Session
 
 if TYPE_CHECKING:
     from lodestream.decoding.decoder import Decoder
-    from lodestream.protocol.messages import Header
+    from lodestream.protocol.messages import Opened
 
 __all__ = ["BaseStream"]
 
@@ -68,10 +68,10 @@ class BaseStream:
         return self._reception.decoder
 
     @property
-    def header(self) -> Header | None:
+    def header(self) -> Opened | None:
         """The server's first message over the WebSocket: the container's SHA-256 and size, and how much is planned."""
         download = self._session.download
-        return download.header if download is not None else None
+        return download.answer if download is not None else None
 
     @property
     def identity(self) -> Identity:

@@ -1,4 +1,4 @@
-"""The chunks of an residual section: one for each channel in each window of each block."""
+"""The chunks of a residual section: one for each channel in each window of each block."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from .model import Header
 
-__all__ = ["Window", "count_windows", "windows"]
+__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel"]
 
 
-class Window(NamedTuple):
+class ChunkPlace(NamedTuple):
     """A chunk's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept."""
 
     channel: int
@@ -20,8 +20,8 @@ class Window(NamedTuple):
     kept: bool = False
 
 
-def windows(header: Header) -> Iterator[Window]:
-    """All chunks in the order of the file: block by block, row by row of windows, channel by channel.
+def chunk_places(header: Header) -> Iterator[ChunkPlace]:
+    """All chunks in the order of the file: block by block, row by row of places, channel by channel.
 
     A block of which holes are kept has as many chunks again, in the same order, of these.
     """
@@ -32,9 +32,9 @@ def windows(header: Header) -> Iterator[Window]:
                 for left in range(0, columns, width):
                     down, across = (top, min(top + height, rows)), (left, min(left + width, columns))
                     for channel in range(header.channels):
-                        yield Window(channel, block, down, across, kept)
+                        yield ChunkPlace(channel, block, down, across, kept)
 
 
-def count_windows(header: Header) -> int:
-    """How many windows there are, each with a chunk for every channel; those of kept holes count for themselves."""
-    return sum(1 for _ in windows(header)) // header.channels
+def chunks_of_a_channel(header: Header) -> int:
+    """How many chunks each channel has; those of kept holes count for themselves."""
+    return sum(1 for _ in chunk_places(header)) // header.channels

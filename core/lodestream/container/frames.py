@@ -1,4 +1,4 @@
-"""A container as it arrives: sections out of any chunking of its bytes, each checked before it is handed on."""
+"""A container as it arrives: sections however its bytes are cut, each checked before it is handed on."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class FrameReader:
         """Bytes that wait for the rest of their section."""
         return len(self._data)
 
-    def feed(self, chunk: bytes | memoryview) -> Iterator[Frame]:
+    def feed(self, data: bytes | memoryview) -> Iterator[Frame]:
         """Take bytes, yield the sections that are now complete.
 
         Raises
@@ -80,7 +80,7 @@ class FrameReader:
         UnsupportedVersionError
             Where the container is of another version, or a section that must be understood is not known.
         """
-        self._data += chunk
+        self._data += data
         while not self.ended and (frame := self._next()) is not None:
             if frame.kind in _KNOWN:
                 self.ended = frame.kind == sections.INDEX
@@ -139,6 +139,11 @@ def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | No
     """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told.
 
     ``offset`` is the section's place in the container.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the length takes more than nine bytes.
     """
     length, shift = 0, 0
     for place in range(1, min(len(data), 10)):

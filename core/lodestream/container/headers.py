@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import CorruptStreamError, TooLargeError
 from ..grid.layout import Layout
@@ -21,6 +22,7 @@ from .sections import HEADER, KEPT_MASKS, MASKS, SIGNATURE, section
 from .shape import (
     DTYPES,
     LONGEST_AXIS,
+    Blocks,
     Extras,
     parse_arrangement,
     parse_extras,
@@ -93,7 +95,13 @@ def _serialize_masks(header: Header) -> bytes:
 
 
 def parse_masks(header: Header, frame: Frame) -> Header:
-    """The header with the masks of their section."""
+    """The header with the masks of their section.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the section ends too early or too late, or integer points cannot have the value of holes.
+    """
     payload, offset = frame.payload, frame.payload_offset
     fields = FieldReader(payload, offset)
     (hole,) = fields.unpack("q")
@@ -121,7 +129,17 @@ def parse_masks(header: Header, frame: Frame) -> Header:
 
 
 def parse_header(payload: memoryview, offset: int, length: int) -> Header:
-    """Header section's payload, which stands at ``offset``; the header ends at ``length``."""
+    """Header section's payload, which stands at ``offset``; the header ends at ``length``.
+
+    Raises
+    ------
+    CorruptStreamError
+        If a field has a value that no header has, or they do not fit together.
+    TooLargeError
+        If an axis is longer than this version reads.
+    UnsupportedVersionError
+        If it takes a codec that this version does not have.
+    """
     fields = FieldReader(payload, offset)
     needed = codecs.parse_codecs(fields)
     flags, code = fields.byte(), fields.byte()
@@ -139,47 +157,20 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         blocks = ((shape, (bool(flags & 1), bool(flags & 2))),)
     points = sum(rows * columns for (rows, columns), _ in blocks)
     extras = parse_extras(fields.take(fields.varint(len(payload))), offset, points) if flags & 128 else Extras()
-    attributes = extras.attributes
-    channels = point_channels + sum(kind.channels for kind in attributes)
+    channels = point_channels + sum(kind.channels for kind in extras.attributes)
     few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
     if few or points * channels > LARGEST:
         raise CorruptStreamError(
             f"expected points, channels and layers, got {points} x {channels}, {layer_count} layers", offset
         )
-    longest = max(length for shape, _ in blocks for length in shape)
-    if longest > LONGEST_AXIS:
-        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {longest:,}")
-    for name, exponents in (("tiles", tile), ("chunks", chunk)):
-        # Across a narrow surface long ones would be many, and nearly empty.
-        many = count_rectangles(blocks, exponents) > 64 + len(blocks) + (points >> max(exponents))
-        if many or not _LEAST_BITS <= sum(exponents) <= _MOST_BITS or min(exponents) < 1:
-            raise CorruptStreamError(
-                f"expected {name} of 2**{_LEAST_BITS} to 2**{_MOST_BITS} that fit the surface, "
-                f"got exponents {exponents[0]} and {exponents[1]}",
-                offset,
-            )
+    _check_sizes(blocks, tile, chunk, offset)
     if not (math.isfinite(extent) and extent >= 0):
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
-    lattices = []
-    for _ in range(channels):
-        start, rule = fields.at, fields.byte()
-        origin, step = fields.number(), fields.number()
-        if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
-            raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
-        lattices.append(Lattice(_RULES[rule], origin, step))
-    grids = Layout.single(*blocks[0], tile) if arrangement is None else Layout(grids_of(arrangement), tile)
-    empty = tuple(fields.varint((2 << grids.levels) - 1) for _ in range(channels))
-    predictors = np.stack([default_predictors(grids)] * channels)
-    fitted = fitted_steps(grids)
-    for channel in range(channels):
-        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < min(point_channels, 3)]
-        start, count = fields.at, fields.varint()
-        if count != len(own):
-            raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
-        for level, axis in own:
-            predictors[channel, level, axis] = fields.unpack("bb")
-    if (predictors == -128).any():
-        raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
+    lattices = tuple(_parse_lattice(fields) for _ in range(channels))
+    # What follows is counted in levels, so that the levels must be known to read on.
+    layout = Layout.single(*blocks[0], tile) if arrangement is None else Layout(grids_of(arrangement), tile)
+    empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
+    predictors = _parse_predictors(fields, layout, channels, min(point_channels, 3), offset)
     fields.end()
     return Header(
         dtype=DTYPES[code],
@@ -187,8 +178,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         arrangement=arrangement,
         point_channels=point_channels,
         flat=bool(flags & 4),
-        attributes=attributes,
-        lattices=tuple(lattices),
+        attributes=extras.attributes,
+        lattices=lattices,
         predictors=predictors,
         extent=extent,
         empty=empty,
@@ -205,6 +196,49 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         joint_changes=extras.joint_changes,
         length=length,
     )
+
+
+def _check_sizes(blocks: Blocks, tile: tuple[int, int], chunk: tuple[int, int], offset: int) -> None:
+    """Refuse axes longer than any that is read, and tiles and chunks of which there would be too many."""
+    longest = max(length for shape, _ in blocks for length in shape)
+    if longest > LONGEST_AXIS:
+        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {longest:,}")
+    points = sum(rows * columns for (rows, columns), _ in blocks)
+    for name, exponents in (("tiles", tile), ("chunks", chunk)):
+        # Across a narrow surface long ones would be many, and nearly empty.
+        many = count_rectangles(blocks, exponents) > 64 + len(blocks) + (points >> max(exponents))
+        if many or not _LEAST_BITS <= sum(exponents) <= _MOST_BITS or min(exponents) < 1:
+            raise CorruptStreamError(
+                f"expected {name} of 2**{_LEAST_BITS} to 2**{_MOST_BITS} that fit the surface, "
+                f"got exponents {exponents[0]} and {exponents[1]}",
+                offset,
+            )
+
+
+def _parse_lattice(fields: FieldReader) -> Lattice:
+    start, rule = fields.at, fields.byte()
+    origin, step = fields.number(), fields.number()
+    if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
+        raise CorruptStreamError(f"expected a lattice, got rule {rule}, origin {origin}, step {step}", start)
+    return Lattice(_RULES[rule], origin, step)
+
+
+def _parse_predictors(
+    fields: FieldReader, layout: Layout, channels: int, geometric: int, offset: int
+) -> NDArray[np.int8]:
+    """Predictors of shape (channel, level, axis, 2); interfaces have some of the ``geometric`` channels only."""
+    predictors = np.stack([default_predictors(layout)] * channels)
+    fitted = fitted_steps(layout)
+    for channel in range(channels):
+        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < geometric]
+        start, count = fields.at, fields.varint()
+        if count != len(own):
+            raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
+        for level, axis in own:
+            predictors[channel, level, axis] = fields.unpack("bb")
+    if (predictors == -128).any():
+        raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
+    return predictors
 
 
 def _exponents(byte: int) -> tuple[int, int]:

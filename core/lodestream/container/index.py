@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from ..errors import CorruptStreamError
 from ..transform.predictors import COEFFICIENT_BITS
-from .chunks import count_windows
+from .chunks import chunks_of_a_channel
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .metadata import check_length
@@ -175,7 +175,7 @@ def parse_root(frame: Frame, header: Header) -> Root:
     first = pages + section_start(length)
     if places.left or first + length + _CRC != frame.offset:
         raise CorruptStreamError("expected sections that fill the container up to its index, got others", frame.offset)
-    counts = _count_pages(len(header.layout.tiles)), _count_pages(count_windows(header)) if exact else 0
+    counts = _count_pages(len(header.layout.tiles)), _count_pages(chunks_of_a_channel(header)) if exact else 0
     found = []
     for directory, count in zip(directories, counts, strict=True):
         if len(directory) != count:
@@ -334,7 +334,7 @@ def _parse_units(
 
 def _parse_chunks(pages: list[FieldReader], header: Header, residual: ByteRange) -> tuple[Chunk, ...]:
     """The chunks of the residual section."""
-    count = count_windows(header) * header.channels
+    count = chunks_of_a_channel(header) * header.channels
     found: list[Chunk] = []
     at, end = -1, residual.end - _CRC
     for fields in pages:

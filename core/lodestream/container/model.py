@@ -113,7 +113,7 @@ class Header:
     exact : bool
         The complete stream restores every value bit for bit.
     corrected : bool
-        An residual section follows the layers.
+        A residual section follows the layers.
     layer_count : int
         Layers of the complete stream.
     codecs : tuple of int
@@ -243,7 +243,7 @@ class Header:
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
-        """For each block which points are valid; None: all."""
+        """For each block which points are valid: bool, shape (row, column) of the block; None: all."""
         if not self.masked:
             return (None,) * len(self.blocks)
         from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
@@ -255,7 +255,7 @@ class Header:
 
     @cached_property
     def kept_masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
-        """For each block which holes have values that come back; None: none of them.
+        """For each block which holes have values that come back: bool, shape (row, column); None: none.
 
         Raises
         ------
@@ -360,8 +360,8 @@ class Index:
     """Where everything lies in a complete container.
 
     ``residual`` is None where the lattice alone is exact, or nothing is stored beyond it; ``chunks`` of it stand in
-    the order of `chunks.windows`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the SHA-256
-    of the values where all are exact.
+    the order of `chunks.chunk_places`. ``index`` are the pages and the root, ``size`` is the file's, ``digest`` the
+    SHA-256 of the values where all are exact.
     """
 
     header: Header

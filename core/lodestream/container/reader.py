@@ -71,8 +71,8 @@ def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacit
     while position < size:
         if capacity is not None:
             capacity.take(min(wanted, size - position))
-        chunk = read(position, min(wanted, size - position))
-        for frame in reader.feed(chunk):
+        data = read(position, min(wanted, size - position))
+        for frame in reader.feed(data):
             if header is None:
                 header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
             elif frame.kind in (sections.MASKS, sections.KEPT_MASKS):
@@ -81,9 +81,9 @@ def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacit
                 raise CorruptStreamError(f"expected masks, got a section of kind {frame.kind}", frame.offset)
             if not header.masked:
                 return header
-        if not chunk:
+        if not data:
             break
-        position += len(chunk)
+        position += len(data)
         wanted *= 2
     raise TruncatedStreamError(f"expected a container with a whole header, got {size} bytes without")
 

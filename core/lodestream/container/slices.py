@@ -71,7 +71,7 @@ class Slices:
         self._seen: set[int] = set()
         self._bytes = index.header.length
         self._in_file = False
-        self._held = 0
+        self._received = 0
         self._finest = 0
         self._near_tiles: NDArray[np.bool_] | None = None
         self._near: tuple[_Groups, ...] = ()
@@ -173,7 +173,7 @@ class Slices:
 
     def _count(self, segment: Segment) -> None:
         level = self._index.header.layout.tiles[segment.tile].level
-        self._held += 1
+        self._received += 1
         self._finest = max(self._finest, level)
         self._by_layer.hold(segment.layer)
         self._by_level.hold(level)
@@ -184,17 +184,17 @@ class Slices:
     def state(self) -> State | None:
         """The state that is complete now, if it is one; the first ones may need no segment at all."""
         risen = self._risen()
-        layer = self._by_layer.whole(self._held)
+        layer = self._by_layer.whole(self._received)
         if layer is not None:
             record = self._index.layers[layer]
             last = layer == len(self._index.layers) - 1
             if last and not self._chunks:
                 return self._end(layer)
-            held = record.end if self._in_file else self._bytes
+            size = record.end if self._in_file else self._bytes
             finest = self._layer_level[layer]
             figures = self._figures(record.rms, record.max_error)
-            return State(layer, finest, held, *figures, False, last and finest == self._index.header.levels)
-        level = self._by_level.whole(self._held)
+            return State(layer, finest, size, *figures, False, last and finest == self._index.header.levels)
+        level = self._by_level.whole(self._received)
         if level is not None and level < self._index.header.levels and not self._in_file:
             known = self._index.levels[level]
             figures = self._figures(known.rms, known.max_error)
@@ -222,12 +222,18 @@ class Slices:
 
     def _end(self, number: int) -> State:
         last = self._index.levels[-1]
-        held = self._index.surface_end if self._in_file else self._bytes
-        return State(number, last.level, held, last.rms, last.max_error, True, True)
+        size = self._index.surface_end if self._in_file else self._bytes
+        return State(number, last.level, size, last.rms, last.max_error, True, True)
 
     def hold_chunk(self, chunk: Chunk) -> State | None:
-        """Note a chunk of residual; the complete state, if everything is there."""
-        if self._held != self._segments:
+        """Note a chunk of residual; the complete state, if everything is there.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment is still missing: the residual is of the whole lattice.
+        """
+        if self._received != self._segments:
             raise CorruptStreamError("expected all segments before residual, got fewer", chunk.range.offset)
         self._corrected += 1
         if not self._in_file:
@@ -251,7 +257,7 @@ def _running_levels(layers: Collection[int], levels: Collection[int], count: int
 
 
 class _Groups:
-    """Segments by layer, or by level: when are the first groups whole, and nothing else held?"""
+    """Segments by layer, or by level: when are the first groups whole, and nothing else received?"""
 
     def __init__(self, groups: list[int], count: int) -> None:
         self._missing = [0] * count
@@ -275,7 +281,7 @@ class _Groups:
         """The last of the groups that are whole with all before them, -1 if there is none."""
         return self._next - 1
 
-    def whole(self, held: int) -> int | None:
-        """The last of the groups that are whole, if these are all that is held."""
+    def whole(self, received: int) -> int | None:
+        """The last of the groups that are whole, if these are all that is received."""
         last = self._next - 1
-        return last if last >= 0 and self._ends[last] == held else None
+        return last if last >= 0 and self._ends[last] == received else None

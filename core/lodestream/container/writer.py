@@ -57,7 +57,7 @@ def write_container(
     levels : sequence of Errors
         One for each level.
     chunks : sequence of bytes
-        Of the residual section, in the order of `chunks.windows`; nothing, or all empty, where there is none.
+        Of the residual section, in the order of `chunks.chunk_places`; nothing, or all empty, where there is none.
     metadata : mapping
     exact : bool
         The complete stream restores every value bit for bit.

@@ -33,14 +33,14 @@ Bytes = bytes  # the name within classes that have a property of this name
 
 
 class Decoder:
-    """Decodes a container chunk by chunk, and gives a `View` for each state whose errors are known.
+    """Decodes a container as its bytes come, and gives a `View` for each state whose errors are known.
 
     `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
     `CorruptStreamError` with its offset; everything before it stays usable.
 
     Parameters
     ----------
-    selection : Wish, optional
+    selection : Selection, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
         not known (NaN) before it is complete.
     max_vertices : int or None
@@ -78,7 +78,7 @@ class Decoder:
         self._loose: dict[int, tuple[int, bytearray]] = {}  # unfinished service sections, by where each goes on
         self._footer = bytearray()
 
-    def feed(self, chunk: bytes | bytearray | memoryview) -> list[View]:
+    def feed(self, data: bytes | bytearray | memoryview) -> list[View]:
         """Decode the next bytes of the file; returns the views that they complete.
 
         Raises
@@ -86,38 +86,38 @@ class Decoder:
         CorruptStreamError, UnsupportedVersionError
             The layers before the damage stay usable.
         """
-        self.capacity.take(len(chunk))
+        self.capacity.take(len(data))
         if self._frames.ended:
-            self._take_footer(bytes(chunk))
+            self._take_footer(bytes(data))
             return []
         before = len(self.layers)
-        for frame in self._frames.feed(bytes(chunk)):
+        for frame in self._frames.feed(bytes(data)):
             self._take(frame)
         if self._frames.ended:
             self._take_footer(self._frames.rest())
         return self.layers[before:]
 
-    def feed_at(self, offset: int, chunk: bytes | bytearray | memoryview) -> list[View]:
+    def feed_at(self, offset: int, data: bytes | bytearray | memoryview) -> list[View]:
         """Decode a slice of the container that starts at ``offset``; returns the views that it completes.
 
-        Slices must come in the order of a `plan`. They may be cut into chunks of any size.
+        Slices must come in the order of a `plan`. They may be cut anywhere.
         """
         before = len(self.layers)
         if self._slices is not None:
-            self.capacity.take(len(chunk))
-            self._take_slice(offset, bytes(chunk))
+            self.capacity.take(len(data))
+            self._take_slice(offset, bytes(data))
         elif offset == self._frames.position + self._frames.pending:
-            self.feed(chunk)
+            self.feed(data)
             if self.header is not None and (self.header.holes or not self.header.masked):
                 early, self._early = self._early, []
-                for place, data in early:
-                    self._take_loose(place, data)
+                for place, more in early:
+                    self._take_loose(place, more)
         else:
-            self.capacity.take(len(chunk))
+            self.capacity.take(len(data))
             if self.header is None or (self.header.masked and not self.header.holes):
-                self._early.append((offset, bytes(chunk)))
+                self._early.append((offset, bytes(data)))
             else:
-                self._take_loose(offset, bytes(chunk))
+                self._take_loose(offset, bytes(data))
         return self.layers[before:]
 
     def focus(self, region: Region | None) -> None:
@@ -175,7 +175,7 @@ class Decoder:
         return self.view().surface(level)
 
     def points_at(self, level: int) -> NDArray[Any]:
-        """The current grid of a level, see `View.points_at`."""
+        """The current grid of a level: shape (row, column), or (row, column, component); see `View.points_at`."""
         return self.view().points_at(level)
 
     @property

@@ -58,7 +58,7 @@ class View:
 
     @property
     def points(self) -> NDArray[Any]:
-        """The points of the only block at full resolution, with the dtype and axes of the original.
+        """The points of the only block at full resolution, with the dtype and shape of the original.
 
         Raises
         ------
@@ -134,21 +134,28 @@ class View:
         CorruptStreamError
             If the SHA-256 of the complete surface is wrong, or no value is finite.
         """
-        header = self._reconstruction.header
-        asked, finest = level is not None, level is None or level == header.levels
-        level = header.levels if level is None else level
-        if not 0 <= level <= header.levels:
-            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
+        header, region = self._reconstruction.header, self._selection.region
+        shown = header.levels if level is None else level
+        if not 0 <= shown <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {shown}")
+        if region is not None and shown != header.levels:
+            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {shown}")
         values = dict(self._metadata if metadata is None else metadata)
-        if asked:  # the grid of that level, without what a seam repeats
+        if level is not None:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
-        digest = self._digest.get(DIGEST)
-        region = self._selection.region
-        if not finest and region is not None:
-            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
+        surface, values = self._positioned(Surface(blocks=self._blocks(shown)), values, shown)
+        self._check_digest(surface, shown)
+        surface.metadata = values
+        surface.joints = header.joints.at(self._nodes(shown))
+        return surface
+
+    def _blocks(self, level: int) -> list[Block]:
+        """All blocks at a level, or the window of the only one; of heights that came with x and y, heights alone."""
+        header, region = self._reconstruction.header, self._selection.region
         chosen = self._selection.channels(header)
         if region is None:
-            grids = self._reconstruction.blocks(self._length, self._state, level, self._corrected and finest, chosen)
+            corrected = self._corrected and level == header.levels
+            grids = self._reconstruction.blocks(self._length, self._state, level, corrected, chosen)
             masks = level_masks(header.patches, header.layout, level, header.masks)
             closures: tuple[Closed, ...] = tuple(closed for _, closed in header.blocks)
         else:
@@ -156,31 +163,36 @@ class View:
             if masks[0] is not None:
                 masks = [masks[0][slice(*region[0]), slice(*region[1])]]
             closures = (window_closed(header.closed, header.shape, region),)
-        blocks = []
-        for grid, mask, closed in zip(grids, masks, closures, strict=True):
-            points, *attributes = grid.arrays
-            named = {
-                kind.name: array if kind.components else array[..., 0]
-                for kind, array in zip(header.attributes, attributes, strict=True)
-                if self._selection.attributes is None or kind.name in self._selection.attributes
-            }
-            if mask is not None and region is None and not mask.any():
-                mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
-            points = points[..., 0] if header.flat else points
-            try:
-                blocks.append(Block(points, closed, mask=mask, attributes=named))
-            except InputError as error:
-                if region is not None:
-                    raise  # nothing of this window is valid
-                raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
-        surface = Surface(blocks=blocks)
-        if not finest and len(blocks) == 1 and header.point_channels == 1:
-            coarse = level_metadata(
-                {**values, **_plane(header)}, header.shape, surface.shape, header.closed, header.levels - level
-            )
+        return [self._block(*of) for of in zip(grids, masks, closures, strict=True)]
+
+    def _block(self, grid: Values, mask: NDArray[np.bool_] | None, closed: Closed) -> Block:
+        """One block: ``grid`` are its points and attributes, (row, column, component) each; ``mask``, (row, column)."""
+        header, selection = self._reconstruction.header, self._selection
+        points, *attributes = grid.arrays
+        named = {
+            kind.name: array if kind.components else array[..., 0]
+            for kind, array in zip(header.attributes, attributes, strict=True)
+            if selection.attributes is None or kind.name in selection.attributes
+        }
+        if mask is not None and selection.region is None and not mask.any():
+            mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
+        points = points[..., 0] if header.flat else points
+        try:
+            return Block(points, closed, mask=mask, attributes=named)
+        except InputError as error:
+            if selection.region is not None:
+                raise  # nothing of this window is valid
+            raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
+
+    def _positioned(self, surface: Surface, values: dict[str, Any], level: int) -> tuple[Surface, dict[str, Any]]:
+        """The surface with the x and y that its heights came with, and the metadata of its level or window."""
+        header, region = self._reconstruction.header, self._selection.region
+        finest = level == header.levels
+        if not finest and len(surface.blocks) == 1 and header.point_channels == 1:
+            steps = header.levels - level
+            values = level_metadata({**values, **_plane(header)}, header.shape, surface.shape, header.closed, steps)
             if header.plane is not None:
-                surface.metadata.update({key: coarse.pop(key) for key in ("grid", "nodes") if key in coarse})
-            values = coarse
+                surface.metadata.update({key: values.pop(key) for key in ("grid", "nodes") if key in values})
         else:
             surface.metadata.update(_plane(header))
             if header.plane is not None and region is not None:
@@ -190,15 +202,17 @@ class View:
                 surface = to_xyz(surface, self._kept(finest))
             except InputError as error:
                 raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
-        if region is not None:
-            values = window_metadata(values, header.shape, region)
-        elif self.complete and finest and header.exact and digest is not None and chosen.all():
+        return surface, values if region is None else window_metadata(values, header.shape, region)
+
+    def _check_digest(self, surface: Surface, level: int) -> None:
+        """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
+        header, selection = self._reconstruction.header, self._selection
+        promised = self._digest.get(DIGEST)
+        whole = selection.region is None and selection.channels(header).all() and level == header.levels
+        if promised is not None and whole and self.complete and header.exact:
             found = values_digest(surface.blocks)
-            if digest != found:
-                raise CorruptStreamError(f"expected values with the SHA-256 {digest}, got {found}", header.length)
-        surface.metadata = values
-        surface.joints = header.joints.at(self._nodes(level))
-        return surface
+            if promised != found:
+                raise CorruptStreamError(f"expected values with the SHA-256 {promised}, got {found}", header.length)
 
     def _nodes(self, level: int) -> list[Nodes]:
         """Which rows and columns of each block are shown at a level, or in the window."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
@@ -11,11 +12,16 @@ from ..container import metadata
 from ..container.shape import LONGEST_AXIS
 from ..errors import FormatWarning, OptionError, TooLargeError
 from ..library import require
+from ..quality import Limit, Quality
 from ..surface import Surface
-from ..target import Tolerance
+from .allocated import allocate
+from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
 from .losses import at_holes
-from .preparation import Preparation
-from .stages import Encoding, UnreachableError
+from .measured import measure
+from .prepared import Prepared, prepare
+from .quantized import NoQuantiserError, quantize
+from .transformed import transform
+from .written import write
 
 __all__ = ["encode"]
 
@@ -23,29 +29,42 @@ __all__ = ["encode"]
 _COARSER = (8, 4, 0)
 
 
+#: Is told the fraction done, 0 to 1.
+_Progress = Callable[[float], None]
+
+
 def encode(
     surface: Surface | ArrayLike,
-    precision: float | str | Tolerance | None = None,
+    precision: Limit | None = None,
     *,
-    rms: float | str | Tolerance | None = None,
-    attribute_precision: Mapping[str, float | str | Tolerance] | None = None,
+    rms: Limit | None = None,
+    attribute_precision: Mapping[str, Limit] | None = None,
+    quality: Quality | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> bytes:
     """Encode a surface into a container.
 
+    >>> import numpy as np, lodestream
+    >>> heights = np.add.outer(np.arange(9) ** 2, np.arange(9))
+    >>> container = lodestream.encode(heights)
+    >>> bool((lodestream.decode(container).points == heights).all())
+    True
+
     Parameters
     ----------
     surface : Surface or array
-        An array is taken as ``Surface(array)``.
+        An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``.
     precision : float, str, Tolerance or None
         Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
         unless `attribute_precision` names them.
     rms : float, str, Tolerance or None
         Encode for one root mean square error instead: a container as short as possible whose complete surface has at
-        most this error. Quantisation steps are chosen for this error alone, and there are few layers before the last.
+        most this error. Quantization steps are chosen for this error alone, and there are few layers before the last.
     attribute_precision : mapping of str to float, str or Tolerance, optional
         Maximum error of attributes, by name.
+    quality : Quality, optional
+        In place of the three before, which are a shorthand for ``Quality.of(precision, rms, attribute_precision)``.
     progress : callable, optional
         Called from time to time with the fraction done, 0 to 1.
 
@@ -63,46 +82,99 @@ def encode(
     TooLargeError
         If a block has more rows or columns than kernels can count.
     OptionError
-        If there is no attribute of a given name, or both a precision and an error are given.
+        If there is no attribute of a given name, an error is no number of 0 or more, both a precision and an error are
+        given, or a quality and one of these.
     UnavailableError
         If the compiled kernels are missing; it says how to get them.
     """
     require("encoding")
+    quality = _chosen(quality, precision, rms, attribute_precision)
     if not isinstance(surface, Surface):
         surface = Surface(surface)
-    metadata.check(surface.metadata)
-    most = max(length for block in surface.blocks for length in block.shape)
-    if most > LONGEST_AXIS:
-        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {most:,}")
+    _check(surface, quality)
     rising = _rising(progress or (lambda fraction: None))
-    precisions = {name: _tolerance(wanted) for name, wanted in (attribute_precision or {}).items()}
-    unknown = [name for name in precisions if name not in surface.blocks[0].attributes]
-    if unknown:
-        known = ", ".join(surface.blocks[0].attributes) or "none"
-        raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
-    if precision is not None and rms is not None:
-        raise OptionError("expected either a precision or a root mean square error, got both")
     left_out = at_holes(surface)
     if left_out is not None:
         warnings.warn(left_out, FormatWarning, stacklevel=2)
-    if rms is not None:
-        container = _made_for(surface, _tolerance(rms), precisions, rising)
-        if container is not None:
-            rising(1.0)
-            return container
-    prepared = Preparation(surface, (None if precision is None else _tolerance(precision), precisions))
-    container = Encoding(prepared, rising).run()
-    raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
-    for bits in _COARSER:
-        if prepared.precision is not None or len(container) <= longest(raw):
-            break
-        # What looks like noise is not worth coding: the lattice keeps the highest bits, residual stores the rest.
-        container = min(container, Encoding(prepared, rising, bits).run(), key=len)
+    container = None if quality.rms is None else _for_one_error(surface, quality, rising)
+    if container is None:
+        container = _progressive(surface, replace(quality, rms=None), rising)
     rising(1.0)
     return container
 
 
-def _rising(progress: Callable[[float], None]) -> Callable[[float], None]:
+def _chosen(
+    quality: Quality | None, precision: Limit | None, rms: Limit | None, attributes: Mapping[str, Limit] | None
+) -> Quality:
+    if quality is None:
+        return Quality.of(precision, rms, attributes)
+    if precision is not None or rms is not None or attributes:
+        raise OptionError("expected either a quality or single errors, got both")
+    return quality
+
+
+def _check(surface: Surface, quality: Quality) -> None:
+    """Refuse what cannot be encoded before anything takes time."""
+    metadata.check(surface.metadata)
+    most = max(length for block in surface.blocks for length in block.shape)
+    if most > LONGEST_AXIS:
+        raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {most:,}")
+    unknown = [name for name in quality.attributes if name not in surface.blocks[0].attributes]
+    if unknown:
+        known = ", ".join(surface.blocks[0].attributes) or "none"
+        raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
+
+
+def _stages(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:
+    """One stream of a prepared surface, stage by stage. What later stages have no use for is freed between them.
+
+    Raises
+    ------
+    NoQuantiserError
+        If the stream is to be made for an error for which no quantization step is short enough.
+    """
+    transformed = transform(prepared, lattices)
+    progress(0.1)
+    quantized = quantize(transformed, lambda done: progress(0.1 + 0.2 * done))
+    del transformed  # the lattice coordinates of all points
+    allocated = allocate(quantized)
+    progress(0.4)
+    measured = measure(allocated, lambda done: progress(0.4 + 0.4 * done))
+    del allocated  # what a reader knows in the end, which takes as much as the coder that writes it
+    progress(0.8)
+    return write(measured)
+
+
+def _progressive(surface: Surface, quality: Quality, progress: _Progress) -> bytes:
+    """The stream of many layers, up to a precision or bit for bit."""
+    prepared = prepare(surface, quality)
+    container = _stages(prepared, exact_lattices(prepared), progress)
+    raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
+    for bits in _COARSER:
+        if prepared.precision is not None or len(container) <= longest(raw):
+            break
+        # What looks like noise is not worth coding: the lattice keeps the highest bits, the residual stores the rest.
+        container = min(container, _stages(prepared, exact_lattices(prepared, bits), progress), key=len)
+    return container
+
+
+def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> bytes | None:
+    """The stream for one root mean square error; None where exact values are the way to meet it."""
+    prepared = prepare(surface, quality)
+    lattices = fine_lattices(prepared)
+    if lattices is None:
+        return None
+    try:
+        container = _stages(prepared, lattices, progress)
+    except NoQuantiserError:
+        return None
+    if lies_on_coarse_lattice(prepared):
+        exact = prepare(surface, replace(quality, rms=None))
+        container = min(container, _stages(exact, exact_lattices(exact), progress), key=len)
+    return container
+
+
+def _rising(progress: _Progress) -> _Progress:
     """Tell fractions that never fall, whatever is tried one after another."""
     highest = 0.0
 
@@ -114,29 +186,10 @@ def _rising(progress: Callable[[float], None]) -> Callable[[float], None]:
     return told
 
 
-def _tolerance(precision: float | str | Tolerance) -> Tolerance:
-    if isinstance(precision, str):
-        return Tolerance.parse(precision)
-    return precision if isinstance(precision, Tolerance) else Tolerance(float(precision))
-
-
-def _made_for(
-    surface: Surface, rms: Tolerance, precisions: Mapping[str, Tolerance], progress: Callable[[float], None]
-) -> bytes | None:
-    """The stream for this root mean square error; None where exact values are the way to meet it."""
-    prepared = Preparation(surface, (None, precisions), rms)
-    if prepared.rms is None or (fine := prepared.fine_lattices()) is None:
-        return None
-    try:
-        container = Encoding(prepared, progress, fine=fine).run()
-    except UnreachableError:
-        return None
-    if prepared.lies_on_coarse_lattice():
-        exact = Preparation(surface, (None, precisions))
-        container = min(container, Encoding(exact, progress).run(), key=len)
-    return container
-
-
 def longest(raw: int) -> int:
-    """Most bytes that a container takes which restores so many bytes of values."""
+    """Most bytes that a container takes which restores so many bytes of values, unless nothing else is shorter.
+
+    >>> longest(100_000)
+    102024
+    """
     return raw + raw // 100 + 1024

@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..container.chunks import Window, windows
+from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..decoding.reconstruction import Values
 from ..residual import chunk_coder
 from ..surface import Block, Surface
-from .preparation import Preparation, given_channel
+from .holes import given_channel
+from .prepared import Prepared
 
 __all__ = ["as_returned", "chunk_size", "encode_chunks"]
 
@@ -21,7 +22,7 @@ __all__ = ["as_returned", "chunk_size", "encode_chunks"]
 _TABLES, _WORTH = 8, 0.01
 
 
-def encode_chunks(prepared: Preparation, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
     """The section's chunks; and of each channel whether it is exact then.
 
     A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
@@ -29,17 +30,17 @@ def encode_chunks(prepared: Preparation, header: Header, restored: list[Values])
 
     Parameters
     ----------
-    prepared : Preparation
+    prepared : Prepared
     header : Header
     restored : list of Values, one for each block
         What comes back without these chunks.
     """
     coder = _ChunkCoder(prepared, header, restored)
-    chunks = [coder.code(window) for window in windows(header)]
+    chunks = [coder.code(window) for window in chunk_places(header)]
     return chunks, coder.exact
 
 
-def chunk_size(prepared: Preparation, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
+def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
     """The smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
@@ -64,7 +65,7 @@ def chunk_size(prepared: Preparation, header: Header, restored: list[Values], co
         coder = _ChunkCoder(prepared, tried, restored)
         inside = (
             window
-            for window in windows(tried)
+            for window in chunk_places(tried)
             if starts[0] <= window.rows[0] < stops[0] and starts[1] <= window.columns[0] < stops[1]
         )
         costs.append(sum(len(coder.code(window)) + _TABLES for window in inside) / share)
@@ -75,7 +76,7 @@ def chunk_size(prepared: Preparation, header: Header, restored: list[Values], co
 class _ChunkCoder:
     """Makes chunks; ``exact`` says of each channel whether it is exact with those so far."""
 
-    def __init__(self, prepared: Preparation, header: Header, restored: list[Values]) -> None:
+    def __init__(self, prepared: Prepared, header: Header, restored: list[Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
         rough = [prepared.precision is not None or prepared.rms is not None] * prepared.geometric
         rough += [False] * (prepared.point_channels - prepared.geometric)
@@ -84,7 +85,7 @@ class _ChunkCoder:
         self._rough = rough
         self.exact = [True] * header.channels
 
-    def code(self, window: Window) -> bytes:
+    def code(self, window: ChunkPlace) -> bytes:
         """One chunk."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]

@@ -21,7 +21,7 @@ def spread_bands(
     sign: NDArray[np.int8],
     early: NDArray[np.uint8],
     bands: NDArray[np.int64],
-    windows: NDArray[np.int64],
+    origins: NDArray[np.int64],
     steps: NDArray[np.int64],
     numbers: NDArray[np.int64],
     state: NDArray[np.int8],
@@ -37,7 +37,7 @@ def spread_bands(
     ----------
     known, sign, early : flat, see `bitplanes.code_passes`
     bands : int64, shape (band, `band_fields.BAND_FIELDS`)
-    windows : int64, shape (band, 3)
+    origins : int64, shape (band, 3)
         Of each band: its tile, and its first row and column among all coefficients.
     steps : int64, shape (band,)
         Lattice steps; 0 where ``known`` are no indices.
@@ -61,6 +61,6 @@ def spread_bands(
     while start < numbers.size:
         reached = sizes[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(sizes, reached + _AT_ONCE, side="right")))
-        part = numbers[start:stop]
-        kernels.spread(known, sign, early, bands, windows, steps, part, state, finer, out, *origin)
+        batch = numbers[start:stop]
+        kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)
         start = stop

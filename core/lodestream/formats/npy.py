@@ -17,7 +17,7 @@ from ..surface import Surface
 from .notes import metadata_left_out, warn, warn_left_out
 from .source import Source, number
 
-__all__ = ["MAGIC", "Header", "read", "read_header", "read_values", "sniff", "write"]
+__all__ = ["MAGIC", "NpyHeader", "read", "read_header", "read_values", "sniff", "write"]
 
 MAGIC = b"\x93NUMPY"
 
@@ -32,7 +32,7 @@ _HEADER_READERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class NpyHeader:
     """What the header of an NPY file says of the array that follows."""
 
     shape: tuple[int, ...]
@@ -55,8 +55,14 @@ def sniff(head: bytes, suffix: str) -> bool:
     return head.startswith(MAGIC)
 
 
-def read_header(file: IO[bytes]) -> Header:
-    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled."""
+def read_header(file: IO[bytes]) -> NpyHeader:
+    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled.
+
+    Raises
+    ------
+    FormatError
+        If there is none of version 1.0 or 2.0, or a length in it is negative.
+    """
     head = BytesIO(file.read(_HEAD))
     try:
         version = npy_format.read_magic(head)
@@ -64,7 +70,7 @@ def read_header(file: IO[bytes]) -> Header:
             warnings.simplefilter("ignore", UserWarning)  # headers of Python 2 ("10L") are read, with a warning
             if version not in _HEADER_READERS:
                 raise ValueError(f"version {version[0]}.{version[1]}")
-            header = Header(*_HEADER_READERS[version](head))
+            header = NpyHeader(*_HEADER_READERS[version](head))
     except Exception as error:  # the header is a Python literal: numpy does not say what its parser may raise
         reason = str(error) or type(error).__name__
         raise FormatError(f"expected an NPY header of version 1.0 or 2.0, got one not readable: {reason}") from None
@@ -74,8 +80,14 @@ def read_header(file: IO[bytes]) -> Header:
     return header
 
 
-def read_values(file: IO[bytes], header: Header) -> NDArray[Any]:
-    """Read the array that follows its header, whose size has been checked."""
+def read_values(file: IO[bytes], header: NpyHeader) -> NDArray[Any]:
+    """Read the array that follows its header, of the shape and dtype said there, whose size has been checked.
+
+    Raises
+    ------
+    FormatError
+        If the file ends before its values do.
+    """
     shape = header.shape[::-1] if header.fortran else header.shape
     values = np.empty(shape, header.dtype)
     rest = values.reshape(-1).view(np.uint8).data
@@ -90,7 +102,13 @@ def read_values(file: IO[bytes], header: Header) -> NDArray[Any]:
 
 
 def read(source: Source) -> Surface:
-    """Read the one array of an NPY file."""
+    """Read the one array of an NPY file.
+
+    Raises
+    ------
+    FormatError
+        If the file is cut short, goes on behind its array, or the array is no surface.
+    """
     with source.path.open("rb") as file:
         header = read_header(file)
         source.check_array(header.shape, header.dtype)

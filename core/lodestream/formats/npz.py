@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .notes import listing, warn
-from .npy import Header, read_header, read_values
+from .npy import NpyHeader, read_header, read_values
 from .placed import Coordinate, place
 from .source import Source, number, refuse_array
 
@@ -48,6 +48,11 @@ def read(source: Source) -> Surface:
 
     Those are vectors or arrays under the usual names, or under those that options give; or the numbers dx, dy, xmin,
     xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``.
+
+    Raises
+    ------
+    FormatError
+        If no array is a surface, or coordinates stand beside points that have their own.
     """
     with _refusals(), ZipFile(source.path) as archive:
         members = _members(archive)
@@ -83,7 +88,7 @@ class _Contents:
     source: Source
     archive: ZipFile
     members: Mapping[str, ZipInfo]
-    headers: Mapping[str, Header]
+    headers: Mapping[str, NpyHeader]
 
     @property
     def listing(self) -> str:
@@ -172,7 +177,7 @@ def _members(archive: ZipFile) -> dict[str, ZipInfo]:
     return members
 
 
-def _header(archive: ZipFile, member: ZipInfo) -> Header:
+def _header(archive: ZipFile, member: ZipInfo) -> NpyHeader:
     with archive.open(member) as file:
         header = read_header(file)
         promised = file.tell() + header.nbytes

@@ -7,18 +7,18 @@ from typing import Literal
 
 from ..container.model import ByteRange
 
-__all__ = ["Ended", "Mark", "Plan"]
+__all__ = ["Mark", "Plan", "Reason"]
 
 #: Why a stream ends; `plan` knows the first five, the others happen on the way.
-Ended = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
+Reason = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
 
 
 @dataclass(frozen=True)
 class Mark:
     """A state that the receiver reaches when it has received ``sent`` bytes of the plan's ranges.
 
-    ``number`` is that of the layer (quality order) or level (level order). ``bytes`` counts what is held of the
-    container.
+    ``number`` is that of the layer (quality order) or level (level order). ``bytes`` counts what the receiver then has
+    of the container.
     """
 
     sent: int
@@ -31,18 +31,18 @@ class Mark:
 
 @dataclass(frozen=True)
 class Plan:
-    """Slices of a container in sending order, without what is held.
+    """Slices of a container in sending order, without what is cached.
 
     Attributes
     ----------
     before : tuple of ByteRange
         Service slices that must come first: the index, if segments are sent without the tables of their layers.
     ranges : tuple of ByteRange
-        Slices of the surface. Together with what is held of them they are the state's ``bytes``.
+        Slices of the surface. Together with what is cached of them they are the state's ``bytes``.
     after : tuple of ByteRange
         The metadata.
     marks : tuple of Mark
-        States on the way, the last one at the end; states with a ``sent`` of 0 are held already.
+        States on the way, the last one at the end; states with a ``sent`` of 0 are cached already.
     ended : str
         Why the plan ends.
     prefix : bool
@@ -53,7 +53,7 @@ class Plan:
     ranges: tuple[ByteRange, ...]
     after: tuple[ByteRange, ...]
     marks: tuple[Mark, ...]
-    ended: Ended
+    ended: Reason
     prefix: bool = False
 
     @property
@@ -63,7 +63,7 @@ class Plan:
 
     @property
     def bytes(self) -> int:
-        """Bytes of the surface's slices, sent or held."""
+        """Bytes of the surface's slices, sent or cached."""
         return self.marks[-1].bytes
 
     @property

@@ -13,19 +13,19 @@ from ..container.model import ByteRange, Index
 from ..errors import OptionError
 from ..target import Target
 from .byte_ranges import RangeSet
-from .plan import Ended, Mark, Plan
+from .plan import Mark, Plan, Reason
 from .region_first import region_first
 from .selection import select, selection_of
 
-__all__ = ["Ended", "Mark", "Plan", "plan"]
+__all__ = ["Mark", "Plan", "Reason", "plan"]
 
 
 def plan(
     index: Index,
     target: Target = Target(),  # noqa: B008 - an immutable value
-    held: RangeSet | None = None,
+    cached: RangeSet | None = None,
 ) -> Plan:
-    """The slices that a receiver with this target gets, if it holds these bytes of the container.
+    """The slices that a receiver with this target gets, if it has cached these bytes of the container.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def plan(
     chosen = _whole(index, target)
     if target.first is not None:
         chosen = region_first(index, chosen, target.first)
-    return _less(chosen, held) if held else chosen
+    return _less(chosen, cached) if cached else chosen
 
 
 def _whole(index: Index, target: Target) -> Plan:
@@ -63,12 +63,12 @@ def _prefix(index: Index, target: Target) -> Plan:
     return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended, prefix=True)
 
 
-def _exact(index: Index, number: int, held: int) -> Mark:
+def _exact(index: Index, number: int, size: int) -> Mark:
     last = index.levels[-1]
-    return Mark(held, number, last.level, held, last.rms, last.max_error)
+    return Mark(size, number, last.level, size, last.rms, last.max_error)
 
 
-def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark], Ended]:
+def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark], Reason]:
     """The marks up to the first limit met."""
     rms, worst = (None if t is None else t.absolute(extent) for t in (target.until_rms, target.until_max))
     kept: list[Mark] = []
@@ -81,7 +81,7 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
             return kept, "bytes"
         kept.append(mark)
         if mark is marks[-1]:
-            break
+            break  # complete, even if it meets a tolerance too
         if rms is not None and mark.rms <= rms:
             return kept, "rms"
         if worst is not None and mark.max_error <= worst:
@@ -92,26 +92,27 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
 def _slices_of_layers(index: Index, level: int) -> Plan:
     """Quality order of the levels up to one: of each layer the segments that belong to them, which stand together."""
     tiles = index.header.layout.tiles
-    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     for layer, segments in groupby(index.segments, key=lambda segment: segment.layer):
         for segment in segments:
             if tiles[segment.tile].level <= level:
                 _append(ranges, segment.range)
-                held += segment.range.length
+                size += segment.range.length
         record = index.layers[layer]
         if record.level <= level:
-            marks.append(Mark(held, layer, record.level, held, record.rms, record.max_error))
+            marks.append(Mark(size, layer, record.level, size, record.rms, record.max_error))
     state = index.levels[level]
-    marks = [mark for mark in marks if mark.sent < held]
-    marks.append(Mark(held, level, level, held, state.rms, state.max_error))
+    # Layers that add nothing up to this level end where the level does: its own state, with its errors, says it better.
+    marks = [mark for mark in marks if mark.sent < size]
+    marks.append(Mark(size, level, level, size, state.rms, state.max_error))
     return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), "level")
 
 
 def _by_level(index: Index, target: Target, level: int) -> Plan:
     """Level order: level by level, the segments of all layers; the complete surface also has its residual."""
     tiles = index.header.layout.tiles
-    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     of_level: list[list[ByteRange]] = [[] for _ in index.levels]
     for segment in index.segments:
@@ -119,11 +120,11 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
     for state, places in zip(index.levels[: level + 1], of_level, strict=False):
         for place in places:
             _append(ranges, place)
-            held += place.length
+            size += place.length
         if state.level == index.header.levels and index.residual:
             _append(ranges, index.residual)
-            held += index.residual.length
-        marks.append(Mark(held, state.level, state.level, held, state.rms, state.max_error))
+            size += index.residual.length
+        marks.append(Mark(size, state.level, state.level, size, state.rms, state.max_error))
     if target.level is not None:
         return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
     marks, ended = _until(marks, target, index.header.extent)
@@ -140,46 +141,47 @@ def _selected(index: Index, target: Target) -> Plan:
     segments = [s for s in chosen.segments if tiles[s.tile].level <= finest]
     if target.order == "level":
         segments.sort(key=lambda segment: tiles[segment.tile].level)
-    ranges, held = [ByteRange(0, index.header.length)], index.header.length
+    ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     level = 0
-    ended: Ended
+    ended: Reason
     for number, segment in enumerate(segments):
         _append(ranges, segment.range)
-        held += segment.range.length
+        size += segment.range.length
         own = tiles[segment.tile].level
         level = max(level, own)
         after = segments[number + 1] if number + 1 < len(segments) else None
         if target.order == "level":
             if after is None or tiles[after.tile].level > own:
                 state = index.levels[own]
-                marks.append(_mark(held, own, own, state.rms, state.max_error, partial))
+                marks.append(_mark(size, own, own, state.rms, state.max_error, partial))
         elif after is None or after.layer > segment.layer:
             # Layers of which nothing is wanted are there as well.
             record = index.layers[-1 if after is None else after.layer - 1]
             if target.level is None or level <= target.level:
-                marks.append(_mark(held, record.number, level, record.rms, record.max_error, partial))
+                marks.append(_mark(size, record.number, level, record.rms, record.max_error, partial))
     if finest < index.header.levels:
         state = index.levels[finest]
-        last, ended = _mark(held, finest, finest, state.rms, state.max_error, partial), "level"
+        last, ended = _mark(size, finest, finest, state.rms, state.max_error, partial), "level"
     else:
         for chunk in chosen.chunks.values():
             _append(ranges, chunk.range)
-            held += chunk.range.length
+            size += chunk.range.length
         state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
-        last, ended = Mark(held, number, finest, held, state.rms, state.max_error), "complete"
-    marks = [mark for mark in marks if mark.sent < held] + [last]
+        last, ended = Mark(size, number, finest, size, state.rms, state.max_error), "complete"
+    # A state of the same bytes as the last is the last.
+    marks = [mark for mark in marks if mark.sent < size] + [last]
     if target.level is None:
         marks, ended = _until(marks, target, index.header.extent)
     return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 
 
-def _mark(held: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
-    unknown = float("nan")
-    return Mark(held, number, level, held, *((unknown, unknown) if partial else (rms, max_error)))
+def _mark(size: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
+    unknown = float("nan")  # layers tell errors of the whole surface: of a window on the way they say nothing
+    return Mark(size, number, level, size, *((unknown, unknown) if partial else (rms, max_error)))
 
 
-def _level_end(index: Index, level: int) -> Ended:
+def _level_end(index: Index, level: int) -> Reason:
     return "complete" if level == index.header.levels else "level"
 
 
@@ -200,9 +202,9 @@ def _cut(ranges: list[ByteRange], length: int) -> tuple[ByteRange, ...]:
     return tuple(kept)
 
 
-def _less(chosen: Plan, held: RangeSet) -> Plan:
-    """The plan without what is held; each mark stands where the last missing byte before it does."""
-    missing = [(place, _missing(place, held)) for place in chosen.ranges]
+def _less(chosen: Plan, cached: RangeSet) -> Plan:
+    """The plan without what is cached; each mark stands where the last missing byte before it does."""
+    missing = [(place, _missing(place, cached)) for place in chosen.ranges]
     marks: list[Mark] = []
     todo = iter(chosen.marks)
     mark = next(todo, None)
@@ -216,19 +218,20 @@ def _less(chosen: Plan, held: RangeSet) -> Plan:
                 sent += gaps[passed].length
                 passed += 1
             begun = max(end - gaps[passed].offset, 0) if passed < len(gaps) else 0
+            # A mark inside a gap stands that far into it; one behind what is cached, where the gap before it ends.
             marks.append(replace(mark, sent=sent + begun))
             mark = next(todo, None)
         planned += place.length
         sent += sum(gap.length for gap in gaps[passed:])
     before, after = (
-        tuple(gap for place in part for gap in _missing(place, held)) for part in (chosen.before, chosen.after)
+        tuple(gap for place in part for gap in _missing(place, cached)) for part in (chosen.before, chosen.after)
     )
     ranges = tuple(gap for _, gaps in missing for gap in gaps)
-    # What is held beyond a state that has no figures of its own counts too.
+    # What is cached beyond a state that has no figures of its own counts too.
     ahead = chosen.bytes - sent
     marks = [replace(mark, bytes=ahead + mark.sent) if math.isnan(mark.rms) else mark for mark in marks]
     return replace(chosen, before=before, ranges=ranges, after=after, marks=tuple(marks))
 
 
-def _missing(place: ByteRange, held: RangeSet) -> list[ByteRange]:
-    return [ByteRange(*gap) for gap in held.missing(place.offset, place.length)]
+def _missing(place: ByteRange, cached: RangeSet) -> list[ByteRange]:
+    return [ByteRange(*gap) for gap in cached.missing(place.offset, place.length)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.capacity import Capacity
-from ..container.chunks import windows
+from ..container.chunks import chunk_places
 from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
 from ..grid.support import check_region, needed_tiles
@@ -43,7 +43,7 @@ class Selection:
                 raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
 
     def channels(self, header: Header) -> NDArray[np.bool_]:
-        """Which channels are wanted."""
+        """Which channels are wanted: bool, shape (channel,)."""
         chosen = [True] * header.point_channels
         for kind in header.attributes:
             chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
@@ -78,7 +78,7 @@ class Selection:
         capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
 
     def tiles(self, header: Header) -> NDArray[np.bool_]:
-        """Which tiles are wanted."""
+        """Which tiles are wanted: bool, shape (tile,)."""
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
         if header.arrangement is not None:
@@ -132,7 +132,7 @@ def select(index: Index, selection: Selection) -> SelectedSlices:
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
     chunks = {}
     if index.chunks:
-        for number, (window, chunk) in enumerate(zip(windows(header), index.chunks, strict=True)):
+        for number, (window, chunk) in enumerate(zip(chunk_places(header), index.chunks, strict=True)):
             touches = selection.region is None or all(
                 start < b and a < stop
                 for (start, stop), (a, b) in zip(selection.region, (window.rows, window.columns), strict=True)

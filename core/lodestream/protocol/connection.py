@@ -34,10 +34,10 @@ from .messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     MessageError,
     Open,
+    Opened,
     Segments,
     Stop,
 )
@@ -77,7 +77,7 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.OPENED: (
             {Credit: State.OPENED, Stop: State.WITHDRAWN},
-            {Header: State.STREAMING, Error: State.FAILED},
+            {Opened: State.STREAMING, Error: State.FAILED},
         ),
         State.STREAMING: (
             {Credit: State.STREAMING, Stop: State.STOPPING},
@@ -85,7 +85,7 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
         ),
         State.WITHDRAWN: (
             {},
-            {Header: State.STOPPING, End: State.ENDED, Error: State.FAILED},
+            {Opened: State.STOPPING, End: State.ENDED, Error: State.FAILED},
         ),
         State.STOPPING: (
             {},
@@ -104,7 +104,7 @@ TRANSITIONS: Mapping[Side, Mapping[State, tuple[_Moves, _Moves]]] = {
             {Open: State.OPENED},
         ),
         State.OPENED: (
-            {Header: State.STREAMING, Error: State.FAILED},
+            {Opened: State.STREAMING, Error: State.FAILED},
             {Credit: State.OPENED, Stop: State.STOPPING},
         ),
         State.STREAMING: (

@@ -18,12 +18,12 @@ from collections import deque
 from ..errors import OptionError
 from .messages import MAX_CREDIT, MIN_WINDOW
 
-__all__ = ["Window"]
+__all__ = ["FlowWindow"]
 
 _GAIN = 2.0
 
 
-class Window:
+class FlowWindow:
     """The window of one connection. Times are seconds of any clock that does not go back.
 
     Parameters

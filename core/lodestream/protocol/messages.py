@@ -28,10 +28,10 @@ __all__ = [
     "End",
     "Error",
     "Event",
-    "Header",
     "Layer",
     "MessageError",
     "Open",
+    "Opened",
     "Segments",
     "Stop",
 ]
@@ -157,7 +157,7 @@ class Bye:
 
 
 @dataclass(frozen=True)
-class Header:
+class Opened:
     """From the server: which container is sent, and how much of it.
 
     Attributes
@@ -167,7 +167,7 @@ class Header:
     size : int
         Bytes of the whole container.
     planned : int
-        Bytes of the surface (header, layers, exactness) that the target needs, including held ones; index and metadata
+        Bytes of the surface (header, layers, residual) that the target needs, including held ones; index and metadata
         are not counted.
     extent : float
         Unit of relative tolerances: the range of the heights, or the diagonal of the bounding box.
@@ -233,4 +233,4 @@ class Error:
     detail: str
 
 
-Event: TypeAlias = Open | Credit | Stop | Bye | Header | Segments | Layer | End | Error
+Event: TypeAlias = Open | Credit | Stop | Bye | Opened | Segments | Layer | End | Error

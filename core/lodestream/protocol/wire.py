@@ -26,10 +26,10 @@ from .messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     MessageError,
     Open,
+    Opened,
     Segments,
     Stop,
 )
@@ -158,7 +158,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
     Credit: {"bytes": _positive},
     Stop: {},
     Bye: {},
-    Header: {
+    Opened: {
         "container": _digest,
         "size": _integer,
         "planned": _integer,

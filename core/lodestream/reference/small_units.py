@@ -162,8 +162,12 @@ class SmallUnit:
                     for _ in block:
                         state = STATES[2 * state]
 
-    def _code(self, lists: _Lists, block: list[int], plane: int, first: bool, state: int) -> int:
-        """Code a block's coefficients in one pass; the range coder is written out here, as nothing takes longer."""
+    # One function, and long: it visits every coefficient in every pass, and in plain Python a call for each bit would
+    # take longer than all that is done for the bit.
+    def _code(  # noqa: C901
+        self, lists: _Lists, block: list[int], plane: int, first: bool, state: int
+    ) -> int:
+        """Code a block's coefficients in one pass; the range coder's `bit` is written out in it."""
         coder = self.coder
         probabilities, counts, data, end = coder.probabilities, coder.counts, coder.data, coder.end
         low, width, position = coder.low, coder.width, coder.position

@@ -138,12 +138,12 @@ class Parents:
         """Read the parents at a plane.
 
         `magnitude` (int32 (rows, columns)): of the parent's share; `plane` (int): the plane of the pass. Returns
-        `patch` (int32 (rows, columns)): the parents' patch of section 7.4, for each coefficient of the share; `parent`
+        `part` (int32 (rows, columns)): the parents' part of section 7.4, for each coefficient of the share; `parent`
         (int32 (rows, columns)): the parents' magnitudes, shifted right by the plane.
         """
         near = np.pad(magnitude >> plane, 2)
-        patch = 3 * np.minimum(near, 4)
+        part = 3 * np.minimum(near, 4)
         around = near[1:-1, :-2] + near[1:-1, 2:] + near[:-2, 1:-1] + near[2:, 1:-1]
-        patch[1:-1, 1:-1] += np.minimum(around, 12)
+        part[1:-1, 1:-1] += np.minimum(around, 12)
         place = np.ix_(*self.index)
-        return patch[place], near[place]
+        return part[place], near[place]

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from ..errors import RemoteError, TruncatedStreamError
 from ..protocol.connection import Connection, Side, State
-from ..protocol.flow_control import Window
-from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Header, Layer, Open, Segments, Stop
+from ..protocol.flow_control import FlowWindow
+from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Layer, Open, Opened, Segments, Stop
 from ..target import Region, Target
-from .receiver_state import Ended, Reception
+from .receiver_state import Ended, ReceiverState
 
 if TYPE_CHECKING:
     from ..decoding.decoder import Decoder
@@ -32,39 +32,39 @@ class Download:
         What to receive, where to stop, and in which order.
     window : int or None
         Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it
-        is less than what the link carries in one round trip, the link is idle at times. None: a `Window` measures the
-        link; this needs times.
-    reception : Reception or None
+        is less than what the link carries in one round trip, the link is idle at times. None: a `FlowWindow` measures
+        the link; this needs times.
+    reception : ReceiverState or None
         What has arrived over other connections; its target is used then.
 
     Attributes
     ----------
-    reception : Reception
+    reception : ReceiverState
         What has arrived so far.
-    header : Header or None
+    answer : Opened or None
         The server's first message.
     layer : Layer or None
         The server's last `layer` message.
-    window : Window
+    window : FlowWindow
         The number of bytes that may be in flight.
     opening : bytes
         The first message, for use in the address of the handshake; see `opened`.
     """
 
     def __init__(
-        self, target: Target | None = None, *, window: int | None = None, reception: Reception | None = None
+        self, target: Target | None = None, *, window: int | None = None, reception: ReceiverState | None = None
     ) -> None:
-        self.reception = Reception(target) if reception is None else reception
-        self.window = Window(window)
-        self.header: Header | None = None
+        self.reception = ReceiverState(target) if reception is None else reception
+        self.window = FlowWindow(window)
+        self.answer: Opened | None = None
         self.layer: Layer | None = None
         self._connection = Connection(Side.CLIENT)
         self._opened: float | None = None
         self._turning = False  # this end has stopped in order to open again
-        # Of a container that is not known by name, nothing can be said to be held.
+        # Of a container that is not known by name, nothing can be said to be cached.
         known = self.reception.container is not None
-        held = _largest(self.reception) if known else ()
-        self.opening = self._open(held, self.reception.container)
+        cached = _largest(self.reception) if known else ()
+        self.opening = self._open(cached, self.reception.container)
         self._outbox = [self.opening]
 
     @property
@@ -118,7 +118,7 @@ class Download:
         event = self._connection.receive(message)
         if isinstance(event, Segments):
             return self._take(event, now)
-        if isinstance(event, Header):
+        if isinstance(event, Opened):
             return self._begin(event, now)
         if isinstance(event, Layer):
             self.layer = event
@@ -188,7 +188,7 @@ class Download:
             self.reception.stopped_for = why
         if self._connection.state in (State.OPENED, State.STREAMING):
             self._outbox.append(self._connection.send(Stop()))
-        self._turning = False
+        self._turning = False  # a stop that is under way in order to open again serves: its end is now the last
 
     def tick(self, now: float) -> float | None:
         """Set the time, in seconds of any clock that does not go back; stops when the target's time limit is over.
@@ -239,12 +239,12 @@ class Download:
             f"expected an end message, got {self.reception.data_bytes} bytes before the connection {closed}"
         )
 
-    def _open(self, held: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
-        self.window.grant(self.window.size)
-        return self._connection.send(Open(self.reception.target, self.window.size, held, container))
+    def _open(self, cached: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
+        self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
+        return self._connection.send(Open(self.reception.target, self.window.size, cached, container))
 
-    def _begin(self, event: Header, now: float | None) -> list[DownloadEvent]:
-        self.header = event
+    def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:
+        self.answer = event
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
         self.reception.identify(event.container, event.size)
@@ -263,9 +263,9 @@ class Download:
         return [*views] if shown else []
 
 
-def _largest(reception: Reception) -> tuple[tuple[int, int], ...]:
-    """What is held, the smallest ranges left out where there are more than a message may name."""
-    ranges = list(reception.held)
+def _largest(reception: ReceiverState) -> tuple[tuple[int, int], ...]:
+    """What is cached, the smallest ranges left out where there are more than a message may name."""
+    ranges = list(reception.cached)
     if len(ranges) > MAX_HELD:
         ranges = sorted(sorted(ranges, key=lambda place: place[1], reverse=True)[:MAX_HELD])
     return tuple(ranges)

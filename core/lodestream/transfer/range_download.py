@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import RemoteError, RemoteProtocolError, TruncatedStreamError
 from ..protocol.messages import MAX_CREDIT, MIN_WINDOW
-from .receiver_state import Reception
+from .receiver_state import ReceiverState
 
 if TYPE_CHECKING:
     from .receiver_state import DownloadEvent
@@ -64,12 +64,12 @@ class RangeDownload:
     """Receiving a surface over HTTP Range: requests out, parts of the file in.
 
     The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
-    body, in chunks of any size, to `receive`, then calls `finish`; until `request` returns None. If a connection
+    body, cut anywhere, to `receive`, then calls `finish`; until `request` returns None. If a connection
     breaks, it continues with the next `request`.
 
     Parameters
     ----------
-    reception : Reception
+    reception : ReceiverState
         What has arrived, over any transport.
     etag : str or None
         Strong entity tag of the file, if it is known.
@@ -80,7 +80,7 @@ class RangeDownload:
         Number of requests so far.
     """
 
-    def __init__(self, reception: Reception, *, etag: str | None = None) -> None:
+    def __init__(self, reception: ReceiverState, *, etag: str | None = None) -> None:
         self.reception = reception
         self.requests = 0
         self._etag = etag
@@ -158,6 +158,8 @@ class RangeDownload:
             If the server does not support Range, or the answer does not match the request.
         RemoteError
             With the code ``other-container`` if the file has changed.
+        TruncatedStreamError
+            If the file ends before what was asked for.
         """
         asked = self._asked
         if asked is None:
@@ -186,8 +188,8 @@ class RangeDownload:
         tag = _CONTAINER_TAG.fullmatch(self._etag or "")
         self.reception.identify(tag[1] if tag else None, size)
 
-    def receive(self, chunk: bytes) -> list[DownloadEvent]:
-        """Take a chunk of the body of an answer; returns the views that it completes.
+    def receive(self, data: bytes) -> list[DownloadEvent]:
+        """Take more of the body of an answer; returns the views that it completes.
 
         Raises
         ------
@@ -196,16 +198,16 @@ class RangeDownload:
         RemoteProtocolError
             If there are more bytes than requested.
         """
-        self.reception.wire_bytes += len(chunk)
+        self.reception.wire_bytes += len(data)
         asked, start = self._asked, self._position
-        self._position += len(chunk)
+        self._position += len(data)
         if asked is None or self._position > asked.offset + asked.length:
             raise RemoteProtocolError(f"expected {asked.length if asked else 0} bytes of the file, got more")
         events: list[DownloadEvent] = []
         # Until the index is known everything may be of use; then what lies between two slices is not kept.
-        places = self.reception.wanted(start, len(chunk)) if self.reception.plan else [(start, len(chunk))]
+        places = self.reception.wanted(start, len(data)) if self.reception.plan else [(start, len(data))]
         for offset, length in list(places):
-            events += self.reception.take(offset, chunk[offset - start : offset - start + length])
+            events += self.reception.take(offset, data[offset - start : offset - start + length])
         return events
 
     def finish(self, now: float | None = None) -> None:
@@ -268,12 +270,12 @@ class RangeDownload:
 
     def _first(self) -> tuple[int, int] | None:
         """What to ask for before the index can be looked for."""
-        held, size = self.reception.held, self.reception.size
+        cached, size = self.reception.cached, self.reception.size
         if size is None:
             return 0, self._beginning()
         tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
         for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
-            gap = next(held.missing(start, length), None)
+            gap = next(cached.missing(start, length), None)
             if gap is not None:
                 return gap
         return None
@@ -283,7 +285,7 @@ class RangeDownload:
         from .safe_prefix import in_file_order
 
         target = self.reception.target
-        if not in_file_order(target) or self.reception.held.total:
+        if not in_file_order(target) or self.reception.cached.total:
             return _HEAD
         if target.max_bytes is not None:
             return min(max(target.max_bytes, _HEAD), _FIRST_MOST)
@@ -298,7 +300,7 @@ class RangeDownload:
 
         def read(offset: int, length: int) -> bytes:
             for gap in store.ranges.missing(offset, min(length, size - offset)):
-                raise _MissingError(*gap)
+                raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
 
         self._needed = None
@@ -310,8 +312,8 @@ class RangeDownload:
         return [*self.reception.follow(index)]
 
     def _next_slices(self) -> tuple[int, int] | None:
-        """The next slice that is missing, with those after it that are near and nothing between that is held."""
-        held = self.reception.held
+        """The next slice that is missing, with those after it that are near and nothing between that is cached."""
+        cached = self.reception.cached
         missing = self.reception.missing()
         first = next(missing, None)
         if first is None:
@@ -319,7 +321,7 @@ class RangeDownload:
         start, end = first[0], first[0] + first[1]
         for offset, length in missing:
             gap = offset - end
-            if not 0 <= gap <= self._gap or (gap and sum(size for _, size in held.missing(end, gap)) < gap):
+            if not 0 <= gap <= self._gap or (gap and sum(size for _, size in cached.missing(end, gap)) < gap):
                 break
             end = offset + length
         return start, end - start

@@ -1,4 +1,4 @@
-"""Reception of a surface over one or several connections.
+"""What has come of a surface over one or several connections.
 
 Bytes of the container go in, views come out. A `Download` or a `RangeDownload` is one connection and ends with it. The
 reception is handed to the next connection, so that bytes that have arrived are not requested again.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..decoding.decoder import Decoder, View
     from ..planning.plan import Plan
 
-__all__ = ["DownloadEvent", "Ended", "MemoryStore", "Reception", "Sink", "Store"]
+__all__ = ["DownloadEvent", "Ended", "MemoryStore", "ReceiverState", "Sink", "Store"]
 
 #: Called as ``sink(offset, data)`` with bytes of the container that had not come before, as they come.
 Sink: TypeAlias = Callable[[int, bytes], None]
@@ -98,7 +98,7 @@ class MemoryStore:
         self._pieces = [(at, data) for at, data in self._pieces if not self._used.covers(at, len(data))]
 
 
-class Reception:
+class ReceiverState:
     """One surface being received.
 
     Parameters
@@ -121,7 +121,7 @@ class Reception:
     target : Target
     decoder : Decoder
         Decodes what has arrived so far.
-    held : RangeSet
+    cached : RangeSet
         Bytes of the container that have arrived or were in the store.
     container : str or None
         SHA-256 of the container, once it is known.
@@ -134,9 +134,9 @@ class Reception:
     plan : Plan or None
         The slices that the target needs, once the index is known.
     received : int
-        Bytes of the surface that are held.
+        Bytes of the surface that are cached.
     data_bytes : int
-        Bytes of the container received, including bytes that were held already.
+        Bytes of the container received, including bytes that were cached already.
     wire_bytes : int
         Bytes of all messages and answers received.
     ended : str or None
@@ -159,7 +159,7 @@ class Reception:
 
         self.target = Target() if target is None else target
         self.decoder: Decoder = Decoder(selection_of(self.target), max_vertices=max_vertices, level=self.target.level)
-        self.held = RangeSet() if store is None else store.ranges.copy()
+        self.cached = RangeSet() if store is None else store.ranges.copy()
         self.container = container
         self.size = size
         self.planned: int | None = None
@@ -192,6 +192,7 @@ class Reception:
         RemoteError
             With the code ``other-container`` if it differs from the one before.
         """
+        # What is cached is of one container: bytes of another would be taken for it, and decode to nothing of either.
         if (self.container or container) != (container or self.container) or self.size not in (None, size):
             raise RemoteError(
                 "other-container",
@@ -210,6 +211,7 @@ class Reception:
         """
         check_length(metadata[1], metadata[0], section=True)
         self.planned, self._service = planned, (index, metadata)
+        # Where the file comes from its first byte on, its order is known before its index is.
         if prefix and self._order is None:
             self._follow([(0, planned)], [], [metadata])
         return self._advance()
@@ -267,30 +269,31 @@ class Reception:
             raise RemoteProtocolError(f"expected bytes of {self.size}, got those to {offset + len(data)}")
         self.data_bytes += len(data)
         views = []
-        for start, length in list(self.held.missing(offset, len(data))):
-            piece = data[start - offset : start - offset + length]
+        for start, length in list(self.cached.missing(offset, len(data))):
+            new = data[start - offset : start - offset + length]
+            # A hostile sender could send bytes one by one: each range that is kept counts for itself too.
             self._kept += length + _PIECE
             if self._kept > self.decoder.capacity.bytes:
                 raise TooLargeError(f"expected at most {self.decoder.capacity.bytes:,} bytes of a container, got more")
-            self.held.add(start, length)
+            self.cached.add(start, length)
             self._count(start, length)
             if self._sink is not None:
-                self._sink(start, piece)
+                self._sink(start, new)
             if self._store is not None:
-                self._store.write(start, piece)
+                self._store.write(start, new)  # the decoder gets it in the plan's order, from `_advance`
             else:
-                self._copy(start, piece)
+                self._copy(start, new)
                 self._fed.add(start, length)
-                views += self.decoder.feed_at(start, piece)
+                views += self.decoder.feed_at(start, new)
         return views + self._advance()
 
     def missing(self) -> Iterator[tuple[int, int]]:
         """The bytes that are still to come, as (offset, length) in order; once the index is known."""
         for place in self._order or ():
-            yield from self.held.missing(*place)
+            yield from self.cached.missing(*place)
 
     def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """The parts of a range that the target needs, held or not; before that is known, the whole range."""
+        """The parts of a range that the target needs, cached or not; before that is known, the whole range."""
         return iter([(offset, length)]) if self._wanted is None else self._wanted.overlap(offset, length)
 
     def keep(self) -> Store:
@@ -338,7 +341,7 @@ class Reception:
     ) -> None:
         self._surface = RangeSet(surface)
         self.received = 0
-        for place in self.held:
+        for place in self.cached:
             self._count(*place)
         self._wanted = RangeSet((*before, *surface, *after))
         if self._store is not None:
@@ -382,7 +385,7 @@ class Reception:
                 self._order.popleft()
             self._fed.add(offset, size)
             views += self.decoder.feed_at(offset, self._store.read(offset, size))
-            if self.plan is not None:
+            if self.plan is not None:  # before, the same bytes may be needed again to read the header or the index
                 self._store.used(offset, size)
         return views
 
@@ -414,12 +417,13 @@ class Reception:
         place = self._service[0]
         header = self.decoder.header
         if header is None:
+            # Only to read the header: the real decoder must be fed in the order that is not known yet.
             scratch = Decoder(
                 selection_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
             )
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):
-            return None
+            return None  # the section of masks, without which the index cannot be counted through, is not there yet
         self.decoder.capacity.take(INDEX_GROWTH * place[1])
         return self.follow(index_from(store.read(*place), ByteRange(*place), header))

@@ -12,7 +12,7 @@ from ..planning.byte_ranges import RangeSet
 from ..planning.plan import Mark, Plan
 from ..planning.planner import plan
 from ..protocol.connection import Connection, Side, State
-from ..protocol.messages import CODES, MAX_DATA, End, Error, Event, Header, Layer, MessageError, Open, Segments, Stop
+from ..protocol.messages import CODES, MAX_DATA, End, Error, Event, Layer, MessageError, Open, Opened, Segments, Stop
 
 __all__ = ["Sender"]
 
@@ -41,8 +41,8 @@ class Sender:
         Bytes of the container that were handed out.
     layers : int
         Layers or levels that were handed out; from the first one on the client can draw the surface.
-    held : RangeSet
-        Bytes of the container that the client already held when it last opened.
+    cached : RangeSet
+        Bytes of the container that the client had cached when it last opened.
     why : str or None
         Why the stream ended, once it has.
     """
@@ -50,7 +50,7 @@ class Sender:
     def __init__(self, index: Index, container: str) -> None:
         self.sent = 0
         self.layers = 0
-        self.held = RangeSet()
+        self.cached = RangeSet()
         self.why: str | None = None
         self._index = index
         self._container = container
@@ -71,7 +71,7 @@ class Sender:
     @property
     def pieces(self) -> int:
         """Number of pieces that a plan is made of; the time to make a plan is proportional to it."""
-        return len(self._index.segments) + len(self.held) + len(self._given)
+        return len(self._index.segments) + len(self.cached) + len(self._given)
 
     def receive(self, message: bytes) -> Event:
         """Take one message; returns its event.
@@ -144,7 +144,7 @@ class Sender:
             return
         slice_ = self._slices[0]
         if slice_.offset != wanted.offset or slice_.length < wanted.length:
-            return
+            return  # it was read for a plan that another `Open` has replaced since
         if len(data) != wanted.length:
             raise CorruptStreamError(f"expected {wanted.length} bytes, got {len(data)}", wanted.offset)
         self._slices.popleft()
@@ -162,11 +162,11 @@ class Sender:
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         self.why = None
-        marks = _as_held(chosen) if self._given else chosen.marks
+        marks = _as_cached(chosen) if self._given else chosen.marks
         self._follow(chosen.slices, marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
         self._outbox.append(
-            Header(
+            Opened(
                 self._container,
                 index.size,
                 chosen.bytes,
@@ -180,22 +180,22 @@ class Sender:
 
     def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:
         self._slices = deque(slice_ for slice_ in slices if slice_.length)
-        # Of the states that what is held makes already, there is nothing to say.
+        # Of the states that what is cached makes already, there is nothing to say.
         self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
 
     def _said(self, event: Open) -> RangeSet:
         """What the client has: what it says that it holds, or else what it said before and what it was sent since."""
         if not event.held and event.container is None:
-            return RangeSet((*self.held, *self._given))
+            return RangeSet((*self.cached, *self._given))
         if event.held and event.container is None:
             raise MessageError("bad-held", "expected open.container with open.held, got none")
         if event.container not in (None, self._container):
             raise MessageError("other-container", f"expected container {self._container}, got {event.container}")
-        held = RangeSet(event.held)
-        if held.end > self._index.size:
-            raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {held.end}")
-        self.held = held
-        return held
+        cached = RangeSet(event.held)
+        if cached.end > self._index.size:
+            raise MessageError("bad-held", f"expected ranges of {self._index.size} bytes, got one to byte {cached.end}")
+        self.cached = cached
+        return cached
 
     def _mark(self) -> None:
         while self._marks and self._marks[0][0] <= self._provided:
@@ -207,14 +207,14 @@ class Sender:
             self._outbox.append(End(self._ended))
 
 
-def _as_held(chosen: Plan) -> list[Mark]:
+def _as_cached(chosen: Plan) -> list[Mark]:
     """The marks of a plan after another one, whose slices the client has decoded as they came.
 
-    A state beyond which more is held is not shown by itself: its figures are not known.
+    A state beyond which more is cached is not shown by itself: its figures are not known.
     """
     ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
-    held = [ahead + mark.sent for mark in chosen.marks]
+    cached = [ahead + mark.sent for mark in chosen.marks]
     return [
         mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown)
-        for mark, size in zip(chosen.marks, held, strict=True)
+        for mark, size in zip(chosen.marks, cached, strict=True)
     ]

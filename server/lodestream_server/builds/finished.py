@@ -79,7 +79,7 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
     for option in options:
         raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
     _check_metadata(files[0])
-    return Format("lode", (".lode",), lambda head, suffix: False)
+    return Format(name="lode", suffixes=(".lode",), sniff=lambda head, suffix: False)
 
 
 def _check_metadata(path: Path) -> None:

@@ -50,7 +50,10 @@ from ..storage.records import Record, State
 from ..storage.storage import Storage
 from ..storage.uploads import check_upload
 from . import results, worker
-from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError, reason_of
+from .answers import ProcessDiedError, UnforeseenError, reason_of
+from .fork_control import ForkServer
+from .forkserver import Allowed
+from .processes import Call, Pool
 from .shares import Turns
 
 __all__ = ["Builder"]
@@ -472,8 +475,6 @@ class Builder:
             files=tuple(self._storage.upload_files(record)),
             filename=record.filenames[0] or None,
             name=record.name,
-            precision=options.pop("precision", None),
-            rms=options.pop("rms", None),
             closed=options.pop("closed", "auto"),
             options=options,
             max_vertices=self._settings.max_vertices,

@@ -41,9 +41,12 @@ from ..storage import damage
 from ..storage.durable import discard, make_folder, remove
 from ..storage.folders import is_file
 from ..storage.storage import Storage
+from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
+from .fork_control import ForkServer
+from .forkserver import Allowed
 from .level_files import Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, RefusedLevel, make_level
-from .processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError, WrongAnswerError
+from .processes import Call, Pool
 
 __all__ = ["LevelQueue", "Loan"]
 

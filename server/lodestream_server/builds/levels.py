@@ -26,7 +26,7 @@ from lodestream.errors import (
 )
 from lodestream.formats import formats
 
-from .processes import reason_of
+from .answers import reason_of
 
 if TYPE_CHECKING:
     from lodestream import Surface

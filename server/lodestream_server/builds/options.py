@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream import Tolerance
 from lodestream.errors import FormatError, OptionError, SwitchedOffError
+from lodestream.quality import Quality
 
 from . import finished
-from .worker import ALLOWED_BY, ATTRIBUTE, CLOSED, UNNAMED
+from .stored_quality import ATTRIBUTE, stored
+from .worker import ALLOWED_BY, CLOSED, UNNAMED
 
 if TYPE_CHECKING:
     from lodestream.formats import Format
@@ -53,20 +54,17 @@ class SurfaceOptions:
             points are given.
         """
         values: dict[str, str] = {}
+        precisions = []
         for key, value in query:
             if "=" in key:
                 raise OptionError(f"expected the name of an option, got {key[:80]!a}")
             if key == "precision":
-                # A name may hold an equals sign, a tolerance does not.
-                attribute, equals, value = value.rpartition("=")
-                key, value = key + equals + attribute, str(Tolerance.parse(value))
-            elif key == "rms":
-                value = str(Tolerance.parse(value))
+                precisions.append(value)
+                continue
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value
-        if "precision" in values and "rms" in values:
-            raise OptionError("expected either a precision or a root mean square error, got both")
+        values |= stored(Quality.parse(precisions, values.pop("rms", None)))
         name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
         closed = values.pop("closed", "auto")
         if closed not in CLOSED:

@@ -16,7 +16,7 @@ from lodestream.errors import CorruptStreamError, InputError, StreamError, TooLa
 
 from ..storage import containers
 from . import finished
-from .processes import WrongAnswerError, reason_of
+from .answers import WrongAnswerError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

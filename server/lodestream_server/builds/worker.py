@@ -30,6 +30,7 @@ from lodestream.errors import (
 
 from ..storage.durable import NewFile
 from . import finished
+from .stored_quality import without_quality
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ALLOWED_BY",
-    "ATTRIBUTE",
     "CLOSED",
     "UNNAMED",
     "Built",
@@ -53,9 +53,6 @@ _log = logging.getLogger(__name__)
 
 #: The values of ``closed``; `auto` leaves what the file says.
 CLOSED = ("auto", "none", "rows", "cols", "both")
-
-#: What stands before the name of an attribute in the key of its precision.
-ATTRIBUTE = "precision="
 
 #: What a file without a name is called in messages, which must not tell where it lies on the server.
 UNNAMED = "upload"
@@ -108,14 +105,10 @@ class Job:
         Original name of the first file.
     name : str or None
         Name for the surface.
-    precision : str or None
-        As on the command line: a number, or a number and ``d``.
-    rms : str or None
-        In the same notation; at most one of the two.
     closed : str
         One of `CLOSED`.
     options : mapping of str to str
-        Options of the format, and precisions of attributes: their keys begin with `ATTRIBUTE`.
+        Options of the format, and the quality among them, see `stored_quality`.
     max_vertices : int
     folder : Path
         Folder to write to; empty at the start.
@@ -126,8 +119,6 @@ class Job:
     files: tuple[Path, ...]
     filename: str | None
     name: str | None
-    precision: str | None
-    rms: str | None
     closed: str
     options: dict[str, str]
     max_vertices: int
@@ -238,7 +229,7 @@ def read_progress(folder: Path) -> float:
 
 
 def _build(job: Job) -> Built:
-    from lodestream import Tolerance, encode
+    from lodestream import encode
     from lodestream.formats import check_allowed
 
     path = job.container
@@ -249,22 +240,17 @@ def _build(job: Job) -> Built:
         except (StreamError, TooLargeError) as error:
             error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
             raise
-    surface = _read(job)
-    precision, rms = (None if text is None else Tolerance.parse(text) for text in (job.precision, job.rms))
-    precisions = {
-        key.removeprefix(ATTRIBUTE): Tolerance.parse(value)
-        for key, value in job.options.items()
-        if key.startswith(ATTRIBUTE)
-    }
+    quality, options = without_quality(job.options)
+    surface = _read(job, options)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
-        container = encode(surface, precision, rms=rms, attribute_precision=precisions, progress=_reporter(job.folder))
+        container = encode(surface, quality=quality, progress=_reporter(job.folder))
     with NewFile(path) as file:
         file.write(container)
     return Built(hashlib.sha256(container).hexdigest())
 
 
-def _read(job: Job) -> Surface:
+def _read(job: Job, options: dict[str, str]) -> Surface:
     from lodestream.encoding.losses import at_holes
     from lodestream.formats import read
 
@@ -276,7 +262,7 @@ def _read(job: Job) -> Surface:
             max_vertices=job.max_vertices,
             filename=job.filename or UNNAMED,
             allowed=job.allowed,
-            **{key: value for key, value in job.options.items() if not key.startswith(ATTRIBUTE)},
+            **options,
         )
     said = [str(warning.message) for warning in found if warning.category is FormatWarning]
     notes = dict.fromkeys([*said, *filter(None, [at_holes(surface)])])

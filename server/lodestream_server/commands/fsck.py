@@ -58,6 +58,8 @@ def fsck(args: argparse.Namespace) -> int:
 
     Raises
     ------
+    OptionError
+        If ``--adopt`` and ``--repair`` are both asked for.
     LodestreamError
         If it is not the data folder of a server, or another process uses it; or if the folder is to be changed and the
         compiled kernels are missing.

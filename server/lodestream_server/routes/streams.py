@@ -42,8 +42,8 @@ from ..problems import (
 )
 from ..storage import damage
 from ..storage.containers import OpenContainer
-from .files import ready, still_there
 from .routing import Parts
+from .sending import ready, still_there
 
 __all__ = ["router"]
 
@@ -200,7 +200,7 @@ class _Session:
         """Bytes that the client did not hold of the surface and did not need: it met its target, or had seen enough."""
         if self._sender.why in (None, "complete"):
             return 0
-        held = self._sender.held
+        held = self._sender.cached
         missing = (gap for p in plan(self._container.index).ranges for gap in held.missing(p.offset, p.length))
         return max(sum(length for _, length in missing) - self._sender.sent, 0)
 

@@ -21,8 +21,8 @@ from ..storage import uploads
 from ..storage.durable import discard
 from ..storage.records import Record
 from . import examples
-from .files import ready
 from .routing import Parts, State, readable
+from .sending import ready
 
 __all__ = ["router"]
 

@@ -27,7 +27,7 @@ def make_private(folder: Path) -> bool:
     Raises
     ------
     OSError
-        If it cannot be created, or something else has this name.
+        If it cannot be created; `NotADirectoryError` if something else has this name.
     """
     try:
         folder.mkdir(_PRIVATE, parents=True)

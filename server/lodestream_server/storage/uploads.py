@@ -68,7 +68,13 @@ class Upload:
         return [self._folder / str(number) for number in range(len(self.names))]
 
     def begin(self, name: str | None) -> None:
-        """Start the next file."""
+        """Start the next file.
+
+        Raises
+        ------
+        TooLargeError
+            If the upload has as many files as it may have.
+        """
         if len(self.names) == self._most_files:
             raise TooLargeError(f"expected at most {self._most_files} files in an upload")
         if self._folder is None:
@@ -85,7 +91,13 @@ class Upload:
         self.size += len(data)
 
     def end(self) -> None:
-        """Finish the file and synchronise it to disk."""
+        """Finish the file and synchronise it to disk.
+
+        Raises
+        ------
+        FormatError
+            If the file is empty.
+        """
         assert self._file is not None
         # The length keeps files apart: two files are not the same upload as both in one.
         self.digest.update(self._file.size.to_bytes(8, "big"))

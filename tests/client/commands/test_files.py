@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import RemoteError, RemoteProtocolError
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 from lodestream_client import sync
 from lodestream_client.stream.transport import Transport
 from lodestream_server import running_server
@@ -66,7 +66,7 @@ def test_a_file_is_the_same_surface_as_a_stream(surface: str, url: str, target: 
 
     if asynchronous:
         views, followed = asyncio.run(loop())
-        reception: Reception = followed._reception
+        reception: ReceiverState = followed._reception
     else:
         with sync.connect(url, target=target) as stream_of_file:
             views = list(stream_of_file)
@@ -74,7 +74,7 @@ def test_a_file_is_the_same_surface_as_a_stream(surface: str, url: str, target: 
     assert [view.bytes for view in views] == [view.bytes for view in by_socket]
     assert (reception.ended, views[-1].rms) == (stream.ended, by_socket[-1].rms)
     assert np.array_equal(views[-1].points, by_socket[-1].points)
-    assert reception.data_bytes == reception.held.total
+    assert reception.data_bytes == reception.cached.total
     assert reception.decoder.metadata == stream.decoder.metadata
 
 
@@ -262,7 +262,7 @@ def test_another_web_server(folder: Path, container_file: Path, terrain: Terrain
             views = list(stream)
         assert stream.ended == "complete"
         assert np.array_equal(views[-1].points, terrain)
-        assert stream._reception.data_bytes == stream._reception.held.total
+        assert stream._reception.data_bytes == stream._reception.cached.total
         with sync.connect(address, target=ls.Target(level=3)) as stream:
             list(stream)
         assert stream.ended == "level"

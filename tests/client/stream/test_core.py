@@ -68,7 +68,7 @@ def next_effect(core: Core) -> Effect | None:
 def complete(world: World) -> None:
     assert world.session.ended == "complete"
     assert np.array_equal(world.session.reception.decoder.surface().points, heights())
-    assert world.session.reception.data_bytes == world.session.reception.held.total, "nothing came twice"
+    assert world.session.reception.data_bytes == world.session.reception.cached.total, "nothing came twice"
     assert world.views[-1].complete
 
 

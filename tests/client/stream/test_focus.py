@@ -108,7 +108,7 @@ def test_looking_here_and_there_over_a_link_that_breaks(
                 stream.focus(random.choice([NEAR, FAR, None]))
         check(stream, surface, heights)
         assert stream.connections > 3
-        assert stream._reception.data_bytes == stream._reception.held.total
+        assert stream._reception.data_bytes == stream._reception.cached.total
 
 
 def test_looking_elsewhere_from_another_thread(surface: str, heights: Heights) -> None:
@@ -149,7 +149,7 @@ def test_what_is_kept_on_disk_is_not_sent_again(surface: str, heights: Heights) 
         for _ in second:
             pass
         check(second, surface, heights)
-        assert second.data_bytes + held == second._reception.held.total
+        assert second.data_bytes + held == second._reception.cached.total
 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])

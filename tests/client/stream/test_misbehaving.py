@@ -17,16 +17,16 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import ProtocolError, RemoteProtocolError
-from lodestream.protocol.messages import MAX_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Header, Segments
+from lodestream.protocol.messages import MAX_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Opened, Segments
 from lodestream.protocol.wire import serialize
 from lodestream_client import sync
 
 Behaviour = Callable[[ServerConnection], None]
-HEADER = serialize(Header("ab" * 32, 10_000, 5000, 1.0, (6000, 100), (5000, 100), True))
+HEADER = serialize(Opened("ab" * 32, 10_000, 5000, 1.0, (6000, 100), (5000, 100), True))
 
 
 def header_of(data: bytes, planned: int) -> bytes:
-    return serialize(Header("ab" * 32, len(data), planned, 1.0, (len(data) - 2, 2), (len(data) - 3, 1), True))
+    return serialize(Opened("ab" * 32, len(data), planned, 1.0, (len(data) - 2, 2), (len(data) - 3, 1), True))
 
 
 @contextmanager

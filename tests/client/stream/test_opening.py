@@ -20,7 +20,7 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.protocol.handshake import from_address
-from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Event, Header, Open, Segments
+from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Event, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
@@ -103,7 +103,7 @@ def answering(container: bytes, heard: list[Event]) -> Iterator[str]:
         assert connection.request is not None
         opening = opening_of(connection.request.path)
         assert opening is not None
-        header = Header("ab" * 32, len(container), len(container), 1.0, (1, 2), (len(container) - 1, 1), True)
+        header = Opened("ab" * 32, len(container), len(container), 1.0, (1, 2), (len(container) - 1, 1), True)
         slices: list[Event] = [Segments(at, container[at : at + 60_000]) for at in range(0, len(container), 60_000)]
         events: list[Event] = [header, *slices, End("complete")]
         for event in events:
@@ -153,7 +153,7 @@ def test_what_is_held_goes_with_it_after_a_break(
     with linked(surface, lambda number: Fault(cut_down=breaks[number]) if number < 3 else Fault()) as link:
         views, stream = follow(link.url, asynchronous, window=1500)
     assert np.array_equal(views[-1].points, terrain)
-    assert stream._reception.data_bytes == stream._reception.held.total, "nothing came twice"
+    assert stream._reception.data_bytes == stream._reception.cached.total, "nothing came twice"
     openings = [handshake.opening for handshake in dialled]
     assert [handshake.subprotocol for handshake in dialled] == [SUBPROTOCOL] * len(openings)
     assert len(openings) >= 4
@@ -173,7 +173,7 @@ def test_what_is_too_long_for_an_address_goes_as_a_message(
     views, stream = follow(surface, asynchronous, store=store, container=known, size=len(stored))
     assert dialled == [Dialled(None, SUBPROTOCOL)]
     assert np.array_equal(views[-1].points, terrain)
-    assert stream.data_bytes == stream._reception.held.total - 600 * 10
+    assert stream.data_bytes == stream._reception.cached.total - 600 * 10
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.4])

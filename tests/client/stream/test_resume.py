@@ -57,7 +57,7 @@ def follow(url: str, asynchronous: bool, **options: Any) -> tuple[list[ls.View],
 
 
 def nothing_twice(stream: BaseStream) -> bool:
-    return stream._reception.data_bytes == stream._reception.held.total
+    return stream._reception.data_bytes == stream._reception.cached.total
 
 
 def breaks_after(*bytes_down: int, **manner: Any) -> Callable[[int], Fault]:
@@ -104,7 +104,7 @@ def test_another_address_goes_on_with_what_is_held(surface: str, terrain: Terrai
         views, stream = follow(other.url, asynchronous, store=store, container=container, size=size)
     assert np.array_equal(views[-1].points, terrain)
     assert 0 < stream.data_bytes < size - 2000
-    assert stream.data_bytes < stream._reception.held.total
+    assert stream.data_bytes < stream._reception.cached.total
 
 
 def test_a_connection_that_falls_silent_is_replaced(surface: str, terrain: Terrain, asynchronous: bool) -> None:

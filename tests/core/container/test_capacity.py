@@ -22,7 +22,7 @@ from lodestream.grid.layout import Layout
 from lodestream.planning.selection import Selection
 from lodestream.target import Target
 from lodestream.transfer.range_download import RangeDownload
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 from lodestream.transform.predictors import default_predictors
 
 from .forgery import index_of
@@ -187,7 +187,7 @@ def test_an_index_counts_for_what_it_becomes_before_it_is_asked_for() -> None:
 
 def test_by_parts_of_a_file_too() -> None:
     data = empty()
-    download = RangeDownload(Reception(Target(order="level"), max_vertices=1_000_000))
+    download = RangeDownload(ReceiverState(Target(order="level"), max_vertices=1_000_000))
 
     def serve() -> None:
         while (request := download.request()[0]) is not None:
@@ -202,7 +202,7 @@ def test_by_parts_of_a_file_too() -> None:
 
 
 def test_chunks_that_nobody_can_use_are_bounded() -> None:
-    reception = Reception(max_vertices=1000)
+    reception = ReceiverState(max_vertices=1000)
     reception.decoder.capacity.bytes = 100_000
     reception.keep()
 

@@ -31,7 +31,7 @@ from lodestream.container.model import Errors, OptionalSection
 from lodestream.coordinates.coordinate_rules import evaluate
 from lodestream.decoding.inspection import inspect
 from lodestream.planning.planner import plan
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 
 from ..surfaces import contained, figures, follow, index_of
 from .forgery import with_header, with_index
@@ -583,7 +583,7 @@ def test_metadata_that_are_longer_are_refused_before_they_are_read() -> None:
     with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
         loose.feed_at(index.metadata.offset, long[index.metadata.offset : index.metadata.offset + 6])
     with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
-        Reception(ls.Target()).expect(100, (200, 50), (100, 70_000), True)
+        ReceiverState(ls.Target()).expect(100, (200, 50), (100, 70_000), True)
 
 
 @pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**31, 2**62, LARGEST])

@@ -20,7 +20,7 @@ from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.planning.window_errors import read_window_errors
 from lodestream.transfer.range_download import RangeDownload
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 from tests.golden.generate import FOLDER
 
 from ..surfaces import all_large, index_of, terrain
@@ -67,12 +67,12 @@ def read_index(data: bytes) -> None:
 
 
 def read_by_ranges(data: bytes) -> None:
-    File(data).serve(RangeDownload(Reception(ls.Target(order="level"), max_vertices=MOST)))
+    File(data).serve(RangeDownload(ReceiverState(ls.Target(order="level"), max_vertices=MOST)))
 
 
 def read_window(data: bytes) -> None:
     target = ls.Target(region=REGION)
-    reception = Reception(target, max_vertices=MOST)
+    reception = ReceiverState(target, max_vertices=MOST)
     File(data).serve(RangeDownload(reception))
     decoder = ls.Decoder(selection_of(target), max_vertices=MOST)
     decoder.feed(data)

@@ -11,7 +11,7 @@ import lodestream as ls
 from lodestream import reference
 from lodestream.container import Header, sections
 from lodestream.container import index as container_index
-from lodestream.container.chunks import count_windows
+from lodestream.container.chunks import chunks_of_a_channel
 from lodestream.container.model import Errors
 from lodestream.container.writer import CodedLayer, CodedSegment, write_container
 from lodestream.transform.predictors import default_predictors
@@ -37,7 +37,7 @@ def written(seed: int, attribute: bool) -> bytes:
     rng = np.random.default_rng(seed)
     header = large_header(attribute)
     units = len(header.layout.tiles) * header.channels
-    assert min(units // header.channels, count_windows(header)) > 64
+    assert min(units // header.channels, chunks_of_a_channel(header)) > 64
     layers: list[list[CodedSegment]] = [[] for _ in range(LAYERS)]
     for unit in np.flatnonzero(rng.random(units) < rng.choice([0.02, 0.5, 0.9])).tolist():
         tile, channel = divmod(unit, header.channels)
@@ -51,7 +51,7 @@ def written(seed: int, attribute: bool) -> bytes:
                 left, begins = left - passes, False
     pairs = ((0.5, 1.0),) * header.channels if header.channels > 1 else ()
     errors = [Errors(LAYERS - k, 2.0 * LAYERS, pairs) for k in range(LAYERS)]
-    chunks = [rng.bytes(int(rng.choice([0, 1, 200]))) for _ in range(count_windows(header) * header.channels)]
+    chunks = [rng.bytes(int(rng.choice([0, 1, 200]))) for _ in range(chunks_of_a_channel(header) * header.channels)]
     coded = [CodedLayer(error, own) for error, own in zip(errors, layers, strict=True)]
     levels = [errors[0]] * header.levels + [errors[-1]]
     return write_container(header, coded, levels, chunks, {}, exact=False, optional={200: b"more", 201: b""})

@@ -17,7 +17,7 @@ import lodestream as ls
 from lodestream.container import capacity
 from lodestream.container.capacity import Capacity
 from lodestream.decoding.inspection import inspect
-from lodestream.encoding import preparation
+from lodestream.encoding import prepared
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection
 from lodestream.reference.small_units import SmallUnit
@@ -163,8 +163,8 @@ def test_they_agree_on_tiles_and_chunks_of_any_size(
     heights = np.cumsum(rng.normal(size=shape), axis=1)
     tile, chunk = ((short, 8 + int(rng.integers(0, 3)) - short) for short in map(int, rng.integers(1, 7, 2)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparation, "tile_exponents", lambda *_: tile)
-        patch.setattr(preparation, "chunk_exponents", lambda *_: [chunk])
+        patch.setattr(prepared, "tile_exponents", lambda *_: tile)
+        patch.setattr(prepared, "chunk_exponents", lambda *_: [chunk])
         data = ls.encode(heights.astype(np.float32) if floats else np.rint(9 * heights).astype(np.int16))
     header = index_of(data).header
     assert (header.tile, header.chunk) == (tile, chunk)

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
+from lodestream.encoding.lattice_coordinates import fine_lattices, lattice_coordinates
 from lodestream.encoding.noise_shaping import feedback_rules
-from lodestream.encoding.preparation import Preparation
-from lodestream.encoding.stages import Encoding
+from lodestream.encoding.prepared import prepare
+from lodestream.encoding.transformed import transform
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.grid.layout import Layout
 from lodestream.quantization.band_steps import Quantiser
@@ -28,18 +29,18 @@ CLOSED = st.tuples(st.booleans(), st.booleans())
 
 def check(surface: ls.Surface, base: int) -> None:
     """What the loop leaves in its reconstructions is what a reader makes of the indices."""
-    prepared = Preparation(surface, (None, {}), Tolerance(0.01, relative=True))
-    fine = prepared.fine_lattices()
+    prepared = prepare(surface, ls.Quality(rms=Tolerance(0.01, relative=True)))
+    fine = fine_lattices(prepared)
     assert fine is not None
-    encoding = Encoding(prepared, lambda fraction: None, fine=fine)
+    transformed = transform(prepared, fine)
     layout, table, quantiser = prepared.layout, TileTable.of(prepared.layout), Quantiser(base)
     steps, rules = table.steps(quantiser), feedback_rules(table, quantiser)
-    for number, lattice in enumerate(fine[0][: prepared.geometric]):
-        _, predictors = encoding._transform(number, lattice)
+    for number, lattice in enumerate(fine.channels[: prepared.geometric]):
+        predictors = transformed.predictors[number]
         reconstructions = [allocate(grid.shape) for grid in layout.grids]
         for reconstruction in reconstructions:
             reconstruction[...] = 77  # of another try
-        indices = encoding._loops[number].indices(steps, rules, reconstructions)
+        indices = transformed.loops[number].indices(steps, rules, reconstructions)
         tiles = Tiles(table, quantiser)
         tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
         grids = [allocate(grid.shape) for grid in layout.grids]
@@ -47,8 +48,8 @@ def check(surface: ls.Surface, base: int) -> None:
         inverse(grids, layout, predictors, layout.levels, layout.levels)
         for reconstruction, grid in zip(reconstructions, grids, strict=True):
             assert np.array_equal(reconstruction, grid)
-        distance = np.abs(reconstructions[-1] - prepared.coordinates(number, lattice)[-1]).max()
-        assert distance < 8 * base + 8  # of the last part: the two belong to each other
+        distance = np.abs(reconstructions[-1] - lattice_coordinates(prepared, number, lattice)[-1]).max()
+        assert distance < 8 * base + 8  # of the last patch: the two belong to each other
 
 
 @settings(max_examples=30)

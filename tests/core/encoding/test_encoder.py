@@ -13,7 +13,7 @@ import lodestream as ls
 from lodestream import InputError, OptionError
 from lodestream.container import describe
 from lodestream.container.model import Errors
-from lodestream.encoding.stages import Encoding
+from lodestream.encoding.measured import _Measuring
 
 from ..surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus
 
@@ -185,17 +185,17 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
     points = terrain((40, 33), 1)
     told = [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
     assert len(told) > 5
-    measured = Encoding._errors
+    measured = _Measuring.errors
 
     def layers_when(raised: int, wrong: float) -> list[float]:
         """What is told if the layer of this number had an error of ``wrong``."""
         calls = itertools.count()
 
-        def errors(self: Encoding, *args: Any) -> Errors:
+        def errors(self: _Measuring, *args: Any) -> Errors:
             found = measured(self, *args)
             return found._replace(rms=wrong) if next(calls) == raised else found
 
-        monkeypatch.setattr(Encoding, "_errors", errors)
+        monkeypatch.setattr(_Measuring, "errors", errors)
         return [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
 
     assert layers_when(3, told[2] * 1.5) == told[:3] + told[4:]
@@ -311,7 +311,7 @@ def test_a_precision_leaves_attributes_as_they_are() -> None:
     assert not index_of(container).header.exact
 
 
-def test_pictures_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
+def test_reconstructions_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
     """Their coefficients and nodes reach what reconstructions in eighths of a step are kept within."""
     rng = np.random.default_rng(8)
     points = rng.choice([-(2**23), 0, 1, 2**23 - 1], (70, 90), p=[0.45, 0.05, 0.05, 0.45])

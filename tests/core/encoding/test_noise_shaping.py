@@ -66,7 +66,7 @@ def test_errors_of_a_band_add_up_as_the_rules_say(kind: tuple[bool, bool], count
     errors = rng.normal(size=(20, 30))
     errors += 0.5 * np.roll(errors, 1, 0) - 0.4 * np.roll(errors, 1, 1)
     work = allocate((512, 768))
-    top, left = (int(n) for n in table.windows[number, 1:])
+    top, left = (int(n) for n in table.origins[number, 1:])
     step = int(steps[number])
     work[top + 20 : top + 40, left + 20 : left + 50] = np.rint(errors * step)
     inverse([work], layout, default_predictors(layout), layout.levels)

@@ -28,12 +28,12 @@ class Case:
         rng = np.random.default_rng(seed)
         count = len(shapes)
         self.bands = np.zeros((count, BAND_FIELDS), np.int64)
-        self.windows = np.zeros((count, 3), np.int64)
+        self.origins = np.zeros((count, 3), np.int64)
         place, left = 5, 2
         for number, (rows, columns) in enumerate(shapes):
             stride = columns + int(rng.integers(0, 3))
             self.bands[number, [OFFSET, STRIDE, ROWS, COLUMNS]] = place, stride, rows, columns
-            self.windows[number] = number, 3, left
+            self.origins[number] = number, 3, left
             place, left = place + rows * stride, left + columns
         self.steps, self.state = np.array(steps, np.int64), np.array(states, np.int8)
         self.known = (rng.integers(0, 2**bits, place) >> rng.integers(0, bits + 2, place)).astype(np.int32)
@@ -48,14 +48,14 @@ class Case:
     def spread(self, finer: int, numbers: NDArray[np.int64] | None = None) -> NDArray[np.int32]:
         """What becomes of it, where nothing is spread -1."""
         numbers, out = np.arange(len(self.bands)) if numbers is None else numbers, self.empty()
-        arrays = self.known, self.sign, self.early, self.bands, self.windows, self.steps
+        arrays = self.known, self.sign, self.early, self.bands, self.origins, self.steps
         spread_bands(*arrays, numbers, self.state, finer, out, (2, 1))
         return out
 
     def expected(self, finer: int) -> NDArray[np.int32]:
         """The same by the rules."""
         out = self.empty()
-        for number, (tile, top, left) in enumerate(self.windows.tolist()):
+        for number, (tile, top, left) in enumerate(self.origins.tolist()):
             offset, stride, rows, columns = self.bands[number, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
             step, remaining = int(self.steps[number]), int(self.state[tile])
             trellis = 0
@@ -71,7 +71,7 @@ class Case:
 
 
 def kernel_refuses(case: Case, numbers: list[int], origin: tuple[int, int] = (2, 1)) -> None:
-    arrays = case.known, case.sign, case.early, case.bands, case.windows, case.steps
+    arrays = case.known, case.sign, case.early, case.bands, case.origins, case.steps
     with pytest.raises(ValueError, match="do not fit"):
         kernels.spread(*arrays, np.array(numbers), case.state, 0, case.empty(), *origin)
 
@@ -155,7 +155,7 @@ def test_what_does_not_lie_inside_is_refused() -> None:
         ("sign", slice(1, None), None),
         ("early", slice(1, None), None),
         ("bands", slice(0, 1), None),
-        ("windows", slice(0, 1), None),
+        ("origins", slice(0, 1), None),
         ("steps", slice(0, 1), None),
         ("state", slice(0, 1), None),
         ("bands", (1, OFFSET), -1),
@@ -167,14 +167,14 @@ def test_what_does_not_lie_inside_is_refused() -> None:
         ("bands", (1, ROWS), 2**40),
         ("bands", (1, COLUMNS), -1),
         ("bands", (1, COLUMNS), 2**62),
-        ("windows", (1, 0), -1),
-        ("windows", (1, 0), 2),
-        ("windows", (0, 1), 1),
-        ("windows", (0, 2), 0),
-        ("windows", (1, 1), 6),
-        ("windows", (1, 2), 13),
-        ("windows", (1, 1), -(2**63)),
-        ("windows", (1, 2), -(2**63)),
+        ("origins", (1, 0), -1),
+        ("origins", (1, 0), 2),
+        ("origins", (0, 1), 1),
+        ("origins", (0, 2), 0),
+        ("origins", (1, 1), 6),
+        ("origins", (1, 2), 13),
+        ("origins", (1, 1), -(2**63)),
+        ("origins", (1, 2), -(2**63)),
         ("steps", 0, -1),
         ("steps", 0, 2**26),
         ("state", 1, -1),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.container import read_index
 from lodestream.container.model import Index
-from lodestream.encoding.preparation import Preparation
+from lodestream.encoding.prepared import prepare
 
 from ..surfaces import is_told
 
@@ -175,7 +175,7 @@ def test_every_vertex_counts_once() -> None:
     ],
 )
 def test_every_vertex_is_one_wherever_it_appears(blocks: list[ls.Block], vertices: int) -> None:
-    prepared = Preparation(ls.Surface(blocks=blocks), (None, {}))
+    prepared = prepare(ls.Surface(blocks=blocks), ls.Quality())
     assert sum(original.count for original in prepared.originals) == vertices
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.encoding.preparation import chunk_exponents, tile_exponents
+from lodestream.encoding.tiling import chunk_exponents, tile_exponents
 from lodestream.entropy.tiles import TileTable, gather
 from lodestream.errors import InputError
 from lodestream.grid.layout import Layout, tile_bounds

@@ -28,7 +28,7 @@ from lodestream.protocol.messages import MAX_DATA, MAX_HELD, End, Layer, Message
 from lodestream.protocol.wire import parse, serialize
 from lodestream.target import Region
 from lodestream.transfer.download import Download, Ended
-from lodestream.transfer.receiver_state import MemoryStore, Reception
+from lodestream.transfer.receiver_state import MemoryStore, ReceiverState
 from lodestream.transfer.sender import Sender
 
 SHAPE = (400, 530)
@@ -64,9 +64,9 @@ def index(kind: str) -> Index:
 class Link:
     """A client and a server joined by queues, one step of one of them at a time."""
 
-    def __init__(self, kind: str, target: ls.Target, window: int, reception: Reception | None = None) -> None:
+    def __init__(self, kind: str, target: ls.Target, window: int, reception: ReceiverState | None = None) -> None:
         self.data = container(kind)
-        self.reception = Reception(target) if reception is None else reception
+        self.reception = ReceiverState(target) if reception is None else reception
         self.client = Download(window=window, reception=self.reception)
         self.server = Sender(index(kind), hashlib.sha256(self.data).hexdigest())
         self.to_server: list[bytes] = []
@@ -122,11 +122,11 @@ class Link:
                 self.take()
 
 
-def check_end(reception: Reception, kind: str, target: ls.Target) -> None:
+def check_end(reception: ReceiverState, kind: str, target: ls.Target) -> None:
     """All that was promised has come, nothing twice, and shows what the target says."""
     chosen = plan(index(kind), target)
     assert reception.ended == chosen.ended
-    assert reception.data_bytes == reception.held.total
+    assert reception.data_bytes == reception.cached.total
     assert reception.received == chosen.bytes
     view = reception.decoder.view()
     assert (view.bytes, view.rms, view.max_error) == (chosen.bytes, chosen.rms, chosen.max_error)
@@ -155,7 +155,7 @@ def test_whenever_one_looks_elsewhere_and_the_link_breaks(
     seed: int,
     stored: bool,
 ) -> None:
-    random, reception = Random(seed), Reception(target, store=MemoryStore() if stored else None)
+    random, reception = Random(seed), ReceiverState(target, store=MemoryStore() if stored else None)
     todo = list(turns)
     for steps in [*cuts, 10**6]:
         link = Link(kind, target, window, reception)
@@ -337,8 +337,8 @@ def test_the_work_of_a_plan_grows_as_what_it_is_made_of(target: ls.Target) -> No
         assert server.pieces == count + len(found.segments)
         while server.next_message() is not None:
             pass
-        opening = steps_of(lambda server=server: plan(found, target, server.held))  # type: ignore[misc]
-        turning = steps_of(lambda server=server: plan(found, replace(target, first=NEAR), server.held))  # type: ignore[misc]
+        opening = steps_of(lambda server=server: plan(found, target, server.cached))  # type: ignore[misc]
+        turning = steps_of(lambda server=server: plan(found, replace(target, first=NEAR), server.cached))  # type: ignore[misc]
         assert opening < 14 * server.pieces
         assert turning < 29 * server.pieces
 
@@ -372,7 +372,7 @@ def test_a_region_outside_is_refused_on_either_side(region: Region) -> None:
 @pytest.mark.parametrize("region", [((5, 5), (0, 5)), ((0, 5), (7, 6)), ((-1, 5), (0, 5))])
 def test_a_region_without_a_point_is_refused_before_anything_is_known(region: Region) -> None:
     with pytest.raises(OptionError, match="at least one row and column"):
-        Reception().focus(region)
+        ReceiverState().focus(region)
     with pytest.raises(OptionError, match="at least one row and column"):
         ls.Target(first=region)
 
@@ -441,7 +441,7 @@ def test_an_index_that_came_in_part_does_not_stand_in_the_way_of_metadata() -> N
     place = index("integers").index
     while not any(place.offset <= offset < place.end for offset, _ in first.slices):
         first.run(until=first.reception.data_bytes + 1)
-    assert not first.reception.held.covers(place.offset, place.length)
+    assert not first.reception.cached.covers(place.offset, place.length)
     second = Link("integers", target, MAX_DATA, first.reception)
     second.focus(None)
     second.run()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.container import read_index
 from lodestream.container.model import Index
-from lodestream.encoding import preparation
+from lodestream.encoding import prepared
 from lodestream.grid.layout import Layout
 from lodestream.grid.support import needed_tiles
 from lodestream.planning.planner import plan
@@ -114,8 +114,8 @@ SIZES = [((4, 4), (4, 4)), ((1, 7), (9, 7)), ((3, 6), (7, 1)), ((8, 8), (5, 3))]
 def test_tiles_and_chunks_of_any_size_are_read(
     kind: str, tile: tuple[int, int], chunk: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preparation, "tile_exponents", lambda *_: tile)
-    monkeypatch.setattr(preparation, "chunk_exponents", lambda *_: [chunk])
+    monkeypatch.setattr(prepared, "tile_exponents", lambda *_: tile)
+    monkeypatch.setattr(prepared, "chunk_exponents", lambda *_: [chunk])
     surface = surface_of(kind, 80, 270)
     container = ls.encode(surface)
     header = index_of(container).header

@@ -34,7 +34,7 @@ def record(container: bytes) -> Iterator[tuple[str, bytes]]:
     again = Download(reception=download.reception, window=_WINDOW)
     yield from _connection(again, Sender(index_of(container), sha256), container, None)
     assert again.ended == "complete"
-    assert again.reception.data_bytes == again.reception.held.total
+    assert again.reception.data_bytes == again.reception.cached.total
 
 
 def _connection(download: Download, sender: Sender, container: bytes, most: int | None) -> Iterator[tuple[str, bytes]]:

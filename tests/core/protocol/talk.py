@@ -15,7 +15,7 @@ from lodestream.decoding.decoder import View
 from lodestream.protocol.messages import MAX_CREDIT, MAX_MESSAGE, Segments
 from lodestream.protocol.wire import parse
 from lodestream.transfer.download import Download, Ended
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 from lodestream.transfer.sender import Sender
 
 __all__ = ["Link", "container", "index"]
@@ -43,7 +43,7 @@ class Link:
     target: ls.Target = field(default_factory=ls.Target)
     window: int = MAX_CREDIT
     now: float = 0.0
-    reception: Reception | None = None
+    reception: ReceiverState | None = None
 
     def __post_init__(self) -> None:
         self.client = Download(self.target, window=self.window, reception=self.reception)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import OptionError
-from lodestream.protocol.flow_control import Window
+from lodestream.protocol.flow_control import FlowWindow
 from lodestream.protocol.messages import MAX_CREDIT, MAX_DATA, MIN_WINDOW
 
 
@@ -20,12 +20,12 @@ class Outcome:
 
     use: float
     most: int
-    window: Window
+    window: FlowWindow
 
 
 def transfer(rate: float, round_trip: float, total: int, burst: float = 0.0) -> Outcome:
     """Receive so many bytes over a link that lets nothing through but every ``burst`` seconds."""
-    window = Window()
+    window = FlowWindow()
     outstanding = credit = window.size
     window.grant(window.size, 0.0)
     window.heard(round_trip)
@@ -86,7 +86,7 @@ def test_a_link_without_limits_gets_all_that_is_allowed() -> None:
     st.none() | st.floats(1e-9, 100),
 )
 def test_it_stays_within_its_limits_whatever_comes(arrivals: list[tuple[int, float]], heard: float | None) -> None:
-    window, now = Window(), 0.0
+    window, now = FlowWindow(), 0.0
     if heard is not None:
         window.heard(heard)
     for size, seconds in arrivals:
@@ -97,7 +97,7 @@ def test_it_stays_within_its_limits_whatever_comes(arrivals: list[tuple[int, flo
 
 
 def test_without_times_it_stays_as_it_is() -> None:
-    window = Window()
+    window = FlowWindow()
     for _ in range(100):
         window.grant(MAX_DATA)
         window.arrive(MAX_DATA)
@@ -106,7 +106,7 @@ def test_without_times_it_stays_as_it_is() -> None:
 
 @pytest.mark.parametrize("size", [1, 1000, MAX_CREDIT])
 def test_a_fixed_one_is_not_measured(size: int) -> None:
-    window = Window(size)
+    window = FlowWindow(size)
     for number in range(100):
         window.grant(size, float(number))
         window.arrive(size, number + 1e-3)
@@ -116,4 +116,4 @@ def test_a_fixed_one_is_not_measured(size: int) -> None:
 @pytest.mark.parametrize("size", [0, -1, MAX_CREDIT + 1])
 def test_a_size_outside_the_limits_is_refused(size: int) -> None:
     with pytest.raises(OptionError, match="window"):
-        Window(size)
+        FlowWindow(size)

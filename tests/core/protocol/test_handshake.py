@@ -12,7 +12,7 @@ from lodestream.protocol.handshake import MAX_OPENING, from_address, to_address
 from lodestream.protocol.messages import MessageError, Open
 from lodestream.protocol.wire import serialize
 from lodestream.transfer.download import Download
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 
 LONGEST = MAX_OPENING * 3 // 4
 
@@ -56,5 +56,5 @@ def test_a_download_says_open_once() -> None:
     download = Download()
     download.opened(0.0)
     assert download.data_to_send() == []
-    download = Download(reception=Reception())
+    download = Download(reception=ReceiverState())
     assert download.data_to_send() == [download.opening]

@@ -21,7 +21,7 @@ from lodestream.errors import (
 )
 from lodestream.planning.planner import plan
 from lodestream.protocol.connection import State
-from lodestream.protocol.messages import CODES, MAX_CREDIT, End, Error, Header, Layer, MessageError, Open, Segments
+from lodestream.protocol.messages import CODES, MAX_CREDIT, End, Error, Layer, MessageError, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.download import Download, Ended
 
@@ -67,7 +67,7 @@ def test_every_target_ends_where_the_plan_does(target: ls.Target, ended: str, wi
     state = (decoder.bytes, decoder.level, decoder.rms, decoder.max_error)
     assert state == (planned.bytes, planned.level, planned.rms, planned.max_error)
     assert decoder.metadata == {"name": "hills"}
-    assert link.client.header == Header(
+    assert link.client.answer == Opened(
         hashlib.sha256(container()).hexdigest(),
         len(container()),
         planned.bytes,

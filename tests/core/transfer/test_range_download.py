@@ -22,7 +22,7 @@ from lodestream.planning.selection import selection_of
 from lodestream.protocol.messages import MAX_CREDIT, MIN_WINDOW
 from lodestream.transfer.download import Download
 from lodestream.transfer.range_download import RangeDownload, RangeRequest
-from lodestream.transfer.receiver_state import MemoryStore, Reception
+from lodestream.transfer.receiver_state import MemoryStore, ReceiverState
 from lodestream.transfer.sender import Sender
 
 from ..surfaces import SAMPLES, contained, index_of, terrain
@@ -90,7 +90,7 @@ def test_both_transports_lead_to_the_same_surface(name: str, target: ls.Target) 
     too_small = target.region is not None and min(index.header.shape) < 6
     if too_small or (target.level or 0) > index.header.levels:
         pytest.skip("the surface is too small to have that")
-    reception = Reception(target)
+    reception = ReceiverState(target)
     File(container).serve(RangeDownload(reception))
     chosen = plan(index, target)
     assert reception.ended == chosen.ended
@@ -107,14 +107,14 @@ def test_both_transports_lead_to_the_same_surface(name: str, target: ls.Target) 
 
 @pytest.mark.parametrize("target", [*TARGETS, ls.Target(level=4), ls.Target(level=3, order="level")], ids=repr)
 def test_little_more_than_the_plan_comes_in_few_requests(large: bytes, target: ls.Target) -> None:
-    reception = Reception(target)
+    reception = ReceiverState(target)
     file = File(large)
     download = RangeDownload(reception)
     file.serve(download)
     chosen = plan(index_of(large), target)
     needed = sum(place.length for place in chosen.slices)
     assert download.requests == len(file.asked) <= 3 + len(chosen.ranges)
-    assert reception.data_bytes == reception.held.total, "nothing came twice"
+    assert reception.data_bytes == reception.cached.total, "nothing came twice"
     if target.order == "quality" and target.level is None:
         assert download.requests <= (2 if target.region is None else 3)
         # What lies between the tiles of a region is taken with them where it is little.
@@ -127,7 +127,7 @@ def test_slices_that_are_near_are_asked_for_together(large: bytes) -> None:
     index = index_of(large)
     target = ls.Target(level=index.header.levels - 1)
     file = File(large)
-    File.serve(file, RangeDownload(Reception(target)))
+    File.serve(file, RangeDownload(ReceiverState(target)))
     assert 3 <= len(file.asked) < 3 + len(plan(index, target).ranges) / 2
 
 
@@ -141,11 +141,11 @@ def test_whatever_is_held_is_not_asked_for(large: bytes, target: ls.Target) -> N
             for gap in list(store.ranges.missing(offset, min(random.randrange(1, 9000), len(large) - offset))):
                 store.write(gap[0], large[gap[0] : sum(gap)])
         held = store.ranges.copy()
-        reception = Reception(target, store=store, size=len(large))
+        reception = ReceiverState(target, store=store, size=len(large))
         file = File(large)
         file.serve(RangeDownload(reception))
         assert reception.ended == plan(index_of(large), target).ended
-        assert reception.data_bytes == reception.held.total - held.total
+        assert reception.data_bytes == reception.cached.total - held.total
         assert not any(next(held.overlap(*place), None) for place in file.asked)
         assert reception.decoder.rms == plan(index_of(large), target).rms
 
@@ -157,7 +157,7 @@ def test_whatever_is_held_is_not_asked_for(large: bytes, target: ls.Target) -> N
 def test_the_transports_may_change_at_any_byte(target: ls.Target, schedule: list[tuple[bool, int]]) -> None:
     container, index = contained("heights")
     sha256 = hashlib.sha256(container).hexdigest()
-    reception = Reception(target)
+    reception = ReceiverState(target)
     parts = RangeDownload(reception) if schedule and schedule[0][0] else None
     for by_range, most in [*schedule, (False, 10**6), (True, 10**6)]:
         if reception.ended is not None:
@@ -168,8 +168,8 @@ def test_the_transports_may_change_at_any_byte(target: ls.Target, schedule: list
         else:
             by_socket(Download(reception=reception, window=300), Sender(index, sha256), container, most // 300)
     assert reception.ended == plan(index, target).ended
-    assert reception.data_bytes == reception.held.total, "nothing came twice"
-    expected = Reception(target)
+    assert reception.data_bytes == reception.cached.total, "nothing came twice"
+    expected = ReceiverState(target)
     File(container).serve(RangeDownload(expected))
     decoder = reception.decoder
     assert (decoder.bytes, decoder.rms) == (expected.decoder.bytes, expected.decoder.rms)
@@ -196,7 +196,7 @@ def by_socket(download: Download, sender: Sender, container: bytes, messages: in
 
 def started(headers: dict[str, str] | None = None, status: int = 206) -> RangeDownload:
     """A download whose first request, of 4,096 bytes, was answered like this."""
-    download = RangeDownload(Reception(ls.Target(order="level")))
+    download = RangeDownload(ReceiverState(ls.Target(order="level")))
     download.request()
     download.answer(status, {"content-range": "bytes 0-4095/100000", **(headers or {})})
     return download
@@ -254,7 +254,7 @@ def test_a_file_that_changes_is_not_mixed_with_itself(first: dict[str, str], sec
     container = ls.encode(terrain((60, 60)).astype(np.float32))
     size = len(container)
     assert size > 8192
-    download = RangeDownload(Reception(ls.Target(order="level")))
+    download = RangeDownload(ReceiverState(ls.Target(order="level")))
     request, _ = download.request()
     assert request is not None
     headers = {"content-range": f"bytes 0-4095/{size}", **first}
@@ -274,7 +274,7 @@ def test_a_file_that_changes_is_not_mixed_with_itself(first: dict[str, str], sec
 
 def test_a_tag_that_is_a_hash_names_the_container(large: bytes) -> None:
     sha256 = hashlib.sha256(large).hexdigest()
-    reception = Reception()
+    reception = ReceiverState()
     File(large, f'"{sha256}"').serve(RangeDownload(reception), 5000)
     assert reception.container == sha256
     assert reception.size == len(large)
@@ -282,17 +282,17 @@ def test_a_tag_that_is_a_hash_names_the_container(large: bytes) -> None:
 
 def test_what_is_no_container_is_refused() -> None:
     with pytest.raises(ls.StreamError):
-        File(bytes(50_000)).serve(RangeDownload(Reception()))
+        File(bytes(50_000)).serve(RangeDownload(ReceiverState()))
 
 
 def test_a_level_that_does_not_exist(large: bytes) -> None:
     with pytest.raises(OptionError, match="expected a level of 0 to"):
-        File(large).serve(RangeDownload(Reception(ls.Target(level=99))))
+        File(large).serve(RangeDownload(ReceiverState(ls.Target(level=99))))
 
 
 def test_stopping_ends_it_with_what_has_come(large: bytes) -> None:
     for why in ("stopped", "seconds"):
-        reception = Reception()
+        reception = ReceiverState()
         download = RangeDownload(reception)
         File(large).serve(download, 20_000)
         assert reception.ended is None
@@ -305,11 +305,11 @@ def test_stopping_ends_it_with_what_has_come(large: bytes) -> None:
 def test_an_index_longer_than_the_first_guess(monkeypatch: pytest.MonkeyPatch, large: bytes) -> None:
     monkeypatch.setattr("lodestream.transfer.range_download._TAIL_LEAST", 64)
     monkeypatch.setattr("lodestream.transfer.range_download._HEAD", 16)
-    reception = Reception(ls.Target(order="level"))
+    reception = ReceiverState(ls.Target(order="level"))
     file = File(large)
     file.serve(RangeDownload(reception))
     assert reception.ended == "complete"
-    assert reception.data_bytes == reception.held.total
+    assert reception.data_bytes == reception.cached.total
     assert len(file.asked) > 3
 
 
@@ -338,9 +338,9 @@ def test_layers_are_shown_before_the_index_has_come_and_none_too_many(name: str,
             chosen = plan(index, target)
         except OptionError:
             with pytest.raises(OptionError, match="first layer or level"):
-                File(container).serve(RangeDownload(Reception(target)))
+                File(container).serve(RangeDownload(ReceiverState(target)))
             continue
-        reception = Reception(target)
+        reception = ReceiverState(target)
         download = RangeDownload(reception)
         request, _ = download.request()
         assert request is not None
@@ -365,7 +365,7 @@ def test_layers_are_shown_before_the_index_has_come_and_none_too_many(name: str,
 def test_the_first_request_is_as_large_as_the_target_allows(large: bytes, target: ls.Target, requests: int) -> None:
     assert 2 * MIN_WINDOW < len(large) < MAX_CREDIT
     file = File(large)
-    file.serve(RangeDownload(Reception(target)))
+    file.serve(RangeDownload(ReceiverState(target)))
     assert len(file.asked) == requests
     assert file.asked[0] == (0, {1: MAX_CREDIT, 2: target.max_bytes or MIN_WINDOW}[requests])
 
@@ -378,7 +378,7 @@ def kept(target: Any, data: bytes) -> MemoryStore:
             pass
 
     store = Keeping()
-    File(data).serve(RangeDownload(Reception(target, store=store)))
+    File(data).serve(RangeDownload(ReceiverState(target, store=store)))
     return store
 
 
@@ -387,18 +387,18 @@ def kept(target: Any, data: bytes) -> MemoryStore:
 def test_one_target_goes_on_from_what_another_has_left(first: ls.Target, second: ls.Target) -> None:
     container, index = contained("heights")
     sha256 = hashlib.sha256(container).hexdigest()
-    expected = Reception(second)
+    expected = ReceiverState(second)
     File(container).serve(RangeDownload(expected))
     for by_range in (True, False):
         store = kept(first, container)
         before = store.ranges.total
-        reception = Reception(second, store=store, container=sha256, size=len(container))
+        reception = ReceiverState(second, store=store, container=sha256, size=len(container))
         if by_range:
             File(container, f'"{sha256}"').serve(RangeDownload(reception))
         else:
             by_socket(Download(reception=reception, window=300), Sender(index, sha256), container, 10**6)
         assert reception.ended == expected.ended
-        assert reception.data_bytes == reception.held.total - before
+        assert reception.data_bytes == reception.cached.total - before
         decoder = reception.decoder
         assert (decoder.bytes, decoder.rms) == (expected.decoder.bytes, expected.decoder.rms)
         assert np.array_equal(decoder.surface().points, expected.decoder.surface().points)

@@ -16,7 +16,7 @@ from lodestream.planning.planner import plan
 from lodestream.protocol.messages import MAX_HELD, MIN_WINDOW, MessageError, Open
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.download import Download
-from lodestream.transfer.receiver_state import Reception
+from lodestream.transfer.receiver_state import ReceiverState
 from lodestream.transfer.sender import Sender
 
 from ..protocol.talk import Link, container, index
@@ -61,12 +61,12 @@ def test_a_connection_that_breaks_after_any_message_is_gone_on_with(target: ls.T
         second = Link(target, 700, reception=reception)
         second.run()
         assert reception.ended == whole.client.ended
-        assert reception.data_bytes == reception.held.total == whole.client.reception.data_bytes
+        assert reception.data_bytes == reception.cached.total == whole.client.reception.data_bytes
         decoder = reception.decoder
         assert (decoder.bytes, decoder.rms, decoder.max_error) == (expected.bytes, expected.rms, expected.max_error)
         assert decoder.metadata == expected.metadata
-        assert second.client.header is not None
-        assert second.client.header.planned == plan(index(), target).bytes
+        assert second.client.answer is not None
+        assert second.client.answer.planned == plan(index(), target).bytes
     assert np.array_equal(decoder.surface().points, expected.surface().points)
 
 
@@ -80,7 +80,7 @@ def test_however_often_it_breaks_in_whatever_order_events_come(
     target: ls.Target, window: int, cuts: list[int], seed: int
 ) -> None:
     """No deadlock, and credit that is never negative nor exceeded, over several connections."""
-    schedule, reception = Random(seed), Reception(target)
+    schedule, reception = Random(seed), ReceiverState(target)
     for steps in [*cuts, 100_000]:
         link = Link(target, window, reception=reception)
         for _ in range(steps):
@@ -96,17 +96,17 @@ def test_however_often_it_breaks_in_whatever_order_events_come(
         if reception.ended is not None:
             break
     assert reception.ended == plan(index(), target).ended
-    assert reception.data_bytes == reception.held.total
+    assert reception.data_bytes == reception.cached.total
     assert reception.decoder.bytes == plan(index(), target).bytes
 
 
 def test_another_container_is_not_mixed_with_the_one_held() -> None:
-    reception = Reception(container="0" * 64)
+    reception = ReceiverState(container="0" * 64)
     link = Link(reception=reception)
     with pytest.raises(MessageError, match="expected container") as refused:
         link.hear()
     assert refused.value.code == "other-container"
-    reception = Reception()
+    reception = ReceiverState()
     reception.identify("0" * 64, 10)
     with pytest.raises(RemoteError, match="has changed") as told:
         reception.identify("1" * 64, 10)
@@ -128,9 +128,9 @@ def test_a_list_of_what_is_held_that_cannot_be(held: tuple[tuple[int, int], ...]
 
 
 def test_what_is_held_in_very_many_pieces_is_told_as_far_as_a_message_goes() -> None:
-    reception = Reception(container="0" * 64)
+    reception = ReceiverState(container="0" * 64)
     for number in range(MAX_HELD + 10):
-        reception.held.add(number * 10, 5 if number % 500 else 1)
+        reception.cached.add(number * 10, 5 if number % 500 else 1)
     opening = parse(Download(reception=reception).data_to_send()[0])
     assert isinstance(opening, Open)
     assert len(opening.held) == MAX_HELD
@@ -147,16 +147,16 @@ def test_a_server_that_sends_what_is_held_does_no_harm() -> None:
     while first.to_client:
         first.take()
     reception = first.client.reception
-    assert 0 < reception.held.total < len(container())
+    assert 0 < reception.cached.total < len(container())
     reception.container = None  # so that the next connection cannot say what is held
     Link(window=700, reception=reception).run()
     assert reception.ended == "complete"
-    assert reception.data_bytes > reception.held.total
+    assert reception.data_bytes > reception.cached.total
     assert np.array_equal(reception.decoder.surface().points, ls.decode(container()).points)
 
 
 def test_bytes_behind_the_end_of_the_container_are_refused() -> None:
-    reception = Reception(size=100)
+    reception = ReceiverState(size=100)
     with pytest.raises(RemoteProtocolError, match="expected bytes of 100"):
         reception.take(90, bytes(11))
 

@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 import lodestream as ls
 from lodestream.errors import RemoteError
 from lodestream.protocol.handshake import to_address
-from lodestream.protocol.messages import CODES, End, Error, Header, Open, Stop
+from lodestream.protocol.messages import CODES, End, Error, Open, Opened, Stop
 from lodestream.protocol.wire import serialize
 from lodestream_client import sync
 from lodestream_server import running_server
@@ -73,7 +73,7 @@ def test_a_token_goes_with_the_handshake(served: Served) -> None:
     for scope in SCOPES:
         with raw_stream(served.surface, additional_headers=served.keys.header(scope)) as stream:
             stream.send(Open())
-            assert isinstance(stream.until_end()[0], Header)
+            assert isinstance(stream.until_end()[0], Opened)
 
 
 def test_a_token_that_is_not_good_is_refused_at_the_handshake(served: Served) -> None:
@@ -99,14 +99,14 @@ def test_the_page_of_another_site_opens_no_stream(served: Served, http: httpx.Cl
         assert json.loads(caught.value.response.body or b"")["code"] == "foreign-origin"
     with raw_stream(served.surface, origin=served.url) as stream:
         stream.send(Open(token=served.keys.tokens["read"]))
-        assert isinstance(stream.until_end()[0], Header)
+        assert isinstance(stream.until_end()[0], Opened)
 
 
 def test_a_token_in_open_does_what_a_header_would(served: Served) -> None:
     for scope in SCOPES:
         with raw_stream(served.surface) as stream:
             stream.send(Open(token=served.keys.tokens[scope]))
-            assert isinstance(stream.until_end()[0], Header)
+            assert isinstance(stream.until_end()[0], Opened)
 
 
 def opening(message: Open, **options: Any) -> Any:
@@ -121,7 +121,7 @@ def test_an_open_in_the_address_holds_no_token(
     header = served.keys.header("read")
     with caplog.at_level("DEBUG", "lodestream_server"):
         with raw_stream(served.surface, **opening(Open(), additional_headers=header)) as stream:
-            assert isinstance(stream.until_end()[0], Header)
+            assert isinstance(stream.until_end()[0], Opened)
         for address in (served.surface, missing):
             with raw_stream(address, **opening(Open())) as stream:
                 assert refused(stream) == "no-token"
@@ -189,7 +189,7 @@ def test_the_streams_of_a_token_end_with_it(
             stream = held.enter_context(raw_stream(served.surface, **options))
             if "query" not in options:
                 stream.send(message)
-            assert isinstance(stream.receive(), Header)
+            assert isinstance(stream.receive(), Opened)
             return stream
 
         def of(name: str) -> list[Raw]:

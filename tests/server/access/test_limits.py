@@ -17,7 +17,7 @@ import pytest
 from fastapi import Request
 from websockets.exceptions import ConnectionClosed
 
-from lodestream.protocol.messages import Error, Header, Open
+from lodestream.protocol.messages import Error, Open, Opened
 from lodestream_server import Settings, running_server
 from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
@@ -243,18 +243,18 @@ def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str,
         for name in ("one", "one", "two"):
             stream = opened(held, name)
             stream.send(Open(credit=0))
-            assert isinstance(stream.receive(), Header)
+            assert isinstance(stream.receive(), Opened)
         assert code_of(opened(held, "one")) == ("too-many", 4429)
         stream = opened(held, "two")
         stream.send(Open(credit=0))
-        assert isinstance(stream.receive(), Header)
+        assert isinstance(stream.receive(), Opened)
         assert code_of(opened(held, "three")) == ("busy", 4503)
 
     def free() -> bool:
         with ExitStack() as held:
             stream = opened(held, "one")
             stream.send(Open(credit=0))
-            return isinstance(stream.receive(), Header)
+            return isinstance(stream.receive(), Opened)
 
     assert eventually(free, "room after they are gone")
 
@@ -268,7 +268,7 @@ def test_who_shows_no_token_takes_no_stream_from_those_who_have_one(small: tuple
             headers = {"Authorization": f"Bearer {tokens[name]}"}
             stream = held.enter_context(raw_stream(surface, additional_headers=headers))
             stream.send(Open(credit=0))
-            assert isinstance(stream.receive(), Header)
+            assert isinstance(stream.receive(), Opened)
         # However a token is shown, it has the streams of that token and no more.
         silent[0].send(Open(credit=0, token=tokens["one"]))
         assert code_of(silent[0]) == ("busy", 4503)
@@ -284,14 +284,14 @@ def test_streams_count_by_the_token_in_open(small: tuple[str, str, dict[str, str
 
     def free() -> bool:
         with ExitStack() as held:
-            return isinstance(opened(held, "one").receive(), Header)
+            return isinstance(opened(held, "one").receive(), Opened)
 
     eventually(free, "room after the streams of before")
     with ExitStack() as held:
         for name in ("two", "two", "three"):
-            assert isinstance(opened(held, name).receive(), Header)
+            assert isinstance(opened(held, name).receive(), Opened)
         assert code_of(opened(held, "two")) == ("too-many", 4429)
-        assert isinstance(opened(held, "one").receive(), Header)
+        assert isinstance(opened(held, "one").receive(), Opened)
 
 
 def refused_at_once(url: str, token: str, length: int) -> bytes:

@@ -13,8 +13,8 @@ from importlib import import_module
 from pathlib import Path
 
 from lodestream_server.builds import jobs, level_queue, worker
+from lodestream_server.builds.forkserver import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
-from lodestream_server.builds.processes import Allowed
 from lodestream_server.builds.worker import Built, Job, Refused, build
 from lodestream_server.storage import durable
 from tests.server.storage.disks import FullDisk

@@ -20,7 +20,7 @@ import pytest
 
 from lodestream.confinement import landlock
 from lodestream_server.builds import jobs, worker
-from lodestream_server.builds.processes import ForkServer
+from lodestream_server.builds.fork_control import ForkServer
 from lodestream_server.maintenance import fsck
 from lodestream_server.storage.durable import remove
 from tests.server.builds.test_builds import running

@@ -287,14 +287,14 @@ def test_a_build_of_a_container_does_not_encode(tmp_path: Path, exact: bytes, mo
     (tmp_path / "0").write_bytes(exact)
     folder = tmp_path / "work"
     folder.mkdir()
-    job = worker.Job((tmp_path / "0",), "x.lode", None, None, None, "auto", {}, 1 << 20, folder)
+    job = worker.Job((tmp_path / "0",), "x.lode", None, "auto", {}, 1 << 20, folder)
     built = worker.build(job)
     assert isinstance(built, worker.Built)
     assert job.container.read_bytes() == exact
     assert built.errors == "checked"
     assert worker.read_progress(folder) > 0
     with pytest.raises(AssertionError):
-        worker.build(worker.Job((_npy(tmp_path),), "x.npy", None, None, None, "auto", {}, 1 << 20, folder))
+        worker.build(worker.Job((_npy(tmp_path),), "x.npy", None, "auto", {}, 1 << 20, folder))
 
 
 def _npy(folder: Path) -> Path:

@@ -16,7 +16,10 @@ from typing import Any
 
 import pytest
 
-from lodestream_server.builds.processes import Allowed, Call, ForkServer, Pool, ProcessDiedError, UnforeseenError
+from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
+from lodestream_server.builds.fork_control import ForkServer
+from lodestream_server.builds.forkserver import Allowed
+from lodestream_server.builds.processes import Call, Pool
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, eventually
 from tests.server.programs import alive
@@ -174,7 +177,9 @@ def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     program = (
         "import asyncio, pathlib, sys\n"
-        "from lodestream_server.builds.processes import Allowed, Call, ForkServer, Pool\n"
+        "from lodestream_server.builds.forkserver import Allowed\n"
+        "from lodestream_server.builds.processes import Call, Pool\n"
+        "from lodestream_server.builds.fork_control import ForkServer\n"
         "from tests.server.builds import slow\n"
         "begun = pathlib.Path(sys.argv[1])\n"
         "asyncio.run(Pool(1, ForkServer()).run(Call(slow.sleep, (begun,), allowed=Allowed(write=begun.parent))))\n"

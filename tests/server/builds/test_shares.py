@@ -16,7 +16,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.protocol.connection import State
-from lodestream.protocol.messages import MAX_HELD, End, Header, Open, Stop
+from lodestream.protocol.messages import MAX_HELD, End, Open, Opened, Stop
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
@@ -273,7 +273,7 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
             assert good.get("/healthz").status_code == 200
             with ExitStack() as mine:
                 events = opened(mine, town, "good", surface).until_end()
-            assert isinstance(events[0], Header)
+            assert isinstance(events[0], Opened)
             assert data_of(events) > surface["bytes"] // 2
 
         eventually(lambda: planning or None, "the first long plan")
@@ -284,9 +284,9 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
         mine = opened(stack, town, "good", surface, **fewer)
         assert entering.wait(PATIENCE)
         go.set()
-        assert isinstance(mine.receive(), Header)
+        assert isinstance(mine.receive(), Opened)
         for stream in theirs:
-            assert isinstance(stream.receive(), Header)
+            assert isinstance(stream.receive(), Opened)
         assert planning == ["open", "short", *["open"] * 4]
         go.clear()
         planning.clear()

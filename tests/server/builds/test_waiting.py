@@ -52,7 +52,7 @@ def test_a_reason_that_is_not_in_the_bytes_may_pass(cause: Exception, monkeypatc
             raise FormatError("expected a file that can be read") from None
 
     monkeypatch.setattr(worker, "_build", read)
-    refused = worker.build(worker.Job((), None, None, None, None, "auto", {}, 1, Path()))
+    refused = worker.build(worker.Job((), None, None, "auto", {}, 1, Path()))
     assert isinstance(refused, worker.Refused)
     assert not refused.final
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
 from lodestream import Target
-from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, End, Error, Header, Open, Segments
+from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, End, Error, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 
 __all__ = [
@@ -165,7 +165,7 @@ class Reader:
         event = parse(payload)
         if isinstance(event, Segments):
             return self._take(event)
-        if isinstance(event, Header):
+        if isinstance(event, Opened):
             self.container, self.expected = event.container, event.size
         elif isinstance(event, End):
             self.ended = event.why

@@ -18,7 +18,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.protocol.connection import State
-from lodestream.protocol.messages import CODES, Credit, End, Error, Event, Header, Open, Segments, Stop
+from lodestream.protocol.messages import CODES, Credit, End, Error, Event, Open, Opened, Segments, Stop
 from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.connections import connections
@@ -190,7 +190,7 @@ def test_a_stream_whose_client_speaks_now_and_then_outlives_the_clocks(impatient
     url, made = impatient
     with raw_stream(url + made["url"]) as stream:
         stream.send(Open(credit=1))
-        assert isinstance(stream.receive(), Header)
+        assert isinstance(stream.receive(), Opened)
         over = time.monotonic() + 1.5 * SECONDS
         while time.monotonic() < over:  # longer in all than a head or a silence may take
             assert isinstance(stream.receive(), Segments)
@@ -310,7 +310,7 @@ def test_a_plan_that_takes_long_is_no_silence_of_the_client(tmp_path: Path, monk
                 return stream.receive()
 
         # On a machine that does much else, the other open may come too late some time; not always.
-        eventually(lambda: isinstance(answer(), Header), "the answer to another open")
+        eventually(lambda: isinstance(answer(), Opened), "the answer to another open")
 
 
 def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> None:

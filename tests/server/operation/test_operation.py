@@ -27,7 +27,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
-from lodestream.protocol.messages import MAX_CREDIT, Bye, End, Header, Layer, Open, Stop
+from lodestream.protocol.messages import MAX_CREDIT, Bye, End, Layer, Open, Opened, Stop
 from lodestream_server import running_server
 from lodestream_server.operation import logs
 from lodestream_server.operation.metrics import Metrics
@@ -67,7 +67,7 @@ def test_streams_are_counted_and_what_stopping_saved(http: httpx.Client, server:
     before = figures(http)
     with raw_stream(server + made["url"]) as stream:
         stream.send(Open(ls.Target(max_bytes=5000)))
-        assert isinstance(stream.receive(), Header)
+        assert isinstance(stream.receive(), Opened)
         assert figures(http)["lodestream_streams_open",] == before["lodestream_streams_open",] + 1
         sent = data_of(stream.until_end())
     eventually(
@@ -285,7 +285,7 @@ def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None
         # Streams that wait, one that never reads, an upload that does not go on, a build that takes its time.
         waiting = running.enter_context(raw_stream(url + made["url"], additional_headers={"x-request-id": "waits"}))
         waiting.send(Open(credit=100))
-        assert isinstance(waiting.receive(), Header)
+        assert isinstance(waiting.receive(), Opened)
         silent = running.enter_context(raw_stream(url + made["url"], close_timeout=0.1))
         silent.send(Open())
         address = urlsplit(url)

@@ -24,9 +24,9 @@ from lodestream.protocol.messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     Open,
+    Opened,
     Segments,
     Stop,
 )
@@ -97,7 +97,7 @@ def test_the_answer_is_that_to_the_message(url: str, target: ls.Target) -> None:
     with raw_stream(url) as stream:
         stream.send(message)
         by_message = events_of(stream)
-    assert isinstance(by_address[0], Header)
+    assert isinstance(by_address[0], Opened)
 
     def said(events: list[Event]) -> list[str]:
         # Where one slice ends and the next begins depends on when grants come.
@@ -135,8 +135,8 @@ def test_what_is_held_is_not_sent_again(url: str, surface: dict[str, Any]) -> No
     assert data_of(events) == surface["levels"][-1]["bytes"] + header_of(events).metadata[1] - 650
 
 
-def header_of(events: list[Event]) -> Header:
-    assert isinstance(events[0], Header)
+def header_of(events: list[Event]) -> Opened:
+    assert isinstance(events[0], Opened)
     return events[0]
 
 
@@ -178,7 +178,7 @@ def test_what_is_wrong_is_told_as_of_a_message(url: str, query: str, code: str, 
 
 def test_an_open_before_the_end_is_out_of_turn(url: str) -> None:
     with opened(url, to_address(serialize(Open(credit=0)))) as stream:
-        assert isinstance(stream.receive(), Header)
+        assert isinstance(stream.receive(), Opened)
         stream.send(Open())
         assert refusal(stream).code == "out-of-turn"
 

@@ -32,9 +32,9 @@ from lodestream.protocol.messages import (
     End,
     Error,
     Event,
-    Header,
     Layer,
     Open,
+    Opened,
     Segments,
     Stop,
 )
@@ -101,7 +101,7 @@ def test_the_messages_come_in_their_order(url: str, surface: dict[str, Any]) -> 
         events = stream.until_end()
         assert closed(stream, 1000) == "bytes"
     header = events[0]
-    assert isinstance(header, Header)
+    assert isinstance(header, Opened)
     assert (header.container, header.size) == (surface["container"], surface["bytes"])
     layers = [event for event in events if isinstance(event, Layer)]
     assert [(layer.bytes, layer.level, layer.rms, layer.max) for layer in layers] == [
@@ -255,7 +255,7 @@ def test_a_surface_deleted_under_a_stream_goes_on_to_its_end(server: str, http: 
             for message in driver.data_to_send():
                 stream.socket.send(message)
             driver.receive(stream.socket.recv(timeout=PATIENCE, decode=False))
-            if driver.header is not None and driver.decoder.bytes:
+            if driver.answer is not None and driver.decoder.bytes:
                 http.delete(made["url"])
         for message in driver.data_to_send():
             stream.socket.send(message)
@@ -340,7 +340,7 @@ def test_what_a_client_holds_is_not_sent_again(url: str, surface: dict[str, Any]
         stream.send(Bye())
         closed(stream, 1000)
     header = events[0]
-    assert isinstance(header, Header)
+    assert isinstance(header, Opened)
     assert header.planned == surface["levels"][-1]["bytes"], "held or not"
     slices = [event for event in events if isinstance(event, Segments)]
     assert all(container[event.offset :].startswith(event.data) for event in slices)

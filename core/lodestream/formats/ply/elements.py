@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError
 from ..source import number
-from .header import Element, Header, Property
+from .header import Element, PlyHeader, Property
 
 __all__ = ["Lists", "Table", "read_elements"]
 
@@ -42,7 +42,7 @@ class Lists:
 Table = Mapping[str, "NDArray[Any] | Lists"]
 
 
-def read_elements(path: Path, header: Header) -> dict[str, Table]:
+def read_elements(path: Path, header: PlyHeader) -> dict[str, Table]:
     """Read the tables of a PLY file, by the names of their elements.
 
     Raises
@@ -53,7 +53,7 @@ def read_elements(path: Path, header: Header) -> dict[str, Table]:
     return _read_text(path, header) if not header.order else _read_binary(path, header)
 
 
-def _read_text(path: Path, header: Header) -> dict[str, Table]:
+def _read_text(path: Path, header: PlyHeader) -> dict[str, Table]:
     with path.open("rb") as file:
         file.seek(header.end)
         body = file.read()
@@ -193,7 +193,7 @@ class _Words:
         return FormatError(f"line {self._line + row}: expected {expected} of {self._element.name}, got {shown}")
 
 
-def _read_binary(path: Path, header: Header) -> dict[str, Table]:
+def _read_binary(path: Path, header: PlyHeader) -> dict[str, Table]:
     data = np.memmap(path, np.uint8, "r")
     tables: dict[str, Table] = {}
     place = header.end

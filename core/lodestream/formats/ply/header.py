@@ -11,7 +11,7 @@ import numpy as np
 from ...errors import FormatError
 from ..source import number
 
-__all__ = ["Element", "Header", "Property", "read_header"]
+__all__ = ["Element", "PlyHeader", "Property", "read_header"]
 
 _TYPES = {
     "char": "i1",
@@ -55,7 +55,7 @@ class Element:
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class PlyHeader:
     """What stands before the tables.
 
     Attributes
@@ -79,7 +79,7 @@ class Header:
     lines: int
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path) -> PlyHeader:
     """Read the header of a PLY file and check what it promises against the size of the file.
 
     Raises
@@ -120,7 +120,7 @@ def read_header(path: Path) -> Header:
     if order is None:
         raise FormatError("expected a PLY header with a line of the format, got none")
     whole = (replace(it, properties=tuple(of.values())) for it, of in zip(elements, properties, strict=True))
-    header = Header(order, tuple(whole), tuple(info), end.end(), len(lines))
+    header = PlyHeader(order, tuple(whole), tuple(info), end.end(), len(lines))
     _check_size(header, path.stat().st_size)
     return header
 
@@ -131,7 +131,7 @@ def _add(properties: dict[str, Property], added: Property, line: int) -> None:
     properties[added.name] = added
 
 
-def _check_size(header: Header, size: int) -> None:
+def _check_size(header: PlyHeader, size: int) -> None:
     follows = size - header.end
     promised = 0
     for element in header.elements:

@@ -16,7 +16,7 @@ from ..meshes import check_faces, surface_of
 from ..notes import keep_words, warn
 from ..source import Source, number
 from .elements import Lists, Table, read_elements
-from .header import Header
+from .header import PlyHeader
 
 __all__ = ["CURVE", "ELEMENT", "lists_left_out", "read", "read_curve", "words_of"]
 
@@ -28,11 +28,16 @@ _INDICES = ("vertex_indices", "vertex_index")
 _TEXTURE = "texcoord"
 
 
-def read(source: Source, header: Header) -> Surface:
+def read(source: Source, header: PlyHeader) -> Surface:
     """Read a mesh that is a structured surface.
 
     Properties of the vertices beside x, y and z are attributes, and so are places in a texture that faces have for
     their corners. Other properties of faces, and other elements, are left out, which ``recognised`` says.
+
+    Raises
+    ------
+    FormatError
+        If faces have no list of vertices, or are no grid.
     """
     rows = {element.name: element.rows for element in header.elements}
     source.check_vertices(rows.get("vertex", 0), f"{number(rows.get('vertex', 0))} vertices")
@@ -59,8 +64,14 @@ def read(source: Source, header: Header) -> Surface:
     return surface_of(source, mesh, "ply", words_of(header))
 
 
-def read_curve(source: Source, header: Header) -> Surface:
-    """Read points that edges join one after another, as a curve of shape (N, 1, 3)."""
+def read_curve(source: Source, header: PlyHeader) -> Surface:
+    """Read points that edges join one after another, as a curve of shape (N, 1, 3).
+
+    Raises
+    ------
+    FormatError
+        If edges do not name two vertices each, or join them in no single line.
+    """
     tables = read_elements(source.path, header)
     points, attributes = _vertices(tables)
     source.check_vertices(len(points), f"{number(len(points))} vertices")
@@ -79,7 +90,7 @@ def read_curve(source: Source, header: Header) -> Surface:
     return Surface(points[:, None], (closed, False), attributes=columns, metadata=metadata)
 
 
-def words_of(header: Header) -> dict[str, str]:
+def words_of(header: PlyHeader) -> dict[str, str]:
     """What comments say of unit and CRS."""
     words: dict[str, str] = {}
     for line in header.info:
@@ -87,7 +98,7 @@ def words_of(header: Header) -> dict[str, str]:
     return words
 
 
-def lists_left_out(header: Header) -> list[str]:
+def lists_left_out(header: PlyHeader) -> list[str]:
     """What vertices have that is no number, in words."""
     return [
         f"list {it.name} of vertices left out"
@@ -101,7 +112,7 @@ def lists_left_out(header: Header) -> list[str]:
 class _Names:
     """Names of faces, with their lines where the file is text."""
 
-    def __init__(self, header: Header) -> None:
+    def __init__(self, header: PlyHeader) -> None:
         self.line: int | None = None
         if not header.order:
             before = [element.name for element in header.elements].index(ELEMENT)

@@ -14,7 +14,7 @@ from ..attributes import group
 from ..notes import warn
 from ..source import Source, number
 from .elements import Lists, Table, read_elements
-from .header import Header
+from .header import PlyHeader
 from .mesh import lists_left_out, words_of
 
 __all__ = ["ELEMENT", "read"]
@@ -24,10 +24,15 @@ ELEMENT = "range_grid"
 _SIZES = ("num_rows", "num_cols")
 
 
-def read(source: Source, header: Header) -> Surface:
+def read(source: Source, header: PlyHeader) -> Surface:
     """Read the grid whose rows and columns ``obj_info`` tells; an empty list is a hole.
 
     Properties of the vertices beside x, y and z are attributes. Other lines of ``obj_info`` are not kept.
+
+    Raises
+    ------
+    FormatError
+        If the grid has another size than ``obj_info`` tells, or vertices lack a coordinate.
     """
     rows, columns = (_size(header, name) for name in _SIZES)
     source.check_vertices(rows * columns, f"a range grid of {rows} x {columns}")
@@ -57,7 +62,7 @@ def read(source: Source, header: Header) -> Surface:
     return merge(surface, source.closed)
 
 
-def _size(header: Header, name: str) -> int:
+def _size(header: PlyHeader, name: str) -> int:
     for line in header.info:
         match line.split():
             case [word, value] if word == name and value.isdecimal() and 0 < len(value) < 10 and int(value):

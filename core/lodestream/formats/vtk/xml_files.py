@@ -50,7 +50,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the grid of each file as a block; an index plane of volumes (option ``plane``)."""
+    """Read the grid of each file as a block; an index plane of volumes (option ``plane``).
+
+    Raises
+    ------
+    FormatError
+        If a file is not whole, or holds no structured grid; of several files the message names the one.
+    """
     readings = []
     for path in (source.path, *source.more):
         try:
@@ -122,14 +128,18 @@ def _checked(path: Path) -> tuple[Dims, int]:
     return (i, j, k), promised
 
 
-def _parsed(path: Path) -> _Found:
-    found = _Found()
-    parser = expat.ParserCreate()
+class _Parser:
+    """Listens to expat, and keeps in `found` what a file says of its grid."""
 
-    def refuse(*_: Any) -> None:
-        raise FormatError("expected XML without a DOCTYPE or entities, got one")
+    def __init__(self) -> None:
+        self.found = _Found()
+        self.expat = expat.ParserCreate()
+        self.expat.StartElementHandler, self.expat.EndElementHandler = self._start, self._end
+        self.expat.CharacterDataHandler = self._text
+        self.expat.StartDoctypeDeclHandler = self.expat.EntityDeclHandler = _refuse
 
-    def start(name: str, attributes: dict[str, str]) -> None:
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        found = self.found
         found.open_array = False
         found.named += name in ("DataArray", "Array")
         check_arrays(found.named)
@@ -153,36 +163,43 @@ def _parsed(path: Path) -> _Found:
                 found.open_array = True
             case "AppendedData":
                 found.appended = attributes
-                found.appended_at = parser.CurrentByteIndex
+                found.appended_at = self.expat.CurrentByteIndex
             case _ if name in _SECTIONS:
                 found.section = name
 
-    def end(name: str) -> None:
-        found.open_array = False
+    def _end(self, name: str) -> None:
+        self.found.open_array = False
         if name in _SECTIONS:
-            found.section = ""
+            self.found.section = ""
 
-    def text(characters: str) -> None:
-        if found.open_array:
-            array = found.arrays[-1]
+    def _text(self, characters: str) -> None:
+        if self.found.open_array:
+            array = self.found.arrays[-1]
             array.characters += len(characters)
             if len(array.text) < _KEPT:
                 array.text += "".join(characters.split())[:_KEPT]
 
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+
+def _refuse(*_: Any) -> None:
+    raise FormatError("expected XML without a DOCTYPE or entities, got one")
+
+
+def _parsed(path: Path) -> _Found:
+    """Parse a file to its end, or as far as its appended data."""
+    parser = _Parser()
+    found = parser.found
     try:
         with path.open("rb") as file:
             read = 0
             while found.appended is None and (chunk := file.read(_CHUNK)):
-                parser.Parse(chunk)
+                parser.expat.Parse(chunk)
                 read += len(chunk)
-                if found.appended is None and read - parser.CurrentByteIndex > _LONGEST_TAG:
+                if found.appended is None and read - parser.expat.CurrentByteIndex > _LONGEST_TAG:
                     raise TooLargeError(
                         f"expected tags and comments of at most {number(_LONGEST_TAG)} bytes, got a longer one"
                     )
             if found.appended is None:
-                parser.Parse(b"", True)
+                parser.expat.Parse(b"", True)
     except expat.ExpatError as error:
         if found.appended is None:  # what is appended may be bytes, which are no XML
             raise FormatError(f"expected an XML file of VTK, got {error}") from None

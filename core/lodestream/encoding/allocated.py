@@ -1,0 +1,86 @@
+"""The fourth stage: what every coding pass costs and gains, and which passes each layer adds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Header
+from ..entropy.band_fields import COLUMNS, ROWS
+from ..entropy.bitplanes import pass_count, pass_gains
+from ..entropy.tile_coder import Strings, TileCoder
+from ..entropy.tiles import Tiles
+from .allocation import TileCurve, assign_layers
+from .header import header_of
+from .large_units import large_level
+from .quantized import Quantized
+
+__all__ = ["Allocated", "State", "allocate"]
+
+#: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
+#: whose tiles are all known is inverted without errors of rounding.
+_ROUNDING = 0.2
+
+#: Coding passes still to come of every tile and channel: int8, shape (tile, channel).
+State = NDArray[np.int8]
+
+
+@dataclass(frozen=True, eq=False)
+class Allocated:
+    """Which coding passes each layer has.
+
+    Attributes
+    ----------
+    quantized : Quantized
+    header : Header
+        With the largest chunks; their size is chosen when errors are measured.
+    tiles : tuple of Tiles, one for each channel
+        All that a reader knows in the end; layers are reconstructed from them.
+    strings : dict
+        The bytes of large units, see `TileCoder`.
+    states : tuple of int8 arrays, shape (tile, channel)
+        Passes still to come after each layer.
+    coefficient_bytes : float
+        What all passes take, about.
+    """
+
+    quantized: Quantized
+    header: Header
+    tiles: tuple[Tiles, ...]
+    strings: Strings
+    states: tuple[State, ...]
+    coefficient_bytes: float
+
+
+def allocate(quantized: Quantized) -> Allocated:
+    """Code each tile once as a whole, and put the passes into layers."""
+    layout, channels = quantized.prepared.layout, quantized.channels
+    tables, geometric = list(quantized.tables), quantized.prepared.geometric
+    large = large_level(tables, list(channels), geometric, quantized.quantiser)
+    coder = TileCoder(tables, list(channels), geometric, quantized.quantiser, large)
+    curves = list(_curves(quantized, coder))
+    states = assign_layers(curves, layout, len(channels), quantized.quantiser is not None)
+    coefficient_bytes = sum(float(curve.bits.sum()) for curve in curves) / 8
+    header = header_of(quantized, large)
+    return Allocated(quantized, header, tuple(coder.tiles), coder.strings, tuple(states), coefficient_bytes)
+
+
+def _curves(quantized: Quantized, coder: TileCoder) -> Iterator[TileCurve]:
+    """Cost and gain of every pass of each tile and channel that has a bit-plane; parents before their children."""
+    rounding = _ROUNDING if quantized.quantiser is None else 0.0
+    for tile in range(len(quantized.prepared.layout.tiles)):
+        for number, (channel, table) in enumerate(zip(quantized.channels, quantized.tables, strict=True)):
+            top = int(channel.top[tile])
+            if not top:
+                continue
+            passes = pass_count(top)
+            costs = np.zeros(passes, np.float64)
+            coder.code(tile, number, passes, passes, costs)
+            bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+            rows, weights = table.of_tile(tile), channel.weights[table.first[tile] : table.first[tile + 1]]
+            gains = np.diff(pass_gains(rows, weights, passes, channel.true, coder.tiles[number].early))
+            gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
+            yield TileCurve(tile, number, bits, gains)

@@ -1,0 +1,86 @@
+"""The header of a stream: what a reader must know before the first layer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Header
+from ..grid.layout import Layout
+from ..surface import Surface
+from .prepared import Prepared
+from .quantized import Quantized
+
+__all__ = ["header_of"]
+
+
+def header_of(quantized: Quantized, large: int) -> Header:
+    """The header, with the largest chunks, and without what is known when all layers are coded.
+
+    Parameters
+    ----------
+    quantized : Quantized
+    large : int
+        The coarsest level whose units are large; 0: none are.
+    """
+    prepared, surface = quantized.prepared, quantized.prepared.surface
+    masks = [block.mask for block in surface.blocks]
+    return Header(
+        dtype=surface.dtype,
+        blocks=tuple((block.shape, block.closed) for block in surface.blocks),
+        arrangement=prepared.arrangement,
+        point_channels=prepared.point_channels,
+        flat=surface.blocks[0].points.ndim == 2,
+        attributes=prepared.kinds,
+        lattices=quantized.lattices.channels,
+        predictors=quantized.predictors,
+        extent=prepared.extent,
+        empty=tuple(_empty_levels(prepared.layout, channel.top) for channel in quantized.channels),
+        tile=prepared.layout.tile,
+        chunk=prepared.chunks[-1],
+        large=large,
+        exact=False,
+        corrected=False,
+        layer_count=0,
+        plane=prepared.plane,
+        masked=any(mask is not None for mask in masks),
+        hole=_hole(surface),
+        holes=tuple(block.holes for block in surface.blocks),
+        quantiser=quantized.quantiser,
+        joint_changes=prepared.joint_changes,
+        mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
+        **_kept(prepared),
+    )
+
+
+def _empty_levels(layout: Layout, top: NDArray[np.int8]) -> int:
+    """The levels without a coefficient other than 0, as bits; ``top``: bit-planes of each tile."""
+    return sum(1 << level for level in range(layout.levels + 1) if not top[layout.tiles_of(level)].any())
+
+
+def _encode_mask(mask: NDArray[np.bool_]) -> bytes:
+    from ..entropy.mask import encode_mask  # only where there is one
+
+    return encode_mask(mask)
+
+
+def _kept(prepared: Prepared) -> dict[str, Any]:
+    """The fields of a header that tell which holes have values that come back."""
+    if all(kept is None for kept in prepared.kept):
+        return {}
+    counts, coded = [], []
+    for kept, block in zip(prepared.kept, prepared.surface.blocks, strict=True):
+        counts.append(0 if kept is None else int(np.count_nonzero(kept)))
+        coded.append(b"" if kept is None or counts[-1] == block.holes else _encode_mask(kept))
+    return {"kept": tuple(counts), "kept_data": tuple(coded)}
+
+
+def _hole(surface: Surface) -> int:
+    """What integer points are under holes: the surface's nodata value where it is one of them."""
+    nodata = surface.metadata.get("nodata")
+    if surface.dtype.kind == "f" or not isinstance(nodata, int | float) or nodata != int(nodata):
+        return 0
+    limits = np.iinfo(surface.dtype)
+    return int(nodata) if max(limits.min, -(2**63)) <= nodata <= min(limits.max, 2**63 - 1) else 0

@@ -1,0 +1,105 @@
+"""Which values of a surface are worth coding, and what stands in place of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..surface import Block
+
+__all__ = ["Arrays", "filled", "given_arrays", "given_channel", "known_values", "valid_points"]
+
+#: Of one block: its points, then each attribute, shape (row, column, channel).
+Arrays = list[NDArray[Any]]
+
+
+def given_arrays(block: Block) -> Arrays:
+    """Points and attributes of a block as they were given, shape (row, column, channel); views."""
+    every = (block.points, *block.attributes.values())
+    return [array if array.ndim == 3 else array[..., np.newaxis] for array in every]
+
+
+def given_channel(block: Block, channel: int) -> NDArray[Any]:
+    """One channel of a block as it was given, shape (row, column), a view.
+
+    Raises
+    ------
+    IndexError
+        If the block has not so many channels.
+    """
+    for array in given_arrays(block):
+        if channel < array.shape[2]:
+            return array[..., channel]
+        channel -= array.shape[2]
+    raise IndexError(channel)
+
+
+def filled(block: Block) -> Arrays:
+    """Points and attributes of a block, finite everywhere; C-contiguous, shape (row, column, channel).
+
+    What has no holes is not copied.
+    """
+    arrays = []
+    for number, array in enumerate(given_arrays(block)):
+        known = [known_values(array[..., k], block, not number and k < 3) for k in range(array.shape[2])]
+        if not all(mask is None or mask.all() for mask in known):
+            from .fill import fill_holes  # only where there is one
+
+            array = array.copy()
+            for channel, mask in enumerate(known):
+                if mask is not None:
+                    array[..., channel] = fill_holes(array[..., channel], mask, block.closed)
+        arrays.append(np.ascontiguousarray(array))
+    return arrays
+
+
+def known_values(values: NDArray[Any], block: Block, coordinate: bool) -> NDArray[np.bool_] | None:
+    """Where one channel has numbers that are worth coding, bool, shape (row, column); None: everywhere.
+
+    A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; the residual gives
+    both back. Numbers that lie further out than all valid ones are left to it as well.
+
+    Parameters
+    ----------
+    values : array, shape (row, column)
+        The channel as it was given.
+    block : Block
+        Whose channel it is.
+    coordinate : bool
+        Whether the channel is a coordinate of the points.
+    """
+    if values.dtype.kind != "f" or (coordinate and block.kept is None):
+        return block.mask
+    valid: NDArray[np.bool_] = np.isfinite(values)
+    if block.mask is not None:
+        valid &= block.mask
+    if block.kept is None or not valid.any():
+        return valid
+    low, high = values[valid].min(), values[valid].max()
+    with np.errstate(invalid="ignore"):  # of signalling NaN
+        valid |= block.kept & (values >= low) & (values <= high)
+    return valid
+
+
+def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """The valid points of all blocks, shape (row, column) or (row, column, channel).
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+    points : for each block, shape (row, column, channel)
+        As `filled` returns them. Those of one block without holes are not copied.
+    """
+    flat = blocks[0].points.ndim == 2
+    if len(blocks) == 1 and blocks[0].mask is None:
+        valid = points[0]
+    else:
+        chosen = [
+            array.reshape(-1, array.shape[2]) if block.mask is None else array[block.mask]
+            for block, array in zip(blocks, points, strict=True)
+        ]
+        valid = np.concatenate(chosen)[:, np.newaxis]
+    return valid[..., 0] if flat else valid

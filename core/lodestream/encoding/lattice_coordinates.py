@@ -1,0 +1,156 @@
+"""The lattices that a stream starts from, and a channel's coordinates on its lattice, grid by grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..grid.connectivity import stored
+from ..quantization.lattice import Lattice, find_lattice, offset_lattice, precision_lattice, short_lattice
+from ..quantization.lattice_choice import attribute_lattices, channel_of, choose_lattices
+from ..transform.pyramid import allocate
+from .arranging import lines
+from .holes import given_channel, known_values
+from .prepared import Prepared
+
+__all__ = ["Lattices", "exact_lattices", "fine_lattices", "lattice_coordinates", "lies_on_coarse_lattice"]
+
+#: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
+_FINEST, _COARSEST = 128, 8
+
+
+@dataclass(frozen=True)
+class Lattices:
+    """The lattices of a stream.
+
+    Attributes
+    ----------
+    channels : tuple of Lattice, one for each channel
+    fineness : int
+        How many lattice steps make the error of one coordinate that the stream is made for; 0: it is made for none.
+    """
+
+    channels: tuple[Lattice, ...]
+    fineness: int = 0
+
+
+def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
+    """A lattice for each channel: its own, or one as fine as its precision asks for, or as costs least.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    bits : int, optional
+        Keep no more of any channel than so many bits of its range; what they leave out is stored.
+
+    Raises
+    ------
+    InputError
+        If a precision is too small for the values.
+    """
+    found = choose_lattices(prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions)
+    whole = prepared.precision is None and bits is None
+    if whole and prepared.point_channels == 1 and prepared.arrangement is None:
+        offset = offset_lattice(prepared.arrays[0][0][..., 0])
+        if offset is not None and find_lattice(prepared.valid) is None:
+            found[0] = offset
+    for number, kind in enumerate(prepared.kinds, 1):
+        values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays])
+        found += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits)
+    return Lattices(tuple(found))
+
+
+def fine_lattices(prepared: Prepared) -> Lattices | None:
+    """Lattices whose steps are small beside the error that the stream is made for.
+
+    None where it is made for none, and where all steps would be too many, however few make the error.
+
+    Raises
+    ------
+    InputError
+        If the precision of an attribute is too small for its values.
+    """
+    if prepared.rms is None:
+        return None
+    error = prepared.rms / math.sqrt(prepared.geometric)
+    flat = [channel_of(prepared.valid, channel) for channel in range(prepared.geometric)]
+    spans = [(float(values.min()), float(values.max())) for values in flat]
+    fineness = _FINEST
+    while any(precision_lattice(*span, error / fineness).step > 1.01 * error / fineness for span in spans):
+        fineness //= 2
+        if fineness < _COARSEST:
+            return None
+    others = exact_lattices(prepared).channels[prepared.geometric :]
+    return Lattices((*(short_lattice(*span, error / fineness) for span in spans), *others), fineness)
+
+
+def lies_on_coarse_lattice(prepared: Prepared) -> bool:
+    """Whether the coordinates lie on a lattice as coarse as the error: an exact stream may then be shorter."""
+    found = find_lattice(prepared.valid)
+    return found is not None and prepared.rms is not None and found.spacing >= prepared.rms
+
+
+def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
+    """Coordinates of a channel on its lattice; what patches share agrees.
+
+    Returns
+    -------
+    list of int32 arrays, shape (row, column), one for each grid of the layout
+        New ones, see `pyramid.allocate`.
+    """
+    arrays = [allocate(grid.shape) for grid in prepared.layout.grids]
+    if prepared.arrangement is None:
+        _of_one_grid(prepared, channel, lattice, arrays[0])
+    else:
+        _of_patches(prepared, channel, lattice, arrays)
+    return arrays
+
+
+def _of_one_grid(prepared: Prepared, channel: int, lattice: Lattice, array: NDArray[np.int32]) -> None:
+    lattice.coordinates(prepared.channel(0, channel), out=array)
+    block = prepared.surface.blocks[0]
+    if block.mask is None:
+        return
+    from .fill import settle_holes  # only where there is one
+
+    mask: NDArray[np.bool_] | None = block.mask
+    if block.kept is not None:
+        mask = known_values(given_channel(block, channel), block, channel < prepared.geometric)
+    assert mask is not None  # there are holes
+    array[...] = settle_holes(array, mask, prepared.layout)
+
+
+def _of_patches(prepared: Prepared, channel: int, lattice: Lattice, arrays: list[NDArray[np.int32]]) -> None:
+    interfaces = prepared.interfaces
+    known: set[int] = set()
+    for number, patch in enumerate(prepared.patches):
+        values = stored(patch, prepared.channel(patch.block, channel))
+        arrays[interfaces + number][...] = lattice.coordinates(values)
+        if channel >= prepared.geometric:
+            continue  # attributes are not shared: blocks may disagree about them
+        for side, line in zip(patch.sides, lines(arrays[interfaces + number]), strict=True):
+            if side is None:
+                continue
+            interface = arrays[side.interface][:, 0]
+            if side.interface not in known:
+                interface[:] = (line[::-1] if side.reversed else line)[: interface.size]
+                known.add(side.interface)
+    if channel < prepared.geometric:
+        _agree(prepared, arrays)
+
+
+def _agree(prepared: Prepared, arrays: list[NDArray[np.int32]]) -> None:
+    """Sides take their points from their interfaces: under holes, and on coarser lattices, these may differ."""
+    interfaces = prepared.interfaces
+    for number, grid in enumerate(prepared.layout.grids[:interfaces]):
+        for end, source in enumerate(grid.sources[:2]):
+            if source is not None:
+                arrays[number][-end, 0] = arrays[source.grid][-1 if source.reversed else 0, 0]
+    for number, patch in enumerate(prepared.patches):
+        for side, line in zip(patch.sides, lines(arrays[interfaces + number]), strict=True):
+            if side is not None:
+                interface = arrays[side.interface][:, 0]
+                line[:] = interface[::-1] if side.reversed else interface

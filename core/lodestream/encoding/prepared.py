@@ -1,0 +1,240 @@
+"""The first stage: holes filled, blocks cut into patches, vertices counted once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import AttributeKind, JointChanges
+from ..coordinates.height_fields import to_heights
+from ..grid.connectivity import Arrangement, Patch, whole_patch
+from ..grid.layout import Layout
+from ..grid.multiblock import grids_of, shared_points
+from ..joints import Groups
+from ..mesh.joining import change_of
+from ..quality import Quality
+from ..quantization.distortion import Original, originals_of
+from ..quantization.lattice import find_lattice
+from ..quantization.lattice_choice import DEFAULT_DIVISIONS, choose_lattices
+from ..quantization.lattice_depth import default_divisions
+from ..quantization.measure import extent_of
+from ..surface import Block, Surface
+from ..target import Tolerance
+from ..transform.pyramid import PADDING
+from .arranging import arranged, may_share, unshared
+from .holes import Arrays, filled, valid_points
+from .tiling import SMALL, SMALL_TILE, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE, chunk_exponents, square, tile_exponents
+
+__all__ = ["Prepared", "prepare"]
+
+#: Numbers of the rules of x and y that a header may hold.
+_LONGEST_RULES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What the encoder needs of a surface.
+
+    Attributes
+    ----------
+    given, surface : Surface
+        As it came, and as it is coded: heights alone where x and y follow a rule.
+    plane : mapping or None
+        That rule.
+    arrays : tuple, one for each block, of lists of arrays, shape (row, column, channel)
+        Points, then each attribute, of any dtype; finite, holes filled.
+    valid : array, shape (row, column) or (row, column, channel)
+        The valid points of all blocks; of one block with no holes a view of `arrays`.
+    point_channels : int
+        Of the points.
+    geometric : int
+        Channels that are coordinates, at most three.
+    kinds : tuple of AttributeKind
+    extent : float
+        Range of the heights or diagonal of the box, of valid points, in the surface's unit.
+    precision : float or None
+        Largest distance allowed, in the surface's unit.
+    rms : float or None
+        Largest root mean square error of a stream that is made for it, in the surface's unit.
+    attribute_precisions : mapping of str to Tolerance
+    divisions : float
+        Into how many lattice steps the widest extent is divided where the points lie on no lattice.
+    arrangement : Arrangement or None
+        None where the surface is one block that shares no side.
+    patches : tuple of Patch
+    layout : Layout
+    chunks : tuple of (int, int)
+        Exponents of two: what may be the rows and columns of a chunk of residual, the smallest first.
+    originals : tuple of Original, one for each patch
+    joint_changes : JointChanges or None
+        See `Header`.
+    """
+
+    given: Surface
+    surface: Surface
+    plane: Mapping[str, Any] | None
+    arrays: tuple[Arrays, ...]
+    valid: NDArray[Any]
+    point_channels: int
+    geometric: int
+    kinds: tuple[AttributeKind, ...]
+    extent: float
+    precision: float | None
+    rms: float | None
+    attribute_precisions: Mapping[str, Tolerance]
+    divisions: float
+    arrangement: Arrangement | None
+    patches: tuple[Patch, ...]
+    layout: Layout
+    chunks: tuple[tuple[int, int], ...]
+    originals: tuple[Original, ...]
+    joint_changes: JointChanges | None
+
+    @property
+    def kept(self) -> list[NDArray[np.bool_] | None]:
+        """Of each block the holes whose values come back, bool, shape (row, column)."""
+        return [block.kept for block in self.given.blocks]
+
+    @property
+    def interfaces(self) -> int:
+        """How many of the layout's grids are interfaces; they come before the patches."""
+        return len(self.layout.grids) - len(self.patches)
+
+    def channel(self, block: int, channel: int) -> NDArray[Any]:
+        """One channel of a block, shape (row, column), holes filled; a view.
+
+        Raises
+        ------
+        IndexError
+            If the surface has not so many channels.
+        """
+        for array in self.arrays[block]:
+            if channel < array.shape[2]:
+                return array[..., channel]
+            channel -= array.shape[2]
+        raise IndexError(channel)
+
+    def span(self, channel: int) -> float:
+        """Largest value of a channel less the smallest one, in its unit."""
+        values = [self.channel(block, channel) for block in range(len(self.arrays))]
+        return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
+
+    def canvases(self) -> list[NDArray[np.int32]]:
+        """Room for a reconstruction of all coordinates: int32, shape (coordinate, row, column or more), of each grid.
+
+        What is in it does not matter to whoever reconstructs; rows end in `pyramid.PADDING` columns that kernels use.
+        """
+        shapes = [grid.shape for grid in self.layout.grids]
+        return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
+
+
+def prepare(surface: Surface, quality: Quality) -> Prepared:
+    """Prepare a surface; `InputError` is raised if it cannot be encoded with this precision."""
+    given, (surface, plane) = surface, _heights(surface)
+    blocks, first = surface.blocks, surface.blocks[0]
+    arrays = tuple(filled(block) for block in blocks)
+    points = [own[0] for own in arrays]
+    point_channels = points[0].shape[2]
+    geometric = min(point_channels, 3)
+    valid = valid_points(blocks, points)
+    extent = extent_of(valid, geometric) if plane is None else _extent_given(given.blocks[0])
+    precision, rms = quality.precision, None
+    if precision is not None and precision.relative and not extent:
+        precision = None  # a fraction of nothing: one point, which a lattice holds exactly
+    absolute = None if precision is None else precision.absolute(extent)
+    if quality.rms is not None and extent:
+        rms = quality.rms.absolute(extent) or None  # 0: every value is exact, as of a surface that is one point
+    divisions = _divisions(points, geometric) if absolute is None and rms is None else DEFAULT_DIVISIONS
+    arrangement = None
+    if len(blocks) > 1 or (geometric > 1 and may_share(first, points[0])):
+        arrangement = unshared(blocks)
+        if geometric > 1:  # sides are shared by points, not by heights
+            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions)
+            arrangement = arranged(blocks, points, lattices[:geometric])
+    if arrangement is None:
+        small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
+        layout, chunks = _of_one_grid(first, geometric, small)
+    else:
+        # It is never read in windows: tiles and chunks may be as large as costs the fewest bytes.
+        layout, chunks = Layout(grids_of(arrangement), square(WHOLE_TILE)), [square(WHOLE_CHUNK)]
+    return Prepared(
+        given=given,
+        surface=surface,
+        plane=plane,
+        arrays=arrays,
+        valid=valid,
+        point_channels=point_channels,
+        geometric=geometric,
+        kinds=_kinds(first),
+        extent=extent,
+        precision=absolute,
+        rms=rms,
+        attribute_precisions=quality.attributes,
+        divisions=divisions,
+        arrangement=arrangement,
+        patches=(whole_patch(0, first.shape, first.closed),) if arrangement is None else arrangement.patches,
+        layout=layout,
+        chunks=tuple(chunks),
+        originals=tuple(originals_of(arrangement, points, [block.mask for block in blocks])),
+        joint_changes=_joint_changes(given, arrangement),
+    )
+
+
+def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
+    """Heights in place of x, y and z where a short rule makes x and y again, and that rule."""
+    block = surface.blocks[0]
+    lost = block.mask is not None and surface.dtype.kind != "f"  # integers have no coordinates under holes
+    if len(surface.blocks) > 1 or "angles" in surface.metadata or lost:
+        return surface, None
+    heights = to_heights(surface)
+    if heights is None:
+        return surface, None
+    rules = heights.metadata.pop("grid")
+    if sum(map(len, rules)) > _LONGEST_RULES:
+        return surface, None
+    return heights, {"grid": rules}
+
+
+def _extent_given(block: Block) -> float:
+    """Of what came as x, y and z, and is coded as heights: tolerances are relative to the diagonal of its box."""
+    points = block.points if block.mask is None else block.points[block.mask][:, np.newaxis]
+    return extent_of(points, 3)
+
+
+def _kinds(block: Block) -> tuple[AttributeKind, ...]:
+    return tuple(
+        AttributeKind(name, array.dtype, array.shape[2] if array.ndim == 3 else 0)
+        for name, array in block.attributes.items()
+    )
+
+
+def _divisions(points: Sequence[NDArray[Any]], geometric: int) -> float:
+    """Into how many lattice steps the widest extent is divided where all values come back bit for bit."""
+    largest = max(points, key=lambda array: array.size)
+    return default_divisions([largest[..., channel] for channel in range(geometric)])
+
+
+def _takes_small_tiles(surface: Surface, valid: NDArray[Any]) -> bool:
+    """Whether a surface that is kept exactly has few points, of many bytes each: floats on no lattice."""
+    few = math.prod(surface.blocks[0].shape) <= SMALL
+    return few and surface.dtype.kind == "f" and find_lattice(valid) is None
+
+
+def _of_one_grid(block: Block, geometric: int, small: bool) -> tuple[Layout, Sequence[tuple[int, int]]]:
+    """The layout of a surface of one block that shares no side, and what its chunks may be."""
+    bits = SMALL_TILE if small else TILE_BITS if geometric == 1 else WHOLE_TILE
+    layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, bits))
+    return layout, chunk_exponents(block.shape, small)
+
+
+def _joint_changes(given: Surface, arrangement: Arrangement | None) -> JointChanges | None:
+    shapes = [block.shape for block in given.blocks]
+    places = Groups.none() if arrangement is None else shared_points(arrangement, shapes)
+    to_places, to_vertices = change_of(given, places)
+    nothing = not any(array.size for array in (*to_places, *to_vertices))
+    return None if nothing else (to_places.runs, to_vertices.runs)

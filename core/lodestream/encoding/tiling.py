@@ -1,0 +1,50 @@
+"""How large the tiles of coefficients and the chunks of residual of a surface are, as exponents of two."""
+
+from __future__ import annotations
+
+__all__ = ["CHUNK_BITS", "TILE_BITS", "WHOLE_CHUNK", "WHOLE_TILE", "chunk_exponents", "square", "tile_exponents"]
+
+#: Coefficients of a tile in a band, and points of a chunk of residual, as exponents of two.
+TILE_BITS, CHUNK_BITS = 12, 12
+#: The same for surfaces of at most so many points, where these take many bytes each.
+SMALL_TILE, SMALL_CHUNK, SMALL = 11, 10, 1 << 19
+#: Of x, y, z, where no window is wanted, or small chunks would take many more bytes.
+WHOLE_TILE, WHOLE_CHUNK = 14, 16
+
+
+def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
+    """Rows and columns of a tile of 2**bits coefficients, as exponents of two, for a surface of one grid.
+
+    They are counted in nodes, half of the points.
+
+    >>> tile_exponents((1000, 1000))
+    (6, 6)
+    >>> tile_exponents((16, 1000))
+    (3, 9)
+    """
+    return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
+
+
+def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
+    """Rows and columns that chunks of residual of a surface of one grid may have, as exponents of two.
+
+    The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
+
+    >>> chunk_exponents((1000, 1000))
+    [(6, 6), (8, 8)]
+    """
+    sizes = [SMALL_CHUNK] * small + [CHUNK_BITS, WHOLE_CHUNK]
+    return [_fitting(*shape, bits) for bits in sizes]
+
+
+def square(bits: int) -> tuple[int, int]:
+    """2**bits in as many rows as columns, or twice as many columns; exponents of two."""
+    return bits // 2, bits - bits // 2
+
+
+def _fitting(rows: int, columns: int, bits: int) -> tuple[int, int]:
+    """A square, or something longer where that holds more of what is narrow."""
+    short, long = square(bits)
+    while short > 1 and 2 * min(rows, columns) <= 1 << short:
+        short, long = short - 1, long + 1
+    return (short, long) if rows <= columns else (long, short)

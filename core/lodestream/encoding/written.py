@@ -1,0 +1,64 @@
+"""The end of the chain: the passes of every layer coded anew, now in the order of the stream, and the container."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..container.digest import DIGEST, values_digest
+from ..container.writer import CodedLayer, CodedSegment, write_container
+from ..entropy.tile_coder import TileCoder
+from ..planning.window_errors import KIND as WINDOW_ERRORS
+from ..planning.window_errors import serialize_window_errors
+from .measured import Measured, MeasuredLayer, all_passes
+from .residual_encoder import as_returned
+
+__all__ = ["write"]
+
+#: The share of the bytes that errors of windows may take.
+_WINDOWS_SHARE = 0.005
+
+
+def write(measured: Measured) -> bytes:
+    """The container; if all channels are exact its metadata hold the digest of the values."""
+    given, header = measured.quantized.prepared.given, measured.header
+    lossless = all(measured.exact)
+    metadata = dict(measured.quantized.prepared.surface.metadata)
+    if lossless:
+        metadata[DIGEST] = values_digest(as_returned(given, header.hole))
+    layers = _coded(measured)
+    levels, chunks = list(measured.levels), list(measured.chunks)
+    optional = _window_errors(measured.layers, layers, chunks)
+    return write_container(header, layers, levels, chunks, metadata, exact=lossless, optional=optional)
+
+
+def _coded(measured: Measured) -> list[CodedLayer]:
+    """Code the passes that each layer adds."""
+    quantized, channels = measured.quantized, list(measured.quantized.channels)
+    tables, geometric, large = list(quantized.tables), quantized.prepared.geometric, measured.header.large
+    coder = TileCoder(tables, channels, geometric, quantized.quantiser, large, measured.strings)
+    before = start = all_passes(quantized)
+    coded = []
+    for layer in measured.layers:
+        state, segments = layer.state, []
+        for tile, number in np.argwhere(state < before):
+            first, last = int(before[tile, number]), int(state[tile, number])
+            data = coder.code(int(tile), int(number), first, first - last)
+            top, begins = int(channels[number].top[tile]), first == start[tile, number]
+            segments.append(CodedSegment(int(tile), int(number), top, first - last, bool(begins), data))
+        coded.append(CodedLayer(layer.errors, segments))
+        before = state
+    return coded
+
+
+def _window_errors(
+    measured: Sequence[MeasuredLayer], coded: Sequence[CodedLayer], chunks: Sequence[bytes]
+) -> dict[int, bytes]:
+    """Errors of windows as an optional section, if all layers have them and they take little of the bytes."""
+    codes = [layer.window_codes for layer in measured if layer.window_codes is not None]
+    if len(codes) < len(coded):
+        return {}
+    payload = serialize_window_errors(codes)
+    total = sum(len(s.data) for layer in coded for s in layer.segments) + sum(map(len, chunks))
+    return {WINDOW_ERRORS: payload} if len(payload) < _WINDOWS_SHARE * total else {}

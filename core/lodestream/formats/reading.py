@@ -1,0 +1,187 @@
+"""Reading files: the first bytes decide the format, its row of the table does the rest."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..container import metadata
+from ..errors import FormatError, InputError, OptionError
+from ..surface import Closed, Surface
+from . import notes
+from .source import DEFAULT_MAX_VERTICES, Source, check_allowed, with_name
+from .table import FORMATS, Format
+
+__all__ = ["read", "sniff"]
+
+#: Bytes at the start of a file that decide about its format.
+_HEAD = 4096
+
+_CLOSED: Mapping[str, Closed | None] = {
+    "auto": None,
+    "none": (False, False),
+    "rows": (True, False),
+    "cols": (False, True),
+    "both": (True, True),
+}
+
+
+def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Format:
+    """Find the format of a file by its first bytes.
+
+    Parameters
+    ----------
+    path : str or path-like
+        An existing file.
+    filename : str, optional
+        The file's original name, if `path` has another; only its suffix matters, and only for text.
+
+    Raises
+    ------
+    FormatError
+        If the file is empty, not a regular file, or of no known format.
+    """
+    path = Path(path)
+    label = filename or os.fspath(path)
+    try:
+        return _sniff(path, Path(label).suffix.lower())
+    except InputError as error:
+        raise with_name(error, label) from None
+
+
+def read(
+    path: str | os.PathLike[str],
+    *more: str | os.PathLike[str],
+    closed: str | Closed = "auto",
+    max_vertices: int = DEFAULT_MAX_VERTICES,
+    filename: str | None = None,
+    allowed: Collection[str] | None = None,
+    **options: Any,
+) -> Surface:
+    """Read a surface from a file; the file's content decides its format.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A file of one of the `formats`.
+    *more : str or path-like
+        Further files of the same surface, for formats that take them (`Format.more`).
+    closed : {"auto", "none", "rows", "cols", "both"} or (bool, bool)
+        Which axes are closed. "auto": those that the format declares closed, and those whose last row or column repeats
+        the first bit for bit. The repeated one is merged (``seam`` in the metadata) and written again by `write`.
+    max_vertices : int
+        Larger surfaces are refused before memory is allocated for them.
+    filename : str, optional
+        The file's original name, if `path` has another, as with uploads. It is used in messages and as ``name`` in the
+        metadata; its suffix helps with text.
+    allowed : collection of str, optional
+        Names (`Format.names`) of the formats that may be read; by default all.
+    **options
+        Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
+
+    Returns
+    -------
+    Surface
+        With its own copy of the values, in the file's type (float64 for text). Its metadata have ``name``, ``format``
+        and, if the file has them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a number,
+        or text if it is not finite), ``unit``, ``scale`` and ``offset`` (for values kept as stored), ``scalars``
+        (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that docs/formats.md lists. A
+        `FormatWarning` tells what was left out; so also if metadata exceed `lodestream.container.metadata.MAX_BYTES`
+        and their largest entries are dropped.
+
+    Raises
+    ------
+    FormatError
+        If the file is invalid, cut short, or not a structured surface.
+    SwitchedOffError
+        If its format may not be read.
+    TooLargeError
+        If it announces more vertices than allowed, or expands implausibly.
+    OptionError
+        If an option does not exist, or its value is not valid.
+    InputError
+        If the values cannot be a surface because none is valid.
+    OSError
+        If the file cannot be opened.
+    """
+    path = Path(path)
+    label = filename or os.fspath(path)
+    name = Path(label)
+    try:
+        if isinstance(closed, str) and closed not in _CLOSED:
+            raise OptionError(f"expected closed as one of {', '.join(_CLOSED)}, got {closed!r}")
+        chosen = _CLOSED[closed] if isinstance(closed, str) else closed
+        if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
+            raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
+        format_ = _sniff(path, name.suffix.lower())
+        if format_.read is None:
+            raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
+        check_allowed(format_.names, allowed)
+        if more and not format_.more:
+            raise OptionError(f"expected one file of format {format_.name}, got {1 + len(more)}")
+        _check_options(format_, options)
+        if format_.named:
+            options = {**format_.named(name.name), **options}
+        others = tuple(map(Path, more))
+        for other in others:
+            _check_regular(other)
+        size = path.stat().st_size
+        surface = format_.read(Source(path, name.stem, size, max_vertices, options, others, chosen, allowed))
+        surface.metadata, dropped = metadata.fitted(surface.metadata)
+        if dropped:
+            words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
+            notes.warn(f"metadata are limited to {metadata.MAX_BYTES:,} bytes; left out: {words}")
+        return surface if chosen is None else _closed(surface, chosen)
+    except InputError as error:
+        raise with_name(error, label) from None
+
+
+def _closed(surface: Surface, closed: Closed) -> Surface:
+    if len(surface.blocks) > 1:
+        raise OptionError(f"expected closed=auto for a surface of several blocks, got {len(surface.blocks)} blocks")
+    if surface.closed == tuple(closed):
+        return surface
+    attributes = surface.attributes
+    return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=surface.metadata)
+
+
+def _sniff(path: Path, suffix: str) -> Format:
+    _check_regular(path)
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not any(suffix in it.suffixes for it in FORMATS):
+        suffix = ""
+    if not head:
+        raise FormatError(f"expected {_readable()}, got an empty file")
+    for format_ in FORMATS:
+        if format_.sniff(head, suffix):
+            return format_
+    raise FormatError(f"expected {_readable()}, got {_describe(head)}")
+
+
+def _check_regular(path: Path) -> None:
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise FormatError("expected a regular file, got a folder, pipe or device")
+
+
+def _readable() -> str:
+    names = [it.name for it in FORMATS if it.read]
+    return f"a file of format {', '.join(names[:-1])} or {names[-1]}"
+
+
+def _describe(head: bytes) -> str:
+    """Say how a file begins, in characters that are safe to print."""
+    text = head[:40].decode("ascii", "replace")
+    if all(character.isprintable() or character.isspace() for character in text) and "\ufffd" not in text:
+        return f"text that begins with {' '.join(text.split())!r}"
+    return f"bytes that begin with {head[:8].hex(' ')}"
+
+
+def _check_options(format_: Format, options: Mapping[str, Any]) -> None:
+    for name in options:
+        if name not in format_.options:
+            known = ", ".join(format_.options) or "none"
+            raise OptionError(f"expected an option of format {format_.name} ({known}), got {name!r}")

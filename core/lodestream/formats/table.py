@@ -1,0 +1,176 @@
+"""The table of formats: who recognises, reads and writes each, and under which names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import BinaryIO
+
+from ..surface import Surface
+from . import bezier, glb, npy, npz, off, text_arrays
+from .netcdf import reader as netcdf
+from .obj import reader as obj
+from .obj import writer as obj_writer
+from .pcd import reader as pcd
+from .plot3d import reader as plot3d
+from .ply import reader as ply
+from .ply import writer as ply_writer
+from .raster import ascii_grid, geotiff, png, srtm_hgt, usgs_dem
+from .source import Source
+from .vtk import cgns
+from .vtk import legacy as vtk_legacy
+from .vtk import writer as vts_writer
+from .vtk import xml_files as vtk_xml
+
+__all__ = ["FORMATS", "Format", "formats"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """One row of the table of formats.
+
+    Attributes
+    ----------
+    name : str
+        Name in ``?format=`` and in messages.
+    suffixes : tuple of str
+        File name suffixes, in lower case with their dot; the usual one first.
+    sniff : callable
+        ``sniff(head, suffix)`` tells whether a file that begins with the bytes `head` has this format. The suffix is
+        that of a known format, or empty.
+    read : callable or None
+        Takes a `Source`, returns a `Surface`; None if the format is only written.
+    write : callable or None
+        Takes a `Surface` and a binary file that need not be seekable; None if the format is only read.
+    blocks : bool
+        Whether several blocks can be written.
+    options : mapping of str to str
+        Options for reading, each with a line of help.
+    kinds : tuple of str
+        Names of variants of this format that are read by other rules. Each can be switched off by itself.
+    more : str
+        Description of further files of the same surface; empty if the format takes one file only.
+    named : callable or None
+        Returns the options that a file's name implies (such as the position of an .hgt); explicit options take
+        precedence. Code that identifies surfaces by bytes and options must include these.
+    media_type : str
+        Media type for HTTP.
+    process : bool
+        Whether reading starts a separate process, which must be allowed and needs its own memory.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes, str], bool]
+    read: Callable[[Source], Surface] | None = None
+    write: Callable[[Surface, BinaryIO], None] | None = None
+    blocks: bool = False
+    options: Mapping[str, str] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()
+    more: str = ""
+    named: Callable[[str], Mapping[str, str]] | None = None
+    media_type: str = "application/octet-stream"
+    process: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of this format and of its variants."""
+        return self.name, *self.kinds
+
+
+#: In the order in which they are tried: the first whose `Format.sniff` agrees reads the file.
+FORMATS = (
+    Format(name="npy", suffixes=(".npy",), sniff=npy.sniff, read=npy.read, write=npy.write),
+    Format(name="npz", suffixes=(".npz",), sniff=npz.sniff, read=npz.read, options=npz.READ_OPTIONS),
+    Format(
+        name="geotiff",
+        suffixes=(".tif", ".tiff"),
+        sniff=geotiff.sniff,
+        read=geotiff.read,
+        write=geotiff.write,
+        options=geotiff.READ_OPTIONS,
+        media_type="image/tiff",
+    ),
+    Format(
+        name="netcdf",
+        suffixes=(".nc", ".nc4", ".cdf"),
+        sniff=netcdf.sniff,
+        read=netcdf.read,
+        options=netcdf.READ_OPTIONS,
+        kinds=netcdf.KINDS,
+    ),
+    Format(
+        name="png",
+        suffixes=(".png",),
+        sniff=png.sniff,
+        read=png.read,
+        write=png.write,
+        options=png.READ_OPTIONS,
+        named=png.named,
+        media_type="image/png",
+    ),
+    Format(name="esri-ascii", suffixes=(".asc",), sniff=ascii_grid.sniff, read=ascii_grid.read),
+    Format(name="usgs-dem", suffixes=(".dem",), sniff=usgs_dem.sniff, read=usgs_dem.read),
+    Format(
+        name="srtm-hgt",
+        suffixes=(".hgt",),
+        sniff=srtm_hgt.sniff,
+        read=srtm_hgt.read,
+        options=srtm_hgt.READ_OPTIONS,
+        named=srtm_hgt.named,
+    ),
+    Format(name="ply", suffixes=(".ply",), sniff=ply.sniff, read=ply.read, write=ply_writer.write, blocks=True),
+    Format(name="off", suffixes=(".off",), sniff=off.sniff, read=off.read),
+    Format(
+        name="obj",
+        suffixes=(".obj",),
+        sniff=obj.sniff,
+        read=obj.read,
+        write=obj_writer.write,
+        blocks=True,
+        media_type="model/obj",
+    ),
+    Format(name="pcd", suffixes=(".pcd",), sniff=pcd.sniff, read=pcd.read),
+    Format(
+        name="vtk",
+        suffixes=(".vtk",),
+        sniff=vtk_legacy.sniff,
+        read=vtk_legacy.read,
+        options=vtk_legacy.OPTIONS,
+        process=True,
+    ),
+    Format(
+        name="vts",
+        suffixes=vtk_xml.SUFFIXES,
+        sniff=vtk_xml.sniff,
+        read=vtk_xml.read,
+        write=vts_writer.write,
+        blocks=True,
+        options=vtk_xml.OPTIONS,
+        more=vtk_xml.MORE,
+        process=True,
+    ),
+    Format(name="glb", suffixes=(".glb",), sniff=glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
+    Format(name="cgns", suffixes=(".cgns",), sniff=cgns.sniff, read=cgns.read, options=cgns.OPTIONS, process=True),
+    Format(name="bpt", suffixes=(bezier.SUFFIX,), sniff=bezier.sniff, read=bezier.read, options=bezier.OPTIONS),
+    Format(
+        name="text",
+        suffixes=text_arrays.SUFFIXES,
+        sniff=text_arrays.sniff,
+        read=text_arrays.read,
+        more=text_arrays.MORE,
+    ),
+    Format(
+        name="plot3d",
+        suffixes=plot3d.SUFFIXES,
+        sniff=plot3d.sniff,
+        read=plot3d.read,
+        options=plot3d.READ_OPTIONS,
+        more=plot3d.MORE,
+    ),
+)
+
+
+def formats() -> tuple[Format, ...]:
+    """All formats that can be read or written."""
+    return FORMATS

@@ -1,0 +1,109 @@
+"""Writing files: a name's suffix decides the format."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+from typing import BinaryIO
+
+from ..coordinates.seams import restore
+from ..errors import FormatError, InputError, OptionError
+from ..surface import Surface
+from .non_finite import note_infinities
+from .source import with_name
+from .table import FORMATS, Format
+
+__all__ = ["check_blocks", "for_writing", "write", "write_stream"]
+
+
+def check_blocks(format_: Format, count: int) -> None:
+    """Refuse to write several blocks in a format that holds only one.
+
+    Raises
+    ------
+    FormatError
+        Naming the formats that hold several.
+    """
+    if count > 1 and not format_.blocks:
+        several = [it.name for it in FORMATS if it.write and it.blocks]
+        words = f"{', '.join(several[:-1])} and {several[-1]} hold several"
+        raise FormatError(f"expected one block for {format_.name}, got {count}: {words}")
+
+
+def for_writing(path: str | os.PathLike[str]) -> Format:
+    """The format in which a file of this name is written.
+
+    Raises
+    ------
+    OptionError
+        If no format that can be written has this suffix; the message names those that exist.
+    """
+    path = Path(path)
+    format_ = next((it for it in FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
+    if format_ is None:
+        suffixes = ", ".join(suffix for it in FORMATS if it.write for suffix in it.suffixes)
+        raise with_name(OptionError(f"expected a name that ends in one of {suffixes}"), str(path))
+    return format_
+
+
+def write(surface: Surface, path: str | os.PathLike[str]) -> None:
+    """Write a surface to a file; the suffix decides the format.
+
+    The file is written under a temporary name and renamed at the end, so it is complete or absent. A `FormatWarning`
+    tells what the format cannot hold.
+
+    Raises
+    ------
+    OptionError
+        If no format that can be written has this suffix; the message names those that exist.
+    FormatError
+        If the format cannot hold this surface.
+    """
+    path, format_ = Path(path), for_writing(path)
+    if path.exists() and not path.is_file():
+        with path.open("wb") as file:  # a pipe or a device cannot be replaced by a file; a folder is refused here
+            write_stream(surface, format_.name, file)
+        return
+    target = path.resolve()  # a link stays a link
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            write_stream(surface, format_.name, file)
+        temporary.replace(target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = os.fspath(path)  # not the temporary name, which tells the user nothing
+        if isinstance(error, InputError):
+            raise with_name(error, str(path)) from None
+        raise
+
+
+def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
+    """Write a surface to an open binary file, such as standard output or the body of a response.
+
+    Parameters
+    ----------
+    surface : Surface
+    format_name : str
+        Name of a format that can be written, as in `formats`.
+    file : binary file
+        Only its ``write`` is used.
+
+    Raises
+    ------
+    OptionError
+        If there is no such format; the message names those that exist.
+    FormatError
+        If the format cannot hold this surface. Nothing has been written then.
+    """
+    written = {it.name: it for it in FORMATS if it.write}
+    if format_name not in written:
+        raise OptionError(f"expected a format that is written ({', '.join(written)}), got {format_name!r}")
+    format_ = written[format_name]
+    check_blocks(format_, len(surface.blocks))
+    assert format_.write is not None, "it is written"
+    surface = restore(surface)
+    note_infinities(surface, format_name)
+    format_.write(surface, file)

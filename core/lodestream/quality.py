@@ -1,0 +1,110 @@
+"""How closely a container keeps a surface, whoever asks: a caller, the command line, or the query of an upload."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from .errors import OptionError
+from .target import Tolerance
+
+__all__ = ["Limit", "Quality"]
+
+#: What stands for a tolerance where people write one: a number in the surface's unit, or a text for `Tolerance.parse`.
+Limit = Tolerance | float | str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """How closely a container keeps a surface; by default bit for bit.
+
+    >>> Quality.of("1e-4d").precision
+    Tolerance(value=0.0001, relative=True)
+    >>> Quality.of(rms=0.5, attributes={"depth": 2}).attributes
+    {'depth': Tolerance(value=2.0, relative=False)}
+
+    Parameters
+    ----------
+    precision : Tolerance or None
+        Maximum error of the points of the complete surface.
+    rms : Tolerance or None
+        The stream is made for one root mean square error instead: the complete surface has at most this error.
+    attributes : mapping of str to Tolerance
+        Maximum errors of attributes, by name; the others come back bit for bit.
+
+    Raises
+    ------
+    OptionError
+        If both a precision and a root mean square error are given.
+    """
+
+    precision: Tolerance | None = None
+    rms: Tolerance | None = None
+    attributes: Mapping[str, Tolerance] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if self.precision is not None and self.rms is not None:
+            raise OptionError("expected either a precision or a root mean square error, got both")
+
+    @classmethod
+    def of(
+        cls,
+        precision: Limit | None = None,
+        rms: Limit | None = None,
+        attributes: Mapping[str, Limit] | None = None,
+    ) -> Quality:
+        """A quality from tolerances, numbers in the surface's unit, or texts.
+
+        Raises
+        ------
+        OptionError
+            If one of them is no error of 0 or more, or both a precision and a root mean square error are given.
+        """
+        return cls(
+            precision=None if precision is None else Tolerance.of(precision),
+            rms=None if rms is None else Tolerance.of(rms),
+            attributes={name: Tolerance.of(limit) for name, limit in (attributes or {}).items()},
+        )
+
+    @classmethod
+    def parse(cls, precisions: Iterable[str] = (), rms: str | None = None) -> Quality:
+        """A quality from the texts of a command line or a query, which `texts` gives back.
+
+        >>> Quality.parse(["1e-4d", "depth=0.5"]) == Quality.of("1e-4d", attributes={"depth": 0.5})
+        True
+
+        Parameters
+        ----------
+        precisions : iterable of str
+            ``P`` for the points, ``NAME=P`` for an attribute. A name may hold an equals sign, a tolerance does not.
+        rms : str or None
+
+        Raises
+        ------
+        OptionError
+            If a text is no tolerance, one is given twice, or both a precision and a root mean square error are given.
+        """
+        found: dict[str | None, Tolerance] = {}
+        for text in precisions:
+            name, equals, tolerance = text.rpartition("=")
+            key = name if equals else None
+            if key in found:
+                raise OptionError(f"expected each precision once, {_shown(key)} given twice")
+            found[key] = Tolerance.parse(tolerance)
+        points = found.pop(None, None)
+        attributes = {name: tolerance for name, tolerance in found.items() if name is not None}
+        return cls(precision=points, rms=None if rms is None else Tolerance.parse(rms), attributes=attributes)
+
+    def texts(self) -> tuple[list[str], str | None]:
+        """What `parse` reads back: the precisions and the root mean square error, in canonical spelling.
+
+        >>> Quality.of(attributes={"depth": 0.5}, rms="0.10d").texts()
+        (['depth=0.5'], '0.1d')
+        """
+        precisions = [] if self.precision is None else [str(self.precision)]
+        precisions += [f"{name}={tolerance}" for name, tolerance in self.attributes.items()]
+        return precisions, None if self.rms is None else str(self.rms)
+
+
+def _shown(name: str | None) -> str:
+    return "P" if name is None else f"{name[:80]!a}"

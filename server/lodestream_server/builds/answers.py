@@ -1,0 +1,127 @@
+"""Answers of processes that read untrusted files: JSON of bounded length, and reasons cut to one printable line."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from textwrap import indent
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from lodestream.errors import LodestreamError
+
+__all__ = [
+    "LONGEST_ANSWER",
+    "ProcessDiedError",
+    "UnforeseenError",
+    "WrongAnswerError",
+    "name_of",
+    "reason_of",
+    "result_of",
+]
+
+LONGEST_ANSWER = 256 << 10
+_LONGEST_KIND = 100
+_LONGEST_REASON = 2000
+
+
+class ProcessDiedError(LodestreamError):
+    """The process ended before the call did.
+
+    Attributes
+    ----------
+    exitcode : int or None
+        Its exit code; negative for the signal that ended it.
+    """
+
+    def __init__(self, exitcode: int | None) -> None:
+        name = ""
+        if exitcode is not None and exitcode < 0:
+            name = f", {signal.Signals(-exitcode).name}" if -exitcode in set(signal.Signals) else ""
+        code = "" if exitcode is None else f" (exit code {exitcode}{name})"
+        super().__init__(f"the process ended before it was done{code}")
+        self.exitcode = exitcode
+
+
+class WrongAnswerError(ProcessDiedError):
+    """The process gave an invalid answer, or did not make what it claims."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__(0)
+        self.args = (f"the process gave an invalid answer: {words}",)
+
+
+class UnforeseenError(LodestreamError):
+    """The function raised an exception.
+
+    Attributes
+    ----------
+    kind : str
+        Name of the exception's class.
+    errno : int or None
+        Error number of an OSError.
+    traceback : str
+        As the process reports it, with a bar before each line.
+    """
+
+    def __init__(self, kind: str, errno: int | None, traceback: str) -> None:
+        super().__init__(f"the function raised {kind}")
+        self.kind = kind
+        self.errno = errno
+        self.traceback = traceback
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """The module and the name by which another process finds a function."""
+    return f"{function.__module__}:{function.__qualname__}"
+
+
+def result_of(function: Callable[..., Any], answer: bytes) -> Any:
+    """What a function returned, or raised, by the word of its process.
+
+    Parameters
+    ----------
+    function : callable
+        Its annotation says of which type the value must be.
+    answer : bytes
+        JSON: ``returned``, ``memory`` or ``raised``.
+
+    Raises
+    ------
+    WrongAnswerError
+        If that is not JSON, or not of the function's type.
+    MemoryError
+        If the function ran out of memory.
+    UnforeseenError
+        If the function raised anything else.
+    """
+    try:
+        told = json.loads(answer)
+    except (ValueError, RecursionError):
+        raise WrongAnswerError("expected JSON") from None
+    match told:
+        case {"returned": value}:
+            kind = get_type_hints(function).get("return", Any)
+            try:
+                return TypeAdapter(kind).validate_python(value)
+            except (ValidationError, RecursionError):
+                raise WrongAnswerError(f"expected what {function.__name__} returns") from None
+        case {"memory": str(words)}:
+            raise MemoryError(words)
+        case {"raised": {"kind": str(kind), "errno": int() | None as number, "traceback": str(text)}} if (
+            kind.isidentifier() and len(kind) <= _LONGEST_KIND
+        ):
+            raise UnforeseenError(kind, number, indent(_printable(text), "| ", lambda line: True))
+    raise WrongAnswerError("expected what was returned or raised")
+
+
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() or character == "\n" else "?" for character in text)
+
+
+def reason_of(text: str) -> str:
+    """A reason given by a process, as one printable line of limited length."""
+    words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
+    return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

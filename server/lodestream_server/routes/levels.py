@@ -1,0 +1,90 @@
+"""The route of levels, which are made as files on request."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from lodestream.errors import OptionError
+
+from ..access.access import anybody
+from ..access.gate import caller_of
+from ..access.scopes import needs
+from ..builds.level_files import Key
+from ..builds.level_queue import Loan
+from ..builds.levels import MEDIA_TYPES
+from ..problems import responses
+from ..storage.records import Record
+from . import examples
+from .byte_ranges import sort_out
+from .routing import Parts, matches, readable
+from .sending import SentFile, ready, still_there
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["files"])
+
+
+@readable(
+    router,
+    "/surfaces/{surface}/levels/{level}",
+    summary="Fetch one level as a file",
+    response_class=Response,
+    responses={
+        200: examples.LEVEL,
+        206: {"description": "The range asked for"},
+        304: {"description": "The client has it"},
+        **responses(404, 409, 413, 416, 422, 424, 429, 501, 503, 507),
+    },
+)
+@needs("read")
+async def level(
+    request: Request,
+    parts: Parts,
+    surface: str,
+    level: int,
+    format_name: Annotated[str, Query(alias="format", description=", ".join(MEDIA_TYPES))] = "npy",
+) -> Response:
+    """The grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes."""
+    record = ready(parts, surface)
+    _check(record, level, format_name)
+    etag = f'"{record.container}-{level}-{format_name}"'
+    headers = {"etag": etag, "cache-control": "no-cache"}
+    unchanged = matches(request.headers.get("if-none-match"), etag)
+    if unchanged is not None:
+        return unchanged
+    key = Key(record.container or "", level, format_name)
+    with still_there(parts, surface):
+        loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
+    try:
+        sort_out(request, loan.size, etag)
+        headers["content-disposition"] = f'attachment; filename="{record.id}-{level}.{format_name}"'
+        return _Borrowed(loan, headers, MEDIA_TYPES[format_name])
+    except BaseException:
+        loan.release()
+        raise
+
+
+class _Borrowed(SentFile):
+    """A file that is given back once it was sent, or the client has gone."""
+
+    def __init__(self, loan: Loan, headers: dict[str, str], media_type: str) -> None:
+        super().__init__(loan.path, headers=headers, media_type=media_type, stat_result=loan.path.stat())
+        self._loan = loan
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._loan.release()
+
+
+def _check(record: Record, level: int, format_name: str) -> None:
+    finest = len((record.info or {})["levels"]) - 1
+    if not 0 <= level <= finest:
+        raise OptionError(f"expected a level of 0 to {finest}, got {level}")
+    if format_name not in MEDIA_TYPES:
+        raise OptionError(f"expected format to be one of {', '.join(MEDIA_TYPES)}, got {format_name[:80]!a}")

@@ -1,0 +1,95 @@
+"""What routes that answer with files share: the state of a surface, and a file that is sent whole or refused."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from fastapi.responses import FileResponse
+from starlette.types import Message, Receive, Scope, Send
+
+from lodestream.errors import NotFoundError
+
+from ..problems import BuildFailedError, MissingError, NotReadyError, PostponedError
+from ..storage.records import Record
+from .routing import State
+
+__all__ = ["SentFile", "ready", "still_there"]
+
+_log = logging.getLogger(__name__)
+
+
+class SentFile(FileResponse):
+    """A file; once all of it was sent nothing that befalls it concerns the client.
+
+    It is opened before anything is sent, so a file that is not there can still be answered by a problem document.
+    """
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it; an error after its last byte is logged and not raised."""
+        head: Message | None = None
+        complete = False
+
+        async def watched(message: Message) -> None:
+            nonlocal head, complete
+            if message["type"] == "http.response.start":  # the file is opened after it
+                head = message
+                return
+            if head is not None:
+                start, head = head, None
+                await send(start)
+            await send(message)
+            complete = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        try:
+            await super().__call__(scope, receive, watched)
+        except OSError as error:
+            if not complete:
+                raise
+            # The connection would be cut, perhaps with the client's next request on it.
+            _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
+
+
+def ready(parts: State, surface: str) -> Record:
+    """The record of a surface that has a container.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such surface.
+    NotReadyError, PostponedError, BuildFailedError
+        If it is still being built, waits for a retry, or has failed.
+    MissingError
+        If it is not on disk now.
+    """
+    record = parts.storage.get(surface)
+    if record.state == "failed":
+        raise BuildFailedError(f"{surface} could not be built: {record.reason}")
+    if record.state == "waiting":
+        raise PostponedError(f"{surface} could not be built and waits for a retry: {record.reason}")
+    if record.state == "missing":
+        raise MissingError(f"{surface} is not on the server's disk now: {record.reason}")
+    if record.state != "ready":
+        state, progress = parts.builder.state(record)
+        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); try again soon")
+    return record
+
+
+@contextmanager
+def still_there(parts: State, surface: str) -> Iterator[None]:
+    """Around what reads the container of a surface: if there is none, raise what is true of the surface now.
+
+    It may have been deleted meanwhile, although another surface has the same container, or been made again.
+
+    Raises
+    ------
+    NotFoundError, NotReadyError, PostponedError, BuildFailedError, MissingError
+        See `ready`.
+    BusyError
+        If its container can be read again.
+    """
+    try:
+        yield
+    except (NotFoundError, MissingError):
+        raise parts.storage.gone(ready(parts, surface).container or "") from None
