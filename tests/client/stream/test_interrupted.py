@@ -390,7 +390,7 @@ def test_two_pulls_of_one_surface(surface: str, terrain: Terrain, folder: Path, 
     assert identity.name is not None
     assert identity.size is not None
     out = tmp_path / "o.npy"
-    part = cache.Part(folder, identity.name, identity.size)
+    part = cache.CacheFile(folder, identity.name, identity.size)
     try:
         code, _, stderr = run("pull", surface, out)
         assert code == 0
