@@ -45,7 +45,7 @@ CAME = 100_000
 
 # Half of the file is written, then nothing happens.
 STALLED = """\
-import sys, time, lodestream.formats as formats
+import sys, time, lodestream.formats.writing as formats
 whole = formats.write_stream
 def stall(surface, name, file):
     class Half:
