@@ -20,10 +20,11 @@ from typing import Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
-from .requests import api, problems
+from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
-from .requests.api import Description, Flow, Identity, Progress
+from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
+from .requests.calls import Flow
 from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
 
@@ -84,37 +85,37 @@ async def retry(
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``."""
+    """All surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`."""
     return await _run(api.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface."""
+    """State and description of one surface; errors as in `lodestream_client.sync`."""
     return await _run(api.describe(url), url, token)
 
 
 async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
     """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
-    `max_vertices` limits the memory of the container's tables, see `connect`.
+    `max_vertices` limits the memory of the container's tables, see `connect`. Errors as in `lodestream_client.sync`.
     """
     return await _run(api.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file."""
+    """What identifies a surface's container, or a container file; errors as in `lodestream_client.sync`."""
     return await _run(api.identify(url), url, token)
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server."""
+    """Delete a surface from its server; errors as in `lodestream_client.sync`."""
     await _run(api.delete(url), url, token)
 
 
 async def fetch_range(
-    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = calls.TIMEOUT
 ) -> bytes:
-    """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
+    """Fetch bytes of a surface's container over HTTP; see `lodestream_client.sync.fetch_range`."""
     return await _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 
@@ -138,24 +139,24 @@ async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress 
         raise
 
 
-async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
+async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = calls.TIMEOUT) -> T:
     import httpx
 
     answer: Answer | None = None
-    async with httpx.AsyncClient(**api.client_options(url, timeout, asynchronous=True)) as client:
+    async with httpx.AsyncClient(**calls.client_options(url, timeout, asynchronous=True)) as client:
         while True:
             try:
                 step = flow.send(answer)
             except StopIteration as end:
                 result: T = end.value
                 return result
-            if isinstance(step, api.Pause):
+            if isinstance(step, calls.Pause):
                 await asyncio.sleep(step.seconds)
                 answer = None
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             try:
-                async with client.stream(content=content, **api.request_options(step, url, token)) as response:
+                async with client.stream(content=content, **calls.request_options(step, url, token)) as response:
                     incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                     if not (step.partial and response.status_code == 200):
                         async for chunk in response.aiter_raw():

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
-from .requests import api, problems
+from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
-from .requests.api import Description, Flow, Identity, Progress
+from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Closure, Source, opened, prepared
+from .requests.calls import Flow
 from .stream.options import ConnectKeywords, ConnectOptions
 from .stream.sync_stream import Stream
 
@@ -201,12 +202,28 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
 
 
 def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``."""
+    """All surfaces of a server; also exported as ``list``.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If the server refuses, or is not a Lodestream server.
+    UnreachableError
+        If there is no connection.
+    """
     return _run(api.list_surfaces(url), url, token)
 
 
 def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface."""
+    """State and description of one surface.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If there is no such surface, the server refuses, or is not a Lodestream server.
+    UnreachableError
+        If there is no connection.
+    """
     return _run(api.describe(url), url, token)
 
 
@@ -214,29 +231,77 @@ def describe_file(url: str, *, token: str | None = None, max_vertices: int | Non
     """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
     `max_vertices` limits the memory of the container's tables, see `connect`.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If the server refuses, or does not support Range.
+    CorruptStreamError, TruncatedStreamError, UnsupportedVersionError, TooLargeError
+        If the file is not a container that can be read.
+    UnreachableError
+        If there is no connection.
     """
     return _run(api.describe_file(url, max_vertices), url, token)
 
 
 def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file."""
+    """What identifies a surface's container, or a container file.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If there is no such surface or file, or the server refuses; the code ``not-ready``: it cannot be streamed now.
+    UnreachableError
+        If there is no connection.
+    """
     return _run(api.identify(url), url, token)
 
 
 def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server."""
+    """Delete a surface from its server.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If there is no such surface, or the server refuses.
+    UnreachableError
+        If there is no connection.
+    """
     _run(api.delete(url), url, token)
 
 
-def fetch_range(url: str, offset: int, length: int, *, token: str | None = None, timeout: float = api.TIMEOUT) -> bytes:
-    """Fetch bytes of a surface's container over HTTP; `timeout` is in seconds, for connecting and for each wait."""
+def fetch_range(
+    url: str, offset: int, length: int, *, token: str | None = None, timeout: float = calls.TIMEOUT
+) -> bytes:
+    """Fetch bytes of a surface's container over HTTP.
+
+    Parameters
+    ----------
+    url : str
+        URL of the surface, or of a container file.
+    offset, length : int
+        The bytes ``offset`` to ``offset + length``.
+    token : str or None
+        Token, if the server needs one.
+    timeout : float
+        Seconds for connecting and for each wait.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If the server refuses, or does not support Range.
+    CorruptStreamError
+        If there are fewer bytes.
+    UnreachableError
+        If there is no connection.
+    """
     return _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 
-def _run(flow: Flow[T], url: str, token: str | None, timeout: float = api.TIMEOUT) -> T:
+def _run(flow: Flow[T], url: str, token: str | None, timeout: float = calls.TIMEOUT) -> T:
     import httpx
 
-    with httpx.Client(**api.client_options(url, timeout)) as client:
+    with httpx.Client(**calls.client_options(url, timeout)) as client:
         return run(client, flow, url, token)
 
 
@@ -259,13 +324,13 @@ def run(client: httpx.Client, flow: Flow[T], url: str, token: str | None) -> T:
         except StopIteration as end:
             result: T = end.value
             return result
-        if isinstance(step, api.Pause):
+        if isinstance(step, calls.Pause):
             time.sleep(step.seconds)
             answer = None
             continue
         content = step.body.chunks() if step.body is not None and len(step.body.files) == 1 else None
         try:
-            with client.stream(content=content, **api.request_options(step, url, token)) as response:
+            with client.stream(content=content, **calls.request_options(step, url, token)) as response:
                 incoming = Incoming(Head.of(response), step.most, step.url, url, token)
                 if not (step.partial and response.status_code == 200):
                     for chunk in response.iter_raw():

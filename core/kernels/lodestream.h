@@ -276,7 +276,7 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
                                      int64_t second_count, const int32_t *details, int64_t details_count,
                                      int64_t largest, int64_t a, int64_t b, double *bits, int64_t bits_count);
 
-/* spreading.c ---------------------------------------------------------------------------------------------------- */
+/* dequantize.c --------------------------------------------------------------------------------------------------- */
 
 /* Passes that remain of a tile that was not announced: more than any tile has. */
 #define LODE_UNANNOUNCED 57
@@ -285,7 +285,7 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
  *
  * known, sign, early: of the coefficients of all bands, flat, see the section above.
  * bands:   rows of BAND_FIELDS columns (band_fields.h).
- * windows: of each band its tile, and its first row and column among all coefficients.
+ * origins: of each band its tile, and its first row and column among all coefficients.
  * steps:   of each band its quantiser's step, below 2^26; 0 where there is none, and `known` are no indices.
  * state:   passes that remain of each tile, or LODE_UNANNOUNCED, which gives zeros.
  * finer:   coefficients of the tiles from this one on are multiplied by 8.
@@ -293,7 +293,7 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
  */
 LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
                              const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
-                             const int64_t *windows, int64_t windows_count, const int64_t *steps, int64_t steps_count,
+                             const int64_t *origins, int64_t origins_count, const int64_t *steps, int64_t steps_count,
                              const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
                              int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch,
                              int64_t first_row, int64_t first_column);

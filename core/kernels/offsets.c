@@ -1,4 +1,4 @@
-/* Values that lie on one lattice piece by piece, each piece with an offset of its own, as some compressors leave them
+/* Values that lie on one lattice stretch by stretch, each with an offset of its own, as some compressors leave them
  * (docs/format.md, "Offsets").
  *
  * Such values are float32(n step + offset) with a whole n, and the offset is that of a value before, more often than

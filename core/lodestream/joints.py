@@ -82,7 +82,7 @@ class Groups:
         return Groups(points[several], points[label[several]])
 
     def first(self, numbers: Numbers) -> Numbers:
-        """The lowest point of the group of each."""
+        """The lowest point of the group of each, shape (point,) as ``numbers``."""
         if not self.points.size:
             return numbers
         place = np.minimum(np.searchsorted(self.points, numbers), self.points.size - 1)
@@ -196,7 +196,7 @@ class Joints:
         return Joints(self.shapes, self.places, self.vertices, composed)
 
     def number(self, block: int, rows: Numbers, columns: Numbers) -> Numbers:
-        """Numbers in the whole surface of points of a grid."""
+        """Numbers in the whole surface of points of a grid; all of one shape, or of shapes that broadcast."""
         if self.nodes is not None:
             rows, columns = self.nodes[block][0][rows], self.nodes[block][1][columns]
         start = sum(height * width for height, width in self.shapes[:block])

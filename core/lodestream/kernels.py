@@ -323,7 +323,7 @@ predictor_factors = Kernel("predictor_factors", *[reads_plane(_I32)] * 2, *[writ
 predictor_moments = Kernel("predictor_moments", *[reads(_I32)] * 3, REAL, REAL, INTEGER, writes(_F64))
 predictor_bits = Kernel("predictor_bits", *[reads(_I32)] * 3, *[INTEGER] * 3, writes(_F64))
 
-# spreading.c
+# dequantize.c
 _KNOWN: tuple[_Argument, ...] = (reads(_I32), reads(_I8), reads(_U8))
 spread = Kernel("spread", *_KNOWN, *[reads(_I64)] * 4, reads(_I8), INTEGER, writes_plane(_I32), INTEGER, INTEGER)
 

@@ -211,7 +211,7 @@ class Surface:
 
     @property
     def points(self) -> NDArray[Any]:
-        """Points of the only block, see `Block`."""
+        """Points of the only block: shape (H, W), or (H, W, C); see `Block`."""
         return self._only().points
 
     @property
@@ -221,12 +221,12 @@ class Surface:
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Mask of the valid points of the only block; None if all are valid."""
+        """Mask of the valid points of the only block, bool of shape (H, W); None if all are valid."""
         return self._only().mask
 
     @property
     def attributes(self) -> dict[str, NDArray[Any]]:
-        """Attributes of the only block by name."""
+        """Attributes of the only block by name, shape (H, W) or (H, W, C) each."""
         return self._only().attributes
 
     @property

@@ -3,13 +3,17 @@ from __future__ import annotations
 import ast
 import importlib
 import pkgutil
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import lodestream as ls
+from lodestream import errors
+from lodestream.protocol.messages import MessageError
 
 SOURCE = Path(ls.__file__)
 #: A script that VTK's process runs.
@@ -64,6 +68,80 @@ def test_names_that_are_not_there_are_refused_and_those_that_are_listed() -> Non
         ls.nothing  # noqa: B018 - looking it up is the test
     assert set(ls.__all__) <= set(dir(ls))
     assert ls.__version__
+
+
+SHAPE = re.compile(
+    r"\bshapes?\b"
+    r"|\((?:[\w.* ]+,)+[^)]*\)"  # the axes by name: (row, column)
+)
+ERRORS = {*errors.__all__, MessageError.__name__}
+
+
+def sources() -> Iterator[tuple[str, ast.Module]]:
+    """Every module of the core but the reference decoder, a page as a program, which has a form of its own."""
+    for path in sorted(SOURCE.parent.rglob("*.py")):
+        if path.parent.name != "reference":
+            yield str(path.relative_to(SOURCE.parent)), ast.parse(path.read_text())
+
+
+def exported(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    """The functions that a module exports, and the methods of its classes that have a public name."""
+    said = [
+        node.value for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+    ]
+    names = ast.literal_eval(said[0]) if said else []
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and node.name in names:
+            yield node
+        if isinstance(node, ast.ClassDef) and node.name in names:
+            yield from (
+                each for each in node.body if isinstance(each, ast.FunctionDef) and not each.name.startswith("_")
+            )
+
+
+def raised(node: ast.AST) -> Iterator[str]:
+    """Names of the errors that a function raises itself."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Raise) and isinstance(child.exc, ast.Call):
+            yield ast.unparse(child.exc.func)
+        if not isinstance(child, ast.FunctionDef | ast.Lambda):
+            yield from raised(child)
+
+
+def is_array(node: ast.Assign) -> bool:
+    """Whether it names a type of arrays."""
+    return ast.unparse(node.value).startswith("NDArray[")
+
+
+def test_whatever_takes_or_gives_arrays_tells_their_shape() -> None:
+    silent, seen = [], 0
+    for path, tree in sources():
+        aliases = {
+            ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign) and is_array(node)
+        }
+        array = re.compile(rf"\b(?:{'|'.join(['NDArray', 'ArrayLike', *aliases])})\b")
+        for function in exported(tree):
+            arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+            annotations = [function.returns, *(argument.annotation for argument in arguments)]
+            if any(array.search(ast.unparse(each)) for each in annotations if each is not None):
+                seen += 1
+                if not SHAPE.search(ast.get_docstring(function) or ""):
+                    silent.append(f"{path}: {function.name}")
+    assert not silent, silent
+    assert seen > 150, "fewer than there were when this was written"
+
+
+def test_whatever_raises_an_error_names_it() -> None:
+    silent, seen = [], 0
+    for path, tree in sources():
+        for function in exported(tree):
+            own = ERRORS & set(raised(function))
+            seen += bool(own)
+            silent += [
+                f"{path}: {function.name}: {name}" for name in own if name not in (ast.get_docstring(function) or "")
+            ]
+    assert not silent, silent
+    assert seen > 100, "fewer than there were when this was written"
 
 
 def run(script: str) -> str:

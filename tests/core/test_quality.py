@@ -57,9 +57,9 @@ def test_texts_that_contradict_each_other_are_refused(precisions: list[str], rms
 @pytest.mark.parametrize("error", [-1.0, "nan", float("inf"), [1], "1 m"])
 @pytest.mark.parametrize("place", ["precision", "rms", "attributes"])
 def test_what_is_no_error_is_refused(place: str, error: Any) -> None:
-    value: Any = {"a": error} if place == "attributes" else error
+    asked: dict[str, Any] = {place: {"a": error} if place == "attributes" else error}
     with pytest.raises(OptionError, match="expected"):
-        Quality.of(**{place: value})
+        Quality.of(**asked)
 
 
 def test_the_encoder_takes_a_quality_or_its_shorthand() -> None:

@@ -6,7 +6,8 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lodestream.errors import OptionError
@@ -16,12 +17,15 @@ from lodestream.target import Region, Target, Tolerance
 from ..requests import addresses
 
 if TYPE_CHECKING:
+    from ..requests.memory import Closure
+
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
     Subparsers = Any
 
 __all__ = [
     "Subparsers",
+    "SurfaceOptions",
     "add_command",
     "add_json_option",
     "add_rate_option",
@@ -41,6 +45,8 @@ __all__ = [
     "parse_surface",
     "parse_tolerance",
     "quality_of",
+    "standard_input_once",
+    "standard_output_once",
     "surface_options",
     "target_of",
     "token_of",
@@ -53,7 +59,13 @@ _PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20
 
 
 def parse_size(text: str) -> int:
-    """Read a number of bytes, such as ``20000``, ``20kB`` or ``1MiB``."""
+    """Read a number of bytes, such as ``20000``, ``20kB`` or ``1MiB``.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     number, unit = _amount(text)
     factor = _PREFIXES.get(unit.lower().removesuffix("b"))
     if factor is None:
@@ -65,7 +77,13 @@ def parse_size(text: str) -> int:
 
 
 def parse_rate(text: str) -> float:
-    """Read a rate such as ``64kbit``, ``1mbit/s`` or ``200kB``; bytes per second."""
+    """Read a rate such as ``64kbit``, ``1mbit/s`` or ``200kB``; bytes per second.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     number, unit = _amount(text)
     bits = unit.lower().endswith("bit")
     prefix = unit.lower().removesuffix("bit") if bits else unit.removesuffix("B").lower()
@@ -82,7 +100,13 @@ def _amount(text: str) -> tuple[float, str]:
 
 
 def parse_pair(text: str) -> tuple[str, str]:
-    """Read ``KEY=VALUE``."""
+    """Read ``KEY=VALUE``.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"expected KEY=VALUE, got {text!r}")
@@ -90,7 +114,13 @@ def parse_pair(text: str) -> tuple[str, str]:
 
 
 def parse_seconds(text: str) -> float:
-    """Read a number of seconds, 0 or more."""
+    """Read a number of seconds, 0 or more.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
     try:
         value = float(text)
     except ValueError:
@@ -192,6 +222,19 @@ def token_of(args: argparse.Namespace) -> str | None:
     return token or None
 
 
+def standard_input_once(args: argparse.Namespace, names: Sequence[str]) -> tuple[str, ...]:
+    """The names of files to read; ends the program if standard input (``-``) is named twice."""
+    if names.count("-") > 1:
+        args.parser.error("standard input (-) is named twice")
+    return tuple(names)
+
+
+def standard_output_once(args: argparse.Namespace, what: str) -> None:
+    """End the program if standard output is to be both OUT, which is `what`, and the JSON object."""
+    if args.out == "-" and args.json:
+        args.parser.error(f"argument --json: standard output is used for the {what}")
+
+
 def add_rate_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--limit-rate``."""
     parser.add_argument(
@@ -258,11 +301,35 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def surface_options(args: argparse.Namespace) -> dict[str, str]:
-    """The ``-o`` options.
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How files become a surface, as the command line says.
 
-    Ends the program if a key is given twice.
+    Attributes
+    ----------
+    quality : Quality
+    closed : "auto", "none", "rows", "cols" or "both"
+    name : str or None
+        Name of the surface.
+    format_options : mapping of str to str
+        The ``-o`` options.
     """
+
+    quality: Quality
+    closed: Closure
+    name: str | None
+    format_options: Mapping[str, str]
+
+
+def surface_options(args: argparse.Namespace) -> SurfaceOptions:
+    """The options that `add_surface_options` adds.
+
+    Ends the program if they are wrong, for example if a key is given twice.
+    """
+    return SurfaceOptions(quality_of(args), args.closed, args.name, _format_options(args))
+
+
+def _format_options(args: argparse.Namespace) -> dict[str, str]:
     options: dict[str, str] = {}
     for key, value in args.options:
         if key in options:

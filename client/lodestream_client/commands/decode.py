@@ -1,9 +1,10 @@
-"""``lodestream decode``: a container, or the requested part of it, into a file."""
+"""``lodestream decode``: a container, or what is asked for of it, into a file."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
 
 from lodestream.errors import (
@@ -18,7 +19,15 @@ from lodestream.target import Target
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import note, progress_bar
-from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_target_options, target_of
+from .arguments import (
+    Subparsers,
+    add_command,
+    add_json_option,
+    add_size_option,
+    add_target_options,
+    standard_output_once,
+    target_of,
+)
 from .inputs import input_files, named
 from .outcome import Outcome, check_grid, check_out, note_unmet
 
@@ -28,7 +37,7 @@ if TYPE_CHECKING:
     from lodestream.container import Index
     from lodestream.decoding.decoder import Decoder, View
 
-__all__ = ["register", "run"]
+__all__ = ["DecodeOptions", "register", "run"]
 
 _CHUNK = 256 * 1024
 
@@ -54,24 +63,43 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+@dataclass(frozen=True)
+class DecodeOptions:
+    """What the command line asks of a decoding: `container` and `out` are files, ``-`` standard input and output."""
+
+    container: str
+    out: str
+    target: Target
+    max_vertices: int | None
+    partial: bool
+    json: bool
+
+
+def _options(args: argparse.Namespace) -> DecodeOptions:
+    """The options; ends the program if the command line is wrong."""
+    target = target_of(args)
+    standard_output_once(args, "surface")
+    return DecodeOptions(args.container, args.out, target, args.max_vertices, args.partial, args.json)
+
+
 @interruptible()
 def run(args: argparse.Namespace) -> int:
     """Decode, write, report."""
-    target = target_of(args)
-    check_out(args)
-    started = time.monotonic()
-    with input_files(args.parser, [args.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
+    options = _options(args)
+    check_out(options.out)
+    target, started = options.target, time.monotonic()
+    with input_files([options.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
         task = bar.add_task("decoding", total=1.0, figures="")
-        job = _Job(file, args.out, target, args.max_vertices, started, lambda done: bar.update(task, completed=done))
+        job = _Job(file, options, started, lambda done: bar.update(task, completed=done))
         try:
             job.decode()
         except StreamError as error:
-            if not args.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
-                raise named(error, args.container, _advice(args.partial, job, error)) from None
-            note(f"{named(error, args.container)}; the last complete layer before that is written")
+            if not options.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
+                raise named(error, options.container, _advice(options.partial, job, error)) from None
+            note(f"{named(error, options.container)}; the last complete layer before that is written")
             job.ended = "truncated"
         except TooLargeError as error:
-            raise named(error, args.container) from None
+            raise named(error, options.container) from None
     view = job.view or job.decoder.view()
     assert job.decoder.header is not None, "there is a view, so there is a header"
     note_unmet(target, job.ended, view.rms, view.max_error, job.decoder.header.extent)
@@ -85,8 +113,8 @@ def run(args: argparse.Namespace) -> int:
         time.monotonic() - started,
         job.ended,
     )
-    outcome.write(args.out)
-    outcome.report(args.json)
+    outcome.write(options.out)
+    outcome.report(options.json)
     return 0
 
 
@@ -106,23 +134,22 @@ class _Job:
     def __init__(
         self,
         file: BinaryIO,
-        out: str,
-        target: Target,
-        max_vertices: int | None,
+        options: DecodeOptions,
         started: float,
         progress: Callable[[float], None],
     ) -> None:
         from lodestream.decoding.decoder import Decoder
         from lodestream.planning.selection import selection_of
 
-        self.decoder: Decoder = Decoder(selection_of(target), max_vertices=max_vertices, level=target.level)
+        target = options.target
+        self.decoder: Decoder = Decoder(selection_of(target), max_vertices=options.max_vertices, level=target.level)
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
         self.read_bytes = 0
         self.metadata: dict[str, object] | None = None
         self.by_level = target.level is not None or target.order == "level"
         self._file = file
-        self._out = out
+        self._out = options.out
         self._size = file.seek(0, 2)
         self._target = target
         self._started = started

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
@@ -14,7 +15,7 @@ from ..terminal.output import cell, console, human_size, point_words, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
 from .inputs import input_files, named
 
-__all__ = ["register", "run"]
+__all__ = ["InfoOptions", "register", "run"]
 
 # Of a surface that was uploaded as a container.
 _ERRORS = {"checked": "checked by the server", "told": "stated by the uploader, not checked"}
@@ -42,31 +43,42 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+@dataclass(frozen=True)
+class InfoOptions:
+    """What the command line asks for: `what` is a file, ``-`` or a URL."""
+
+    what: str
+    max_vertices: int | None
+    token: str | None
+    json: bool
+
+
 def run(args: argparse.Namespace) -> int:
     """Look, print."""
-    details = _of_url(args) if addresses.is_url(args.what) else _of_file(args)
-    if args.json:
+    options = InfoOptions(args.what, args.max_vertices, token_of(args), args.json)
+    details = _of_url(options) if addresses.is_url(options.what) else _of_file(options)
+    if options.json:
         print_json(details)
     else:
-        _show(args.what, details)
+        _show(options.what, details)
     return 0
 
 
-def _of_url(args: argparse.Namespace) -> Mapping[str, Any]:
+def _of_url(options: InfoOptions) -> Mapping[str, Any]:
     from .. import sync
 
-    url = addresses.source_url(args.what)
+    url = addresses.source_url(options.what)
     if not addresses.is_surface(url):
-        return sync.describe_file(url, token=token_of(args), max_vertices=args.max_vertices)
-    surface = sync.describe(url, token=token_of(args))
+        return sync.describe_file(url, token=options.token, max_vertices=options.max_vertices)
+    surface = sync.describe(url, token=options.token)
     return {**surface.details, "url": surface.url}
 
 
-def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
+def _of_file(options: InfoOptions) -> Mapping[str, Any]:
     from lodestream.container import describe, read_index
     from lodestream.container.capacity import Capacity
 
-    with input_files(args.parser, [args.what]) as files, files.paths[0].open("rb") as file:
+    with input_files([options.what]) as files, files.paths[0].open("rb") as file:
         size = file.seek(0, 2)
 
         def read(offset: int, length: int) -> bytes:
@@ -74,11 +86,11 @@ def _of_file(args: argparse.Namespace) -> Mapping[str, Any]:
             return file.read(length)
 
         try:
-            return describe(read_index(read, size, Capacity(args.max_vertices)), channels=True)
+            return describe(read_index(read, size, Capacity(options.max_vertices)), channels=True)
         except (StreamError, TooLargeError) as error:
             cut = isinstance(error, TruncatedStreamError)
             raise named(
-                error, args.what, "lodestream decode --partial writes its last complete layer" if cut else ""
+                error, options.what, "lodestream decode --partial writes its last complete layer" if cut else ""
             ) from None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 import tempfile
@@ -27,13 +26,11 @@ class Inputs:
 
 
 @contextmanager
-def input_files(parser: argparse.ArgumentParser, names: Sequence[str]) -> Iterator[Inputs]:
-    """The files with these names; standard input (``-``) is copied to a temporary file.
+def input_files(names: Sequence[str]) -> Iterator[Inputs]:
+    """The files with these names; standard input (``-``), at most once, is copied to a temporary file.
 
     Readers and uploads need to know the length first, and the end of a container before its middle.
     """
-    if names.count("-") > 1:
-        parser.error("standard input (-) is named twice")
     if "-" not in names:
         yield Inputs(tuple(map(Path, names)), None)
         return

@@ -1,4 +1,4 @@
-"""Data that ``pull`` keeps on disk, so that ``pull --resume`` can continue."""
+"""Data that ``pull`` caches on disk, so that ``pull --resume`` can continue."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..terminal.output import human_size, note
 
 if TYPE_CHECKING:
     from ..requests.api import Identity
-    from ..stream.cache import Part
+    from ..stream.cache import CacheFile
     from ..sync import Stream
 
 __all__ = ["Kept"]
@@ -25,11 +25,11 @@ _SHARE = 0.25
 
 
 class Kept:
-    """Stored data of one container during a pull; a context manager that reports them if it is left with an error.
+    """Cached data of one container during a pull; a context manager that reports them if it is left with an error.
 
-    With `asked`, stored data of an earlier pull are used, and all data stay until the whole surface has been written.
-    Without, data are stored as they arrive and removed when the command has succeeded; they stay if the command is
-    interrupted, loses its server or is killed. Then it is not an error if they cannot be stored.
+    With `asked`, cached data of an earlier pull are used, and all data stay until the whole surface has been written.
+    Without, data are cached as they arrive and removed when the command has succeeded; they stay if the command is
+    interrupted, loses its server or is killed. Then it is not an error if they cannot be cached.
 
     Parameters
     ----------
@@ -38,17 +38,17 @@ class Kept:
 
     Attributes
     ----------
-    store : Part or None
+    store : CacheFile or None
         Storage for the stream to use, if ``--resume`` was given.
     identity : Identity or None
         Identity of the container in `store`.
     """
 
     def __init__(self, asked: bool) -> None:
-        self.store: Part | None = None
+        self.store: CacheFile | None = None
         self.identity: Identity | None = None
         self._asked = asked
-        self._part: Part | None = None
+        self._cached: CacheFile | None = None
         self._stream: Stream | None = None
         self._fresh = True  # nothing was there before
         self._full = False
@@ -66,13 +66,13 @@ class Kept:
             if isinstance(error, LodestreamError | OSError | KeyboardInterrupt) and self._total:
                 note(self.words)
         finally:
-            if self._part is not None:
-                self._part.close()
+            if self._cached is not None:
+                self._cached.close()
 
     @property
     def _total(self) -> int:
         """Bytes that will stay on disk."""
-        return self._part.ranges.total if self._part is not None and not self._part.discarded else 0
+        return self._cached.ranges.total if self._cached is not None and not self._cached.discarded else 0
 
     @property
     def words(self) -> str:
@@ -82,7 +82,7 @@ class Kept:
         return f"nothing is kept: {self._why_not}" if self._why_not else ""
 
     def use(self, identity: Identity) -> None:
-        """Continue with the stored data of this container.
+        """Continue with the cached data of this container.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class Kept:
             note(self.words)
             return
         try:
-            self.store = self._part = _opened(identity.name, identity.size)
+            self.store = self._cached = _opened(identity.name, identity.size)
         except LodestreamError as error:
             raise LodestreamError(f"{error}; wait for it, or leave out --resume") from None
         except OSError as error:
@@ -111,41 +111,41 @@ class Kept:
         self._stream = stream
 
     def write(self, offset: int, data: bytes) -> None:
-        """Store bytes of the container, if possible."""
-        if self._part is None and not self._why_not:
+        """Cache bytes of the container, if possible."""
+        if self._cached is None and not self._why_not:
             self._begin()
-        if self._part is None or self._full:
+        if self._cached is None or self._full:
             return
         try:
-            for start, length in list(self._part.ranges.missing(offset, len(data))):
-                self._part.write(start, data[start - offset : start - offset + length])
+            for start, length in list(self._cached.ranges.missing(offset, len(data))):
+                self._cached.write(start, data[start - offset : start - offset + length])
         except OSError as error:
             self._full = True
             note(f"no more data are kept for pull --resume: {_reason(error)}")
 
     def read(self, offset: int, length: int) -> bytes | None:
-        """Stored bytes of the container; None if they are not stored."""
-        if self._part is None or not self._part.ranges.covers(offset, length):
+        """Cached bytes of the container; None if they are not cached."""
+        if self._cached is None or not self._cached.ranges.covers(offset, length):
             return None
-        return self._part.read(offset, length)
+        return self._cached.read(offset, length)
 
     def failed(self, error: BaseException) -> None:
         """Declare why the command failed; data that cannot be of use after this error are not kept."""
-        if self._part is None:
+        if self._cached is None:
             return
         changed = isinstance(error, RemoteError) and error.code == "other-container"
         refused = isinstance(error, FormatError | OptionError | TooLargeError) and self._fresh and not self._asked
         # Damage is not to be met again next time.
-        self._part.discarded |= changed or refused or isinstance(error, CorruptStreamError)
+        self._cached.discarded |= changed or refused or isinstance(error, CorruptStreamError)
 
     def done(self, whole: bool) -> None:
         """Declare that OUT has been written, and whether it has the whole surface.
 
-        The stored data then stay if more of the surface may be requested: with ``--resume`` and only a part received,
+        The cached data then stay if more of the surface may be requested: with ``--resume`` and not all of it received,
         or if an earlier command left data here.
         """
-        if self._part is not None:
-            self._part.discarded |= whole if self._asked else self._fresh
+        if self._cached is not None:
+            self._cached.discarded |= whole if self._asked else self._fresh
 
     def _begin(self) -> None:
         identity = self._stream.identity if self._stream is not None else None
@@ -153,7 +153,7 @@ class Kept:
             self._why_not = "the server does not identify versions of the file"
             return
         try:
-            part = _opened(identity.name, identity.size)
+            cached = _opened(identity.name, identity.size)
         except LodestreamError as error:
             # Nothing to speak of unless the command fails: the other program keeps the same bytes.
             self._why_not = str(error)
@@ -162,19 +162,19 @@ class Kept:
             self._why_not = _reason(error)
             note(f"received data are not kept for pull --resume: {self._why_not}")
             return
-        self._part, self._fresh = part, not part.ranges.total
-        folder = part.folder
-        if identity.size - part.ranges.total > _SHARE * shutil.disk_usage(folder).free:
+        self._cached, self._fresh = cached, not cached.ranges.total
+        folder = cached.folder
+        if identity.size - cached.ranges.total > _SHARE * shutil.disk_usage(folder).free:
             self._full = True
             self._why_not = _reason(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)))
 
 
-def _opened(name: str, size: int) -> Part:
-    from ..stream.cache import Part, cache_folder, forget_old
+def _opened(name: str, size: int) -> CacheFile:
+    from ..stream.cache import CacheFile, cache_folder, forget_old
 
     folder: Path = cache_folder()
     forget_old(folder)
-    return Part(folder, name, size)
+    return CacheFile(folder, name, size)
 
 
 def _reason(error: OSError) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from dataclasses import dataclass
@@ -21,19 +20,17 @@ if TYPE_CHECKING:
 __all__ = ["Outcome", "check_grid", "check_out", "note_unmet"]
 
 
-def check_out(args: argparse.Namespace) -> None:
-    """Check early that OUT can be written; ends the program if the command line is wrong.
+def check_out(out: str) -> None:
+    """Check early that OUT can be written.
 
     Raises
     ------
     InputError
         If the folder does not exist, or no format has this suffix.
     """
-    if args.out == "-":
-        if args.json:
-            args.parser.error("argument --json: standard output is used for the surface")
+    if out == "-":
         return
-    path = Path(args.out)
+    path = Path(out)
     require_folder(path)
 
     from lodestream.formats import for_writing

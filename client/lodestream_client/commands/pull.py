@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import (
@@ -30,6 +31,7 @@ from .arguments import (
     add_token_option,
     parse_seconds,
     parse_source,
+    standard_output_once,
     target_of,
     token_of,
 )
@@ -37,9 +39,10 @@ from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
 
 if TYPE_CHECKING:
+    from ..stream.transport import Transport
     from ..sync import Stream
 
-__all__ = ["register", "run"]
+__all__ = ["PullOptions", "register", "run"]
 
 # Seconds without a word after which a connection counts as lost.
 _SILENCE = 30.0
@@ -91,59 +94,112 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Stream, write, report; of what came before an interruption too."""
+@dataclass(frozen=True)
+class PullOptions:
+    """What the command line asks of a pull.
+
+    Attributes
+    ----------
+    url, out : str
+        Source, and file to write; ``-``: standard output.
+    target : Target
+    token : str or None
+    transport : "auto", "ws" or "http"
+    retry : float
+        Seconds without data after which it gives up.
+    limit_rate : float or None
+        Bytes per second.
+    max_vertices : int or None
+    resume, json : bool
+    """
+
+    url: str
+    out: str
+    target: Target
+    token: str | None
+    transport: Transport
+    retry: float
+    limit_rate: float | None
+    max_vertices: int | None
+    resume: bool
+    json: bool
+
+    @property
+    def name(self) -> str:
+        """What is written, in words."""
+        return "standard output" if self.out == "-" else self.out
+
+    @property
+    def whole(self) -> bool:
+        """Whether the target is all of the surface, where no limit is met before."""
+        return self.target.region is None and self.target.attributes is None and self.target.level is None
+
+
+def _options(args: argparse.Namespace) -> PullOptions:
+    """The options; ends the program if the command line is wrong."""
     target = target_of(args)
     if args.transport == "ws" and not addresses.is_surface(args.url):
         args.parser.error("argument --transport: the URL of a file has no WebSocket")
-    check_out(args)
-    with interruptible(), Kept(args.resume) as kept:
-        return _pull(args, target, kept)
+    standard_output_once(args, "surface")
+    return PullOptions(
+        args.url,
+        args.out,
+        target,
+        token_of(args),
+        args.transport,
+        args.retry,
+        args.limit_rate,
+        args.max_vertices,
+        args.resume,
+        args.json,
+    )
 
 
-def _pull(args: argparse.Namespace, target: Target, kept: Kept) -> int:
-    name = "standard output" if args.out == "-" else args.out
+def run(args: argparse.Namespace) -> int:
+    """Stream, write, report; of what came before an interruption too."""
+    options = _options(args)
+    check_out(options.out)
+    with interruptible(), Kept(options.resume) as kept:
+        return _pull(options, kept)
+
+
+def _pull(options: PullOptions, kept: Kept) -> int:
     try:
-        outcome, broke = _written(args, target, kept, name)
+        outcome, broke = _written(options, kept)
     except KeyboardInterrupt as interrupt:
-        raise type(interrupt)(f"{_words(interrupt)}: {name} is not written") from None
-    outcome.report(args.json)
+        raise type(interrupt)(f"{_words(interrupt)}: {options.name} is not written") from None
+    outcome.report(options.json)
     if broke is None or outcome.ended == "complete":
-        part = target.region is not None or target.attributes is not None or target.level is not None
-        kept.done(outcome.ended == "complete" and not part)
+        kept.done(outcome.ended == "complete" and options.whole)
     if broke is None:
         return 0
-    note("; ".join(filter(None, (f"the data received so far are written to {name}", kept.words))))
+    note("; ".join(filter(None, (f"the data received so far are written to {options.name}", kept.words))))
     return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
 
 
-def _written(
-    args: argparse.Namespace, target: Target, kept: Kept, name: str
-) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
+def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
     """What has been written, and what ended the stream before it had all that was asked for."""
     import lodestream.decoding.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
     from .. import sync
 
     started = time.monotonic()
-    if args.resume:
-        kept.use(sync.identify(args.url, token=token_of(args)))
-    stream, broke = _receive(args, target, kept)
+    if options.resume:
+        kept.use(sync.identify(options.url, token=options.token))
+    stream, broke = _receive(options, kept)
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
-                broke.args = (f"{_words(broke)}: the first layer has not arrived, and {name} is not written",)
+                broke.args = (f"{_words(broke)}: the first layer has not arrived, and {options.name} is not written",)
             raise broke
         note(_words(broke))
         kept.failed(broke)
-    outcome = _outcome(args, target, kept, stream, started, hurried=broke is not None)
-    outcome.write(args.out)
+    outcome = _outcome(options, kept, stream, started, hurried=broke is not None)
+    outcome.write(options.out)
     return outcome, broke
 
 
-def _receive(
-    args: argparse.Namespace, target: Target, kept: Kept
-) -> tuple[Stream, KeyboardInterrupt | LodestreamError | None]:
+def _receive(options: PullOptions, kept: Kept) -> tuple[Stream, KeyboardInterrupt | LodestreamError | None]:
     """The stream at its end, and what ended it before it had all that was asked for.
 
     Raises
@@ -155,28 +211,28 @@ def _receive(
 
     broke: KeyboardInterrupt | LodestreamError | None = None
     identity = kept.identity
-    with _Progress(target) as bar:
+    with _Progress(options.target) as bar:
         stream = sync.connect(
-            args.url,
-            target=target,
-            token=token_of(args),
-            transport=args.transport,
-            deadline=args.retry,
-            silence=min(args.retry, _SILENCE) or _SILENCE,
-            limit_rate=args.limit_rate,
+            options.url,
+            target=options.target,
+            token=options.token,
+            transport=options.transport,
+            deadline=options.retry,
+            silence=min(options.retry, _SILENCE) or _SILENCE,
+            limit_rate=options.limit_rate,
             store=kept.store,
             container=identity.container if identity is not None else None,
             size=identity.size if identity is not None else None,
             progress=bar.received,
-            sink=None if args.resume else kept.write,
-            max_vertices=args.max_vertices,
+            sink=None if options.resume else kept.write,
+            max_vertices=options.max_vertices,
         )
         kept.follow(stream)
         try:
             with stream:
                 for number, view in enumerate(stream):
                     if number == 0 and stream.decoder.header is not None:
-                        check_grid(args.out, stream.decoder.header)
+                        check_grid(options.out, stream.decoder.header)
                     bar.figures = f"{human_size(view.bytes)}, level {view.level}, RMS error {view.rms:.4g}"
         except (FormatError, CorruptStreamError, TooLargeError, UnsupportedVersionError):
             raise
@@ -185,15 +241,13 @@ def _receive(
     return stream, broke
 
 
-def _outcome(
-    args: argparse.Namespace, target: Target, kept: Kept, stream: Stream, started: float, *, hurried: bool
-) -> Outcome:
+def _outcome(options: PullOptions, kept: Kept, stream: Stream, started: float, *, hurried: bool) -> Outcome:
     seconds = time.monotonic() - started
-    decoder = stream.decoder
+    decoder, target = stream.decoder, options.target
     wire_bytes = stream.wire_bytes
     metadata = decoder.metadata
     if metadata is None:
-        metadata, more = _metadata(stream, kept, token_of(args), hurried=hurried)
+        metadata, more = _metadata(stream, kept, options.token, hurried=hurried)
         wire_bytes += more
     view = decoder.view()
     header, ended = decoder.header, stream.ended
@@ -235,7 +289,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     from lodestream.container import ByteRange, read_metadata
 
     from .. import sync
-    from ..requests import api
+    from ..requests.calls import TIMEOUT
 
     place = stream.metadata_place
     if place is None:  # over HTTP layers may come before it is known
@@ -244,7 +298,7 @@ def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -
     if (data := kept.read(*place)) is not None:
         return read_metadata(data, ByteRange(*place)), 0
     try:
-        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else api.TIMEOUT)
+        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else TIMEOUT)
     except LodestreamError as error:
         if isinstance(error, NotFoundError) and not hurried:
             raise

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..terminal.output import human_size, note_details, print_json, progress_bar, say
 from .arguments import (
     Subparsers,
+    SurfaceOptions,
     add_command,
     add_json_option,
     add_surface_options,
     add_token_option,
     parse_server,
-    quality_of,
+    standard_input_once,
     surface_options,
     token_of,
 )
 from .inputs import input_files
 
 if TYPE_CHECKING:
+    from ..requests.api import Description
     from ..requests.bodies import Source
 
-__all__ = ["register", "run"]
+__all__ = ["PushOptions", "register", "run"]
 
 
 def register(subparsers: Subparsers) -> None:
@@ -46,18 +49,51 @@ def register(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+@dataclass(frozen=True)
+class PushOptions:
+    """What the command line asks of an upload: names of `files`, ``-`` for standard input, to the server at `url`."""
+
+    files: tuple[str, ...]
+    url: str
+    surface: SurfaceOptions
+    wait: bool
+    token: str | None
+    json: bool
+
+
+def _options(args: argparse.Namespace) -> PushOptions:
+    """The options; ends the program if the command line is wrong."""
+    return PushOptions(
+        standard_input_once(args, args.files),
+        args.url,
+        surface_options(args),
+        not args.no_wait,
+        token_of(args),
+        args.json,
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Upload, wait, print the address."""
-    options = surface_options(args)
-    quality = quality_of(args)
+    options = _options(args)
+    surface = _uploaded(options)
+    note_details(surface.details)
+    if options.json:
+        print_json({**surface.details, "url": surface.url})
+    else:
+        say(surface.url)
+    return 0
 
+
+def _uploaded(options: PushOptions) -> Description:
     from .. import sync
 
-    with input_files(args.parser, args.files) as files, ExitStack() as stack, progress_bar() as bar:
+    wanted = options.surface
+    with input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
         # Standard input has no name of its own to tell.
         sources: list[Source] = [
             stack.enter_context(path.open("rb")) if name == "-" else path
-            for name, path in zip(args.files, files.paths, strict=True)
+            for name, path in zip(options.files, files.paths, strict=True)
         ]
         total = human_size(sum(Path(path).stat().st_size for path in files.paths))
         task = bar.add_task("sending", total=1.0, figures=total)
@@ -65,22 +101,16 @@ def run(args: argparse.Namespace) -> int:
         def progress(stage: str, fraction: float) -> None:
             bar.update(task, description=stage, completed=fraction, figures=total if stage == "sending" else "")
 
-        surface = sync.upload(
-            args.url,
+        return sync.upload(
+            options.url,
             *sources,
-            precision=quality.precision,
-            rms=quality.rms,
-            attribute_precision=quality.attributes,
-            closed=args.closed,
-            name=args.name,
-            options=options,
-            wait=not args.no_wait,
+            precision=wanted.quality.precision,
+            rms=wanted.quality.rms,
+            attribute_precision=wanted.quality.attributes,
+            closed=wanted.closed,
+            name=wanted.name,
+            options=wanted.format_options,
+            wait=options.wait,
             progress=progress,
-            token=token_of(args),
+            token=options.token,
         )
-    note_details(surface.details)
-    if args.json:
-        print_json({**surface.details, "url": surface.url})
-    else:
-        say(surface.url)
-    return 0

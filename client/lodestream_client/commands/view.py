@@ -7,6 +7,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,26 +19,72 @@ from ..terminal.interrupts import Terminated, interruptible
 from ..terminal.output import note, progress_bar, require_folder, say
 from .arguments import (
     Subparsers,
+    SurfaceOptions,
     add_command,
     add_size_option,
     add_surface_options,
     add_token_option,
     parse_pictures,
     parse_port,
-    quality_of,
+    standard_input_once,
     surface_options,
     token_of,
 )
 from .encode import read_surface
-from .inputs import Inputs, input_files
+from .inputs import input_files
 
 if TYPE_CHECKING:
     from ..viewer.sources import Source
 
-__all__ = ["register", "run"]
+__all__ = ["ViewOptions", "register", "run"]
 
 # The first bytes of a container, see docs/format.md.
 _MAGIC = b"\xf5LODE\r\n"
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What is shown, and how.
+
+    Attributes
+    ----------
+    files : tuple of str
+        Names of the files of one surface, or one URL.
+    surface : SurfaceOptions
+        How files that are no container become one.
+    browser : bool
+        Whether a browser is asked to open the page.
+    port : int
+        Of the page; 0: any free one.
+    static : Path or None
+        Folder to write in place of serving.
+    png : Path or None
+        Picture to draw in place of serving.
+    at : tuple of (str, int or None), or None
+        A picture after each of these sizes: as it was written, and in bytes (None: all).
+    max_vertices : int or None
+        Limit on the memory of what is drawn.
+    token : str or None
+        For the server.
+    """
+
+    files: tuple[str, ...]
+    surface: SurfaceOptions
+    browser: bool
+    port: int
+    static: Path | None
+    png: Path | None
+    at: tuple[tuple[str, int | None], ...] | None
+    max_vertices: int | None
+    token: str | None
+
+    @property
+    def name(self) -> str:
+        """What the surface is called until its source says."""
+        if self.surface.name:
+            return self.surface.name
+        first = self.files[0]
+        return "standard input" if first == "-" else Path(first.rstrip("/")).name.removesuffix(".lode")
 
 
 def register(subparsers: Subparsers) -> None:
@@ -76,42 +123,60 @@ def register(subparsers: Subparsers) -> None:
     add_token_option(parser)
 
 
-@interruptible()
-def run(args: argparse.Namespace) -> int:
-    """Show it until Ctrl-C, or write it."""
+def _options(args: argparse.Namespace) -> ViewOptions:
     if args.png is not None and args.static is not None:
         args.parser.error("argument --png: not allowed with argument --static")
     if args.at is not None and args.png is None:
         args.parser.error("argument --at: says when --png draws")
-    if args.png is not None:
-        if args.png.suffix.lower() != ".png":
-            args.parser.error(f"argument --png: expected OUT.png, got {args.png}")
-        require_folder(args.png)
+    if args.png is not None and args.png.suffix.lower() != ".png":
+        args.parser.error(f"argument --png: expected OUT.png, got {args.png}")
     if len(args.files) > 1 and any(map(is_url, args.files)):
         args.parser.error("expected one URL, or files of one surface")
-    if args.png is not None:
-        return _draw(args)
-    pages = assets()
-    if not pages:
-        raise UnavailableError(HOW_TO_BUILD)
-    if args.static is not None:
-        from ..viewer.static import write_static
+    return ViewOptions(
+        standard_input_once(args, args.files),
+        surface_options(args),
+        not args.no_browser,
+        args.port,
+        args.static,
+        args.png,
+        args.at,
+        args.max_vertices,
+        token_of(args),
+    )
 
-        with _source(args, lambda _: None) as source, progress_bar() as bar:
-            task = bar.add_task("writing", total=1.0, figures="")
-            write_static(args.static, pages, source, lambda done: bar.update(task, completed=done))
-        note(f"{args.static} can be put on any host of files that answers Range; open its index.html there")
+
+@interruptible()
+def run(args: argparse.Namespace) -> int:
+    """Show it until Ctrl-C, or write it."""
+    options = _options(args)
+    if options.png is not None:
+        _draw(options, options.png)
         return 0
-    return _serve(args)
+    if not assets():
+        raise UnavailableError(HOW_TO_BUILD)
+    if options.static is not None:
+        _write(options, options.static)
+    else:
+        _serve(options)
+    return 0
 
 
-def _serve(args: argparse.Namespace) -> int:
+def _write(options: ViewOptions, folder: Path) -> None:
+    from ..viewer.static import write_static
+
+    with _source(options) as source, progress_bar() as bar:
+        task = bar.add_task("writing", total=1.0, figures="")
+        write_static(folder, assets(), source, lambda done: bar.update(task, completed=done))
+    note(f"{folder} can be put on any host of files that answers Range; open its index.html there")
+
+
+def _serve(options: ViewOptions) -> None:
     from ..viewer.page_server import PageServer, serving
 
-    server = PageServer(assets(), _name(args), args.port)
+    server = PageServer(assets(), options.name, options.port)
     with serving(server):
         say(server.url)
-        if not args.no_browser:
+        if options.browser:
             import webbrowser
 
             # Some browsers in a terminal return only when they are closed.
@@ -120,12 +185,11 @@ def _serve(args: argparse.Namespace) -> int:
         def progress(done: float) -> None:
             server.progress = done
 
-        with _source(args, progress) as source:
+        with _source(options, progress) as source:
             server.name = source.name
             server.source = source
             note("Ctrl-C ends it")
             _wait()
-    return 0
 
 
 def _wait() -> None:
@@ -138,60 +202,51 @@ def _wait() -> None:
         pass
 
 
-def _draw(args: argparse.Namespace) -> int:
+def _draw(options: ViewOptions, out: Path) -> None:
     from ..viewer.pictures import draw, view_after
 
-    sizes = args.at or (("", None),)
-    with _source(args, lambda _: None) as source:
-        for label, most in sizes:
-            path = args.png if args.at is None else args.png.with_name(f"{args.png.stem}-{label}{args.png.suffix}")
-            view, layout = view_after(source, most, args.max_vertices)
+    require_folder(out)
+    with _source(options) as source:
+        for label, most in options.at or (("", None),):
+            path = out.with_name(f"{out.stem}-{label}{out.suffix}") if label else out
+            view, layout = view_after(source, most, options.max_vertices)
             draw(view, layout, source.name, path)
             note(f"{path}: {view.bytes} bytes, RMS error {view.rms:.6g}, maximum {view.max_error:.6g}")
-    return 0
-
-
-def _name(args: argparse.Namespace) -> str:
-    if args.name:
-        return str(args.name)
-    first = str(args.files[0])
-    return "standard input" if first == "-" else Path(first.rstrip("/")).name.removesuffix(".lode")
 
 
 @contextmanager
-def _source(args: argparse.Namespace, progress: Callable[[float], None]) -> Iterator[Source]:
+def _source(options: ViewOptions, progress: Callable[[float], None] = lambda _: None) -> Iterator[Source]:
     """The container that is shown, made here where a file is something else."""
     from ..viewer.sources import FileSource, RemoteSource
 
-    if is_url(args.files[0]):
-        remote = RemoteSource(args.files[0], token_of(args))
+    if is_url(options.files[0]):
+        remote = RemoteSource(options.files[0], options.token)
         try:
             yield remote
         finally:
             remote.close()
         return
     with ExitStack() as stack:
-        files = stack.enter_context(input_files(args.parser, args.files))
+        files = stack.enter_context(input_files(options.files))
         first = files.paths[0]
         with first.open("rb") as file:
             ready = len(files.paths) == 1 and file.read(len(_MAGIC)) == _MAGIC
-        if ready:
-            yield FileSource(first, _name(args))
-            return
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lodestream-view-")))
-        made = folder / "surface.lode"
-        made.write_bytes(_encoded(args, files, progress))
-        yield FileSource(made, _name(args))
+        if not ready:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lodestream-view-")))
+            # By the names of what was copied, since standard input cannot be read twice.
+            names = tuple(map(str, files.paths))
+            first = folder / "surface.lode"
+            first.write_bytes(_encoded(names, options.surface, progress))
+        yield FileSource(first, options.name)
 
 
-def _encoded(args: argparse.Namespace, files: Inputs, progress: Callable[[float], None]) -> bytes:
+def _encoded(names: tuple[str, ...], options: SurfaceOptions, progress: Callable[[float], None]) -> bytes:
     from lodestream.library import require
 
     require("encoding")
     import lodestream as ls
 
-    quality = quality_of(args)
-    surface = read_surface(args, files, surface_options(args))
+    surface = read_surface(names, options)
     with progress_bar() as bar:
         task = bar.add_task("encoding", total=1.0, figures="")
 
@@ -199,4 +254,4 @@ def _encoded(args: argparse.Namespace, files: Inputs, progress: Callable[[float]
             bar.update(task, completed=done)
             progress(done)
 
-        return ls.encode(surface, quality=quality, progress=tell)
+        return ls.encode(surface, quality=options.quality, progress=tell)

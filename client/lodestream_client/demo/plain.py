@@ -15,7 +15,7 @@ __all__ = ["beginning", "overview"]
 
 
 def beginning(heights: NDArray[np.int16], size: int) -> NDArray[np.float64]:
-    """The first `size` bytes of the array as NPY: rows from the top, NaN for those that have not arrived."""
+    """The first `size` bytes of an array (H, W) as NPY: rows from the top, NaN where none have arrived; (H, W)."""
     whole = io.BytesIO()
     np.save(whole, heights)
     header = whole.tell() - heights.nbytes
@@ -28,9 +28,9 @@ def beginning(heights: NDArray[np.int16], size: int) -> NDArray[np.float64]:
 def overview(heights: NDArray[np.int16], size: int) -> tuple[NDArray[np.float64], int]:
     """The finest overview that fits into `size` bytes, interpolated to the full grid, and its reduction factor.
 
-    An overview of factor f contains the rounded means of f x f points, stored like in a cloud-optimised GeoTIFF:
-    differences along the rows, then deflate. File headers are not counted. Between the means the surface is
-    interpolated bilinearly.
+    The heights are (H, W), and so is the result. An overview of factor f contains the rounded means of f x f points,
+    stored like in a cloud-optimised GeoTIFF: differences along the rows, then deflate. File headers are not counted.
+    Between the means the surface is interpolated bilinearly.
     """
     factors = range(1, max(heights.shape))
     factor = factors[bisect_left(factors, True, hi=len(factors) - 1, key=lambda it: _stored_size(heights, it) <= size)]

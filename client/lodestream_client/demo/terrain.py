@@ -57,7 +57,7 @@ def terrain(shape: tuple[int, int], progress: Callable[[float], None] = lambda d
 
 
 def bilinear(grid: Floats, rows: Floats, columns: Floats) -> Floats:
-    """Values of a grid at fractional rows and columns within it, which broadcast together."""
+    """Values of a grid (H, W) at fractional rows and columns within it, which broadcast to the shape of the result."""
     i = np.minimum(rows.astype(np.intp), grid.shape[0] - 2)
     j = np.minimum(columns.astype(np.intp), grid.shape[1] - 2)
     down, across = rows - i, columns - j

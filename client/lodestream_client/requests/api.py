@@ -6,14 +6,12 @@ it; its return value is the result. `lodestream_client.sync` and `lodestream_cli
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import itertools
 import re
-import ssl
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 from lodestream.errors import CorruptStreamError, RemoteError, RemoteProtocolError
 from lodestream.target import Target
@@ -21,19 +19,12 @@ from lodestream.target import Target
 from . import addresses, problems
 from .answers import LONGEST_ANSWER, Answer, check_figures, parse
 from .bodies import Body
-
-if TYPE_CHECKING:
-    import httpx
+from .calls import Call, Flow, Pause
 
 __all__ = [
-    "TIMEOUT",
-    "Call",
     "Description",
-    "Flow",
     "Identity",
-    "Pause",
     "Progress",
-    "client_options",
     "delete",
     "describe",
     "describe_file",
@@ -41,12 +32,9 @@ __all__ = [
     "identify",
     "identity_of_file",
     "list_surfaces",
-    "request_options",
     "retry",
     "upload",
 ]
-
-T = TypeVar("T")
 
 #: Called as ``progress(stage, fraction)``; the stages are ``encoding``, ``sending`` and ``building``.
 Progress: TypeAlias = Callable[[str, float], None]
@@ -69,36 +57,6 @@ _LONGEST_LIST = 64 * 1024 * 1024
 _MOST_PAGES = 10_000
 
 _MOVED = (301, 302, 303, 307, 308)
-
-#: Seconds for each step of a request: connecting, one piece sent, one piece received.
-TIMEOUT = 30.0
-
-
-@dataclass(frozen=True)
-class Call:
-    """A request to make; the complete answer is sent back.
-
-    With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
-    bytes are read.
-    """
-
-    method: str
-    url: str
-    parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
-    headers: Mapping[str, str] = field(default_factory=dict)
-    body: Body | None = None
-    partial: bool = False
-    most: int = LONGEST_ANSWER
-
-
-@dataclass(frozen=True)
-class Pause:
-    """A wait of so many seconds."""
-
-    seconds: float
-
-
-Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
 
 
 @dataclass(frozen=True)
@@ -149,66 +107,6 @@ class Description:
         return self.state == "ready"
 
 
-def client_options(url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False) -> dict[str, Any]:
-    """Arguments for an httpx client of the server at `url`.
-
-    Parameters
-    ----------
-    url : str
-    timeout : float
-        Seconds for each step.
-    asynchronous : bool
-        Whether it is an asyncio client.
-    """
-
-    def guard(request: httpx.Request) -> None:
-        # httpx itself lets a token go on from a host's port 80 to its port 443; here an origin is an origin.
-        if not addresses.same_origin(str(request.url), url):
-            request.headers.pop("Authorization", None)
-
-    async def guard_later(request: httpx.Request) -> None:
-        guard(request)
-
-    return {
-        "follow_redirects": True,
-        "timeout": timeout,
-        "verify": _trusted(),
-        # No proxy of the environment comes between two programs on one machine.
-        "trust_env": not addresses.is_loopback(url),
-        "headers": {"Accept-Encoding": "identity"},
-        "event_hooks": {"request": [guard_later if asynchronous else guard]},
-    }
-
-
-@functools.cache
-def _trusted() -> ssl.SSLContext:
-    # Reading all the certificates takes longer than many a request.
-    import httpx
-
-    return httpx.create_ssl_context()
-
-
-def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
-    """Arguments for the ``request`` method of an httpx client, except the body of a single file.
-
-    The token is sent only to the server at `url`, wherever redirects lead.
-    """
-    headers = dict(call.headers)
-    if token is not None and addresses.same_origin(call.url, url):
-        headers["Authorization"] = f"Bearer {token}"
-    options: dict[str, Any] = {"method": call.method, "url": call.url, "headers": headers}
-    if call.method not in ("GET", "HEAD"):
-        options["follow_redirects"] = False  # nothing is changed, and no file sent, where nobody said so
-    if call.parameters:
-        options["params"] = dict(call.parameters)
-    if call.body is not None and len(call.body.files) > 1:
-        options["files"] = call.body.parts()
-    elif call.body is not None:
-        headers["Content-Length"] = str(call.body.size)
-        headers["Content-Type"] = "application/octet-stream"
-    return options
-
-
 def upload(
     url: str, parameters: Mapping[str, str | list[str]], body: Body, wait: bool, progress: Progress | None
 ) -> Flow[Description]:
@@ -251,7 +149,13 @@ def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str
 
 
 def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
-    """All surfaces of a server, page by page."""
+    """All surfaces of a server, page by page.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If there are too many pages, one of another server, or one that is no list.
+    """
     page: str | None = addresses.surfaces_url(url)
     surfaces: list[Description] = []
     seen = set[str]()
@@ -300,7 +204,15 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
 
 
 def identify(url: str) -> Flow[Identity]:
-    """What identifies a surface's container, or a file."""
+    """What identifies a surface's container, or a file.
+
+    Raises
+    ------
+    RemoteError
+        With the code ``not-ready`` if the surface cannot be streamed now.
+    RemoteProtocolError
+        If the server does not tell the container's SHA-256 and size.
+    """
     if addresses.is_surface(url):
         surface = yield from describe(url)
         container, size = surface.details.get("container"), surface.details.get("bytes")
@@ -332,13 +244,21 @@ def delete(url: str) -> Flow[None]:
 
 
 def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
-    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file."""
+    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If the server does not support Range.
+    CorruptStreamError
+        If there are fewer bytes.
+    """
     address = addresses.container_url(url)
     headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
     response = _refuse((yield Call("GET", address, headers=headers, partial=True, most=length)), address)
     if response.status != 206:
         raise RemoteProtocolError(
-            f"expected part of the container from {address}, got all of it: Range is not supported"
+            f"expected a range of the container from {address}, got all of it: Range is not supported"
         )
     if len(response.content) != length:
         raise CorruptStreamError(f"expected {length} bytes of the container, got {len(response.content)}", offset)

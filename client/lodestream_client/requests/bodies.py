@@ -59,7 +59,7 @@ class Body:
         if self._sent is not None:
             self._sent(min(self._done / max(self.size, 1), 1.0))
 
-    def parts(self) -> list[tuple[str, tuple[str, BinaryIO, str]]]:
+    def form(self) -> list[tuple[str, tuple[str, BinaryIO, str]]]:
         """Several files as the parts of a form, as httpx expects them."""
         return [
             ("file", (name, cast("BinaryIO", _Counted(file, self)), "application/octet-stream"))
@@ -67,7 +67,7 @@ class Body:
         ]
 
     def chunks(self) -> Iterator[bytes]:
-        """The contents of the one file, piece by piece."""
+        """The contents of the one file, chunk by chunk."""
         file = _Counted(self.files[0][1], self)
         while chunk := file.read(_CHUNK):
             yield chunk

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, assert_never
 
-from ..requests import api
+from ..requests import calls
 from ..requests.answers import Head
 from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
@@ -104,7 +104,7 @@ class AsyncIO:
 
         await self.hang_up(HangUp())
         if self._client is None:
-            self._client = httpx.AsyncClient(**api.client_options(self._session.url, asynchronous=True))
+            self._client = httpx.AsyncClient(**calls.client_options(self._session.url, asynchronous=True))
         request = self._client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
         self._response = await self._client.send(request, stream=True)
         self._body = self._response.aiter_raw()

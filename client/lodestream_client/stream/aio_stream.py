@@ -35,7 +35,7 @@ class Stream(BaseStream):
         return self
 
     async def __anext__(self) -> View:
-        while (view := self._session.next_view()) is None:
+        while (view := self._core.next_view()) is None:
             if not await self._step():
                 raise StopAsyncIteration
         return view

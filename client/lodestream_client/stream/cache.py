@@ -1,6 +1,6 @@
-"""Received data of incomplete surfaces, on disk, so that a later program can continue from there.
+"""Received data of incomplete containers, cached on disk, so that a later program can continue from there.
 
-There is one log file for each container: a head, then a record for each received piece, with its offset, its length and
+There is one log file for each container: a head, then a record for each received range, with its offset, its length and
 a checksum over all three. Records are appended at once and never changed. So a program that is killed loses nothing,
 and a machine that loses power loses at most records whose checksum does not match.
 
@@ -24,7 +24,7 @@ from pathlib import Path
 from lodestream.errors import InputError, LodestreamError
 from lodestream.planning.byte_ranges import RangeSet
 
-__all__ = ["Part", "cache_folder", "forget_old", "is_name"]
+__all__ = ["CacheFile", "cache_folder", "forget_old", "is_name"]
 
 _MAGIC = b"LODEPART"
 _VERSION = 1
@@ -54,8 +54,8 @@ def is_name(name: object) -> bool:
     return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
-class Part:
-    """The stored data of one container; locked against other programs while it is open.
+class CacheFile:
+    """The cached data of one container; locked against other programs while it is open.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Part:
     ----------
     folder : Path
     ranges : RangeSet
-        The bytes that are stored.
+        The bytes that are cached.
     discarded : bool
         Whether closing removes the file. A file without data is removed in any case.
 
@@ -93,9 +93,9 @@ class Part:
         self._path = folder / f"{name}.part"
         self.ranges = RangeSet()
         self.discarded = False
-        self._pieces: list[tuple[int, int, int]] = []  # offset, length, place in the file
+        self._records: list[tuple[int, int, int]] = []  # offset, length, place in the file
         try:
-            self._handle = _held(self._path, os.O_CREAT)
+            self._handle = _locked(self._path, os.O_CREAT)
         except _TakenError:
             raise LodestreamError(f"another program is receiving the same surface into {folder}") from None
         try:
@@ -105,18 +105,24 @@ class Part:
             raise
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read stored bytes."""
+        """Read cached bytes; all of the range must be in `ranges`."""
         data = bytearray()
-        number = bisect_right(self._pieces, (offset, 1 << 63, 0)) - 1
+        number = bisect_right(self._records, (offset, 1 << 63, 0)) - 1
         while len(data) < length:
-            start, size, place = self._pieces[number]
+            start, size, place = self._records[number]
             skipped = offset + len(data) - start
             data += os.pread(self._handle, min(size - skipped, length - len(data)), place + skipped)
             number += 1
         return bytes(data)
 
     def write(self, offset: int, data: bytes) -> None:
-        """Store bytes that are not stored yet."""
+        """Cache bytes that are not cached yet.
+
+        Raises
+        ------
+        OSError
+            If the disk is full, or does not take them for another reason.
+        """
         record = _RECORD.pack(offset, len(data), _checksum(offset, data)) + data
         written = os.pwrite(self._handle, record, self._end)
         if written != len(record):
@@ -125,7 +131,7 @@ class Part:
         self._end += len(record)
 
     def used(self, offset: int, length: int) -> None:
-        """Do nothing: used bytes stay stored."""
+        """Do nothing: used bytes stay cached."""
 
     def close(self) -> None:
         """Release the file, or remove it."""
@@ -135,7 +141,7 @@ class Part:
         os.close(self._handle)
 
     def _add(self, offset: int, length: int, place: int) -> None:
-        insort(self._pieces, (offset, length, place))
+        insort(self._records, (offset, length, place))
         self.ranges.add(offset, length)
 
     def _recover(self, size: int) -> int:
@@ -161,7 +167,7 @@ class Part:
         return end
 
     def _is_new(self, offset: int, length: int) -> bool:
-        """Whether no byte of a range is kept yet."""
+        """Whether no byte of a range is cached yet."""
         return length > 0 and next(self.ranges.overlap(offset, length), None) is None
 
 
@@ -174,7 +180,7 @@ def forget_old(folder: Path) -> None:
         try:
             if not is_name(path.stem) or path.lstat().st_mtime >= before:
                 continue
-            handle = _held(path)
+            handle = _locked(path)
         except (OSError, _TakenError):
             continue
         try:
@@ -183,7 +189,7 @@ def forget_old(folder: Path) -> None:
             os.close(handle)
 
 
-def _held(path: Path, create: int = 0) -> int:
+def _locked(path: Path, create: int = 0) -> int:
     """Open a file of ours, locked until it is closed.
 
     Raises
@@ -201,7 +207,7 @@ def _held(path: Path, create: int = 0) -> int:
                 raise _TakenError from None
             if _is_at(handle, path):
                 return handle
-            # It was removed by whoever held it. Without O_CREAT the next attempt finds none.
+            # It was removed by whoever had it locked. Without O_CREAT the next attempt finds none.
         except BaseException:
             os.close(handle)
             raise

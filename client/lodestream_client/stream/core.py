@@ -6,11 +6,16 @@ All of the policy is here and below: transports, reconnecting, deadlines, pacing
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError
 
 from . import over_http, over_websocket
-from .effects import Effect, Flow, HangUp, Wait
+from .effects import Effect, Flow, HangUp, Send, Wait
 from .session import Session
+
+if TYPE_CHECKING:
+    from lodestream.decoding.decoder import View
 
 __all__ = ["Core"]
 
@@ -50,6 +55,13 @@ class Core:
             self._begun = True
             self.done(None)
         return self._effect
+
+    def next_view(self) -> View | None:
+        """The next view that nobody has taken; None if there is none now, or messages are to be sent first.
+
+        So the server has its credit, and the link is busy, while somebody looks at the view.
+        """
+        return None if isinstance(self._effect, Send) else self.session.next_view()
 
     def done(self, result: object) -> None:
         """Declare that the effect has been carried out.

@@ -110,7 +110,13 @@ class Session:
 
     @property
     def silence(self) -> float:
-        """Seconds without data after which a connection counts as lost; may be set at any time."""
+        """Seconds without data after which a connection counts as lost; may be set at any time.
+
+        Raises
+        ------
+        ValueError
+            If it is set to a number that is not positive.
+        """
         return self._silence
 
     @silence.setter

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, assert_never
 
-from ..requests import api
+from ..requests import calls
 from ..requests.answers import Head
 from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
@@ -103,7 +103,7 @@ class SyncIO:
 
         self.hang_up(HangUp())
         if self._client is None:
-            self._client = httpx.Client(**api.client_options(self._session.url))
+            self._client = httpx.Client(**calls.client_options(self._session.url))
         answer = self._opened.enter_context(
             self._client.stream("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
         )

@@ -45,7 +45,7 @@ class Stream(BaseStream):
         return self
 
     def __next__(self) -> View:
-        while (view := self._session.next_view()) is None:
+        while (view := self._core.next_view()) is None:
             if not self._step():
                 raise StopIteration
         return view

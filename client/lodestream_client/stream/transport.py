@@ -69,7 +69,9 @@ class Transports:
 
         Parameters
         ----------
-        error : LodestreamError now : float
+        error : LodestreamError
+        now : float
+            Seconds of any clock that does not go back.
         progressed : bool
             Whether new data had arrived before.
 
@@ -83,7 +85,7 @@ class Transports:
         if self.transport == "ws" and "http" in self._allowed and problems.blocks_sockets(error, met=self.met):
             self.transport, self._blocked = "http", error
             return 0.0
-        # A wrong address is one by either transport.
+        # An address that is wrong is wrong over either transport, so it is named once.
         twice = isinstance(error, NotFoundError) and isinstance(self._blocked, NotFoundError)
         if self.transport == "http" and self._blocked is not None and not self.met and not twice:
             error.args = (f"{error} (and by WebSocket: {self._blocked})", *error.args[1:])

@@ -23,7 +23,13 @@ def exit_code(interrupt: KeyboardInterrupt) -> int:
 
 @contextmanager
 def raising() -> Iterator[None]:
-    """Raise `Terminated` on SIGTERM within the block, so that temporary files and processes are cleaned up."""
+    """Have SIGTERM end the block, so that temporary files and processes are cleaned up.
+
+    Raises
+    ------
+    Terminated
+        On SIGTERM.
+    """
 
     def leave(number: int, frame: FrameType | None) -> None:
         raise Terminated("terminated")
@@ -41,7 +47,13 @@ def raising() -> Iterator[None]:
 
 @contextmanager
 def unwrapping() -> Iterator[None]:
-    """Raise a KeyboardInterrupt itself if it was turned into another exception, as class bodies do."""
+    """Undo that a KeyboardInterrupt was turned into another exception, as class bodies do.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The one that was turned into another exception.
+    """
     try:
         yield
     except Exception as error:

@@ -11,7 +11,7 @@ from typing import Protocol
 from lodestream.errors import CorruptStreamError, RemoteProtocolError
 
 from .. import sync
-from ..requests import api
+from ..requests import api, calls
 
 __all__ = ["FileSource", "RemoteSource", "Source"]
 
@@ -100,7 +100,7 @@ class RemoteSource:
         self._url, self._token = url, token
         self._lock = threading.Lock()
         self._open = ExitStack()
-        self._client = self._open.enter_context(httpx.Client(**api.client_options(url, api.TIMEOUT)))
+        self._client = self._open.enter_context(httpx.Client(**calls.client_options(url, calls.TIMEOUT)))
 
     def close(self) -> None:
         """Close the connection."""

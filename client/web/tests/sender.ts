@@ -1,4 +1,4 @@
-/** A server's end of a stream without I/O, as `lodestream.sender` is, for tests of the client's end. */
+/** A server's end of a stream without I/O, as `lodestream.transfer.sender` is, for tests of the client's end. */
 import { createHash } from "node:crypto";
 import type { Index } from "../src/container";
 import { plan } from "../src/planning/plan";

@@ -55,6 +55,8 @@ def parse_codecs(fields: FieldReader) -> tuple[int, ...]:
     ------
     UnsupportedVersionError
         When one of them is not known.
+    CorruptStreamError
+        If they are not in rising order.
     """
     start = fields.at
     needed = [fields.varint() for _ in range(fields.varint(len(fields.data)))]

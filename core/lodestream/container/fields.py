@@ -96,21 +96,39 @@ class FieldReader:
         return len(self.data) - self.place
 
     def take(self, count: int) -> memoryview:
-        """The next bytes."""
+        """The next bytes.
+
+        Raises
+        ------
+        CorruptStreamError
+            If there are fewer.
+        """
         if count > len(self.data) - self.place:
             raise CorruptStreamError(f"expected {count} more bytes, got {len(self.data) - self.place}", self.at)
         self.place += count
         return self.data[self.place - count : self.place]
 
     def byte(self) -> int:
-        """A whole number of 0 to 255."""
+        """A whole number of 0 to 255.
+
+        Raises
+        ------
+        CorruptStreamError
+            If there is none left.
+        """
         if self.place == len(self.data):
             raise CorruptStreamError("expected 1 more bytes, got 0", self.at)
         self.place += 1
         return self.data[self.place - 1]
 
     def varint(self, limit: int = LARGEST) -> int:
-        """A whole number that must not exceed ``limit``."""
+        """A whole number that must not exceed ``limit``.
+
+        Raises
+        ------
+        CorruptStreamError
+            If it is larger, takes more than nine bytes, or the bytes end before it does.
+        """
         start, number, shift = self.at, 0, 0
         while True:
             byte = self.byte()
@@ -129,7 +147,13 @@ class FieldReader:
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
 
     def number(self) -> float:
-        """A float64 without its last bytes, see `FieldWriter.number`; it may be infinite or no number."""
+        """A float64 without its last bytes, see `FieldWriter.number`; it may be infinite or no number.
+
+        Raises
+        ------
+        CorruptStreamError
+            If it takes more than eight bytes, or the bytes end before it does.
+        """
         start, count = self.at, self.byte()
         if count > 8:
             raise CorruptStreamError(f"expected at most 8 bytes of a float64, got {count}", start)

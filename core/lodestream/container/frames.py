@@ -139,6 +139,11 @@ def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | No
     """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told.
 
     ``offset`` is the section's place in the container.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the length takes more than nine bytes.
     """
     length, shift = 0, 0
     for place in range(1, min(len(data), 10)):

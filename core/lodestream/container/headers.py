@@ -95,7 +95,13 @@ def _serialize_masks(header: Header) -> bytes:
 
 
 def parse_masks(header: Header, frame: Frame) -> Header:
-    """The header with the masks of their section."""
+    """The header with the masks of their section.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the section ends too early or too late, or integer points cannot have the value of holes.
+    """
     payload, offset = frame.payload, frame.payload_offset
     fields = FieldReader(payload, offset)
     (hole,) = fields.unpack("q")

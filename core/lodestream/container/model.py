@@ -243,7 +243,7 @@ class Header:
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
-        """For each block which points are valid; None: all."""
+        """For each block which points are valid: bool, shape (row, column) of the block; None: all."""
         if not self.masked:
             return (None,) * len(self.blocks)
         from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
@@ -255,7 +255,7 @@ class Header:
 
     @cached_property
     def kept_masks(self) -> tuple[NDArray[np.bool_] | None, ...]:
-        """For each block which holes have values that come back; None: none of them.
+        """For each block which holes have values that come back: bool, shape (row, column); None: none.
 
         Raises
         ------

@@ -128,7 +128,13 @@ def serialize_layer(errors: Errors, entries: Sequence[Entry], channels: int) -> 
 
 
 def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[Entry], int]:
-    """Errors, entries (``top`` is 0 where an earlier layer told it) and where in the payload the segments start."""
+    """Errors, entries (``top`` is 0 where an earlier layer told it) and where in the payload the segments start.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the table names units or planes that there are not, or the segments are of another length.
+    """
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     units = len(header.layout.tiles) * header.channels
@@ -159,7 +165,13 @@ def serialize_metadata(values: dict[str, Any]) -> bytes:
 
 
 def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
-    """The map of a metadata section."""
+    """The map of a metadata section.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the payload is no map of MessagePack.
+    """
     check_length(len(payload), offset)
     try:
         values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
@@ -201,7 +213,13 @@ def serialize_footer(index: int, root: int) -> bytes:
 
 
 def parse_footer(data: bytes, offset: int) -> tuple[ByteRange, ByteRange]:
-    """The places of the index and of its root, from the last bytes of a container, which stand at ``offset``."""
+    """The places of the index and of its root, from the last bytes of a container, which stand at ``offset``.
+
+    Raises
+    ------
+    CorruptStreamError
+        If the bytes are no footer, or it points anywhere but at the index before it.
+    """
     if len(data) != FOOTER_LENGTH or data[-len(_FOOTER_MAGIC) :] != _FOOTER_MAGIC:
         raise CorruptStreamError("expected the footer of a container, got other bytes", offset)
     index, root, crc = (int(number) for number in FieldReader(data, offset).unpack("QQI"))

@@ -67,7 +67,13 @@ def serialize_arrangement(out: FieldWriter, blocks: Blocks, arrangement: Arrange
 
 
 def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
-    """Undo `serialize_arrangement`, checking that patches cover the blocks and fit their interfaces."""
+    """Undo `serialize_arrangement`, checking that patches cover the blocks and fit their interfaces.
+
+    Raises
+    ------
+    CorruptStreamError
+        If a block has no point, or patches and interfaces do not make up the blocks.
+    """
     start = fields.at
     blocks = []
     points = 0
@@ -145,7 +151,7 @@ def _parse_patch(
         sides.append(side)
     wraps = [w and n == count for w, n, count in zip(whole, lengths[::-1], shape, strict=True)]
     if flags > 127 or min(lengths) < 1 or (closed[0] and not wraps[0]) or (closed[1] and not wraps[1]):
-        raise CorruptStreamError(f"expected a part of a block of {shape[0]} x {shape[1]}, got another", start)
+        raise CorruptStreamError(f"expected a patch of a block of {shape[0]} x {shape[1]}, got another", start)
     top, bottom, left, right = sides
     return Patch(
         block,
@@ -182,7 +188,13 @@ def serialize_extras(
 
 
 def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
-    """Undo `serialize_extras`, of a surface of so many points."""
+    """Undo `serialize_extras`, of a surface of so many points.
+
+    Raises
+    ------
+    CorruptStreamError
+        If they are no map of MessagePack, or say what cannot be of such a surface.
+    """
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=True)
         kinds = tuple(

@@ -226,7 +226,13 @@ class Slices:
         return State(number, last.level, size, last.rms, last.max_error, True, True)
 
     def hold_chunk(self, chunk: Chunk) -> State | None:
-        """Note a chunk of residual; the complete state, if everything is there."""
+        """Note a chunk of residual; the complete state, if everything is there.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment is still missing: the residual is of the whole lattice.
+        """
         if self._received != self._segments:
             raise CorruptStreamError("expected all segments before residual, got fewer", chunk.range.offset)
         self._corrected += 1

@@ -69,12 +69,12 @@ def _is_rule(rule: object) -> bool:
 
 
 def rounded(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Float64 values in a type of points: the nearest float or the nearest integer."""
+    """Float64 values of any shape in a type of points: the nearest float or the nearest integer."""
     return (values if dtype.kind == "f" else np.rint(values)).astype(dtype)
 
 
 def bits(values: NDArray[Any]) -> NDArray[Any]:
-    """Values to compare bit by bit, so that -0.0 is not 0.0."""
+    """Values of any shape as unsigned integers of their bits, to compare them so that -0.0 is not 0.0."""
     return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
 
 

@@ -66,8 +66,8 @@ def level_coordinates(length: int, closed: bool, halvings: int) -> NDArray[np.fl
 
     Returns
     -------
-    float64 array
-        Of the level's length, increasing.
+    float64 array of shape (node,)
+        Increasing.
     """
     nodes = np.arange(length, dtype=np.float64)
     for _ in range(halvings):

@@ -188,7 +188,7 @@ def _jumps(angles: NDArray[np.float64], period: float) -> int:
 
 
 def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float64]:
-    """Angles between low and low + period, by whole turns; what is no number stays as it is."""
+    """Angles of any shape between low and low + period, by whole turns; what is no number stays as it is."""
     values = angles.astype(np.float64)
     with np.errstate(invalid="ignore"):
         values -= np.where(np.isfinite(values), period * np.floor((values - low) / period), 0.0)

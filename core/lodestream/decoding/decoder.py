@@ -175,7 +175,7 @@ class Decoder:
         return self.view().surface(level)
 
     def points_at(self, level: int) -> NDArray[Any]:
-        """The current grid of a level, see `View.points_at`."""
+        """The current grid of a level: shape (row, column), or (row, column, component); see `View.points_at`."""
         return self.view().points_at(level)
 
     @property

@@ -96,7 +96,8 @@ class Reconstruction:
     ) -> list[Values]:
         """The grids of ``level`` when the first ``length`` segments are known, one for each block.
 
-        Channels that are not ``chosen`` mean nothing.
+        ``state`` is int8, shape (tile, channel), ``chosen`` bool, shape (channel,): channels that are not chosen mean
+        nothing.
 
         Raises
         ------
@@ -122,7 +123,7 @@ class Reconstruction:
     def reconstructions(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
     ) -> list[Coordinates]:
-        """The grids of ``level`` of each channel, in lattice coordinates, see `blocks`."""
+        """The grids of ``level`` of each channel, in lattice coordinates: int32, shape (row, column); see `blocks`."""
         reconstructions: list[Coordinates] = []
         with self._lock:
             self._decode(length)
@@ -134,7 +135,7 @@ class Reconstruction:
         return reconstructions
 
     def reconstruction(self, length: int, state: NDArray[np.int8], level: int, channel: int) -> Coordinates:
-        """One channel of the grids of ``level``, see `reconstructions`."""
+        """One channel of the grids of ``level``: int32, shape (row, column) each; see `reconstructions`."""
         with self._lock:
             self._decode(length)
             return reconstruct_channel(self.header, channel, self._tiles[channel], state[:, channel], level)
@@ -149,7 +150,8 @@ class Reconstruction:
     ) -> Values:
         """A window of the surface, of one grid, when the first ``length`` segments are known.
 
-        Takes memory for what the window is made of, not for the surface. See `blocks`.
+        Takes memory for what the window is made of, not for the surface. Its arrays have the
+        shape (row, column, component) of the window. See `blocks`.
         """
         header = self.header
         values = self._window_values(length, state, region, chosen)
@@ -282,12 +284,18 @@ class Progress:
         return below - 1
 
     def snapshot(self, whole: bool) -> NDArray[np.int8]:
-        """The present state; once ``whole``, a tile that no layer has announced is known to have nothing but zeros."""
+        """The present state, int8, shape (tile, channel).
+
+        Once ``whole``, a tile that no layer has announced is known to have nothing but zeros.
+        """
         return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
 
 
 def initial_state(header: Header) -> NDArray[np.int8]:
-    """The state before the first layer: what has no coefficient, or none other than 0 in its whole level, is known."""
+    """The state before the first layer, int8, shape (tile, channel).
+
+    What has no coefficient, or none other than 0 in its whole level, is known.
+    """
     tiles = header.layout.tiles
     levels = np.array([tile.level for tile in tiles])
     known = ((np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1).astype(bool)
@@ -335,7 +343,10 @@ class Values:
     arrays: list[NDArray[Any]]
 
     def window(self, window: ChunkPlace, top: int = 0, left: int = 0) -> NDArray[Any]:
-        """One channel in a window, a view; the arrays begin at row ``top`` and column ``left`` of the block."""
+        """One channel at the place of a chunk, shape (row, column), a view.
+
+        The arrays begin at row ``top`` and column ``left`` of the block.
+        """
         channel = window.channel
         rows, columns = (
             slice(start - first, stop - first)
@@ -348,13 +359,16 @@ class Values:
         raise IndexError(window.channel)
 
     def clear(self, holes: NDArray[np.bool_], hole: int) -> None:
-        """Give holes the value that says so: NaN in floats, ``hole`` in integer points, 0 in integer attributes."""
+        """Give holes (bool, shape (row, column)) the value that says so.
+
+        NaN in floats, ``hole`` in integer points, 0 in integer attributes.
+        """
         for number, array in enumerate(self.arrays):
             array[holes] = np.nan if array.dtype.kind == "f" else 0 if number else array.dtype.type(hole)
 
 
 def to_values(header: Header, reconstructions: Sequence[Coordinates], level: int) -> list[Values]:
-    """Values of each channel's reconstruction, block by block."""
+    """Values of each channel's reconstruction, block by block, shape (row, column, component) each."""
     layout, patches = header.layout, header.patches
     interfaces = len(layout.grids) - len(patches)
     components = [header.point_channels, *(kind.channels for kind in header.attributes)]

@@ -58,7 +58,7 @@ class View:
 
     @property
     def points(self) -> NDArray[Any]:
-        """The points of the only block at full resolution, with the dtype and axes of the original.
+        """The points of the only block at full resolution, with the dtype and shape of the original.
 
         Raises
         ------

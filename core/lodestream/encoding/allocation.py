@@ -1,8 +1,8 @@
 """Which bits go into which layer: in order of what they do to the error for each byte.
 
 Every tile of every channel is a list of coding passes, each with a cost in bits and a gain in squared error. Passes are
-grouped into *steps*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
-that a step is worth the segment that it takes. Steps are sorted by gain for each bit, parents never after their
+grouped into *runs*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
+that a run is worth the segment that it takes. Runs are sorted by gain for each bit, parents never after their
 children; layers cut this order so that one is at most `_GROWTH` times as long as the one before.
 """
 
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from ..grid.layout import Layout
 
-__all__ = ["TileCurve", "assign_layers", "step_slopes"]
+__all__ = ["TileCurve", "assign_layers", "hull_slopes"]
 
 #: A segment takes so many bits besides its passes: in the layer's table, in the index, and to start and end a coder.
 _SEGMENT = 48.0
-#: Two steps are one where as two they save less than this share of the tile's bits so far, or than a segment takes;
+#: Two runs are one where as two they save less than this share of the tile's bits so far, or than a segment takes;
 #: early in the stream, where many segments are in the same layer anyway, less than a share of the stream's bits.
 _SHARE_OF_TILE = 0.02
 _SHARE_OF_STREAM = 0.005
-#: What a step adds to a layer besides its passes, in bytes.
+#: What a run adds to a layer besides its passes, in bytes.
 _ENTRY = 5
 #: By how much the bytes grow from layer to layer, at least and at most, where there are more than so many ...
 _GROWTH = 1.12, 1.14
@@ -59,33 +59,33 @@ class TileCurve:
     gains: NDArray[np.float64]
 
 
-def step_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope: 0.0) -> NDArray[np.float64]:
-    """Gain for each bit of every pass, the same for all passes of a step; it falls from step to step.
+def hull_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope: 0.0) -> NDArray[np.float64]:
+    """Gain for each bit of every pass, shape (pass,): the same for all passes of a run, falling from run to run.
 
-    Two steps that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
+    Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
     where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): ``worth(s)``, and a share of
     the tile's bits so far.
     """
-    steps: list[tuple[float, float, int]] = []  # bits, gain, passes
+    runs: list[tuple[float, float, int]] = []  # bits, gain, passes
     known = 0.0
     for bits, gain in zip(curve.bits[::-1], curve.gains[::-1], strict=True):
-        step = (max(float(bits), 1e-9), max(float(gain), 0.0), 1)
-        known += step[0]
-        while steps:
-            last = steps[-1]
-            saved = last[1] * step[0] - step[1] * last[0]
-            if saved > 0 and saved >= max(worth(last[1] / last[0]), _SHARE_OF_TILE * known) * (last[1] + step[1]):
+        run = (max(float(bits), 1e-9), max(float(gain), 0.0), 1)
+        known += run[0]
+        while runs:
+            last = runs[-1]
+            saved = last[1] * run[0] - run[1] * last[0]
+            if saved > 0 and saved >= max(worth(last[1] / last[0]), _SHARE_OF_TILE * known) * (last[1] + run[1]):
                 break
-            steps.pop()
-            step = (step[0] + last[0], step[1] + last[1], step[2] + last[2])
-        steps.append(step)
-    slopes = [gain / bits for bits, gain, passes in steps for _ in range(passes)]
+            runs.pop()
+            run = (run[0] + last[0], run[1] + last[1], run[2] + last[2])
+        runs.append(run)
+    slopes = [gain / bits for bits, gain, passes in runs for _ in range(passes)]
     return np.array(slopes[::-1])
 
 
 def _worth(curves: list[TileCurve]) -> Callable[[float], float]:
-    """What two steps must save to be two, in bits, by the slope of the first; see `_SHARE_OF_STREAM`."""
-    slopes = np.concatenate([step_slopes(curve) for curve in curves])
+    """What two runs must save to be two, in bits, by the slope of the first; see `_SHARE_OF_STREAM`."""
+    slopes = np.concatenate([hull_slopes(curve) for curve in curves])
     order = np.argsort(-slopes, kind="stable")
     falling = (-slopes[order]).tolist()
     known = np.cumsum(np.concatenate([curve.bits for curve in curves])[order]).tolist()
@@ -114,7 +114,7 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: b
     if not curves:
         return [top]
     worth = _worth(curves)
-    slopes = {(curve.tile, curve.channel): step_slopes(curve, worth) for curve in curves}
+    slopes = {(curve.tile, curve.channel): hull_slopes(curve, worth) for curve in curves}
     _lift_parents(slopes, layout)
     counts = [curve.bits.size for curve in curves]
     tile = np.repeat([curve.tile for curve in curves], counts)
@@ -158,7 +158,7 @@ def _layer_ends(
     """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
 
     Found from the end to the start, each within a range of bytes that the next one allows. It is the place after the
-    `last` pass of a step, if there is one, where the error lies furthest below a line, in the logarithms of both, from
+    `last` pass of a run, if there is one, where the error lies furthest below a line, in the logarithms of both, from
     one end of the range to the other: within a bit-plane the error falls faster at first than later.
     """
     if few and float(sizes[-1]) < _BRIEF:

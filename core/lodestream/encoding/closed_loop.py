@@ -1,8 +1,8 @@
-"""Quantisation for one error in a closed loop, from the coarsest level to the finest.
+"""Quantization for one error in a closed loop, from the coarsest level to the finest.
 
 Each level is reconstructed as the reader will, and the details of the next one are predicted from that: so errors of
-nodes do not enter the details. What the reader is to have are the details before the third step. The levels are then
-orthogonal: no error of one could be made good by another.
+nodes do not enter the details. What the reader is to have are the details before the third lifting step. The levels are
+then orthogonal: no error of one could be made good by another.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from .rate_distortion import MOST_TRIES, IndexChooser, longest_base
 
 __all__ = ["ClosedLoop", "choose_indices"]
 
-#: The step of a stream made for one error, over the error, that is tried first.
+#: The quantization step of a stream made for one error, over the error, that is tried first.
 _LIKELY_STEP = 6
 _BOTH = 3  # details along both axes, in `band_fields.KIND`
 
 
 class ClosedLoop:
-    """Quantises one channel, which is a coordinate.
+    """Quantizes one channel, which is a coordinate.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class ClosedLoop:
     predictors : int8, shape (level, axis, 2)
         See `transform.forward`.
     arrays : int32, shape (row, column), one for each grid
-        The channel's lattice coordinates. They are kept, as nodes and details before the third step.
+        The channel's lattice coordinates. They are kept, as nodes and details before the third lifting step.
     """
 
     def __init__(self, table: TileTable, predictors: NDArray[np.int8], arrays: Sequence[NDArray[np.int32]]) -> None:
@@ -55,7 +55,8 @@ class ClosedLoop:
     ) -> NDArray[np.int32]:
         """The index of every coefficient, flat; and what the reader will have of the grids, into ``reconstructions``.
 
-        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        The result has the shape (`TileTable.size`,), ``reconstructions`` (row, column) each. For ``steps`` and
+        ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         table, predictors = self._table, self._predictors
         for reconstruction in reconstructions:
@@ -93,7 +94,7 @@ def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]
 
 
 class _Details:
-    """What the third step predicts of the details of a level of a grid, from what the reader has of it."""
+    """What the third lifting step predicts of the details of a level of a grid, from what the reader has of it."""
 
     def __init__(
         self, layout: Layout, predictors: NDArray[np.int8], grid: int, level: int, reconstruction: NDArray[np.int32]
@@ -180,7 +181,7 @@ def choose_indices(
     wanted: float,
     fineness: int,
 ) -> tuple[Quantiser, list[NDArray[np.int32]]] | None:
-    """The longest steps whose error is at most the one wanted, and the indices then; None where no step is that short.
+    """The longest quantization steps whose error is at most the one wanted, and the indices then; None: there are none.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ def encode(
     Parameters
     ----------
     surface : Surface or array
-        An array is taken as ``Surface(array)``.
+        An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``.
     precision : float, str, Tolerance or None
         Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit

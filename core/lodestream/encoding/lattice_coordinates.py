@@ -51,7 +51,7 @@ def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
     InputError
         If a precision is too small for the values.
     """
-    found = choose_lattices(prepared.valid, prepared.geometric, prepared.precision, bits, steps=prepared.divisions)
+    found = choose_lattices(prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions)
     whole = prepared.precision is None and bits is None
     if whole and prepared.point_channels == 1 and prepared.arrangement is None:
         offset = offset_lattice(prepared.arrays[0][0][..., 0])

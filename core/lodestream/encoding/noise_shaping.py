@@ -1,10 +1,10 @@
-"""How the errors of quantised coefficients add up in the surface: what the encoder minimises in place of their squares.
+"""How the errors of quantized coefficients add up in the surface: what the encoder minimises in place of their squares.
 
 Synthesis functions of neighbours in a band overlap, so the sum of squares over the surface is a quadratic form of a
 band's errors: e G e, where G holds the inner products of its synthesis functions before the third step. Far from the
 ends G is a convolution along each axis, and a product of a causal filter and its mirror image: e G e is g times the sum
 of squares of ``e_k + f_1 e_{k-1} + f_2 e_{k-2} + ...``, along both axes one after the other. So what counts is the
-error of a coefficient plus what is *fed back* of those that were quantised before it.
+error of a coefficient plus what is *fed back* of those that were quantized before it.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..entropy.tiles import TileTable
-from ..quantization.band_steps import Quantiser, steps_along
+from ..quantization.band_steps import Quantiser, lifting_steps_along
 
 __all__ = ["FILTERS", "feedback_rules"]
 
-#: Of nodes and of details, by the axis's steps from there to the finest level: f_1, f_2 and g; with further steps the
-#: same filter, and g doubles with each.
+#: Of nodes and of details, by the axis's lifting steps from there to the finest level: f_1, f_2 and g; with further
+#: ones the same filter, and g doubles with each.
 FILTERS = np.array(
     [
         [(0, 0, 1), (0.1716, 0, 1.4571), (0.2404, 0, 2.5997), (0.2608, 0, 5.0327), (0.2661, 0, 9.9806)],
@@ -39,9 +39,9 @@ def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32
     Returns
     -------
     float32, shape (band, 6)
-        How far below an index its point lies in the odd quantiser, in steps; the weight of a squared error in steps;
-        f_1 and f_2 along axis 0; f_1 and f_2 along axis 1. A weight of one is that of a squared error of
-        `Quantiser.base` in one point of the surface.
+        How far below an index its point lies in the odd quantiser, and the weight of a squared error, both in
+        quantization steps; f_1 and f_2 along axis 0; f_1 and f_2 along axis 1. A weight of one is that of a squared
+        error of `Quantiser.base` in one point of the surface.
     """
     steps = table.steps(quantiser)
     found: dict[tuple[int, int, tuple[bool, bool]], tuple[float, ...]] = {}  # many tiles have bands of the same kind
@@ -54,7 +54,7 @@ def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32
                 step = int(steps[number])
                 weight, taps = (step / quantiser.base) ** 2, []
                 for axis in range(2):
-                    count, detail = steps_along(band, tile.level, table.layout, axis)
+                    count, detail = lifting_steps_along(band, tile.level, table.layout, axis)
                     alone = table.layout.grids[band.grid].interface and axis == 1
                     first, second, gain = _alone(count) if alone else _filter(count, detail)
                     weight *= gain

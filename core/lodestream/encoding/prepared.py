@@ -20,8 +20,8 @@ from ..mesh.joining import change_of
 from ..quality import Quality
 from ..quantization.distortion import Original, originals_of
 from ..quantization.lattice import find_lattice
-from ..quantization.lattice_choice import DEFAULT_STEPS, choose_lattices
-from ..quantization.lattice_depth import default_steps
+from ..quantization.lattice_choice import DEFAULT_DIVISIONS, choose_lattices
+from ..quantization.lattice_depth import default_divisions
 from ..quantization.measure import extent_of
 from ..surface import Block, Surface
 from ..target import Tolerance
@@ -134,18 +134,7 @@ class Prepared:
 
 
 def prepare(surface: Surface, quality: Quality) -> Prepared:
-    """Prepare a surface.
-
-    Parameters
-    ----------
-    surface : Surface
-    quality : Quality
-
-    Raises
-    ------
-    InputError
-        If the surface cannot be encoded with this precision.
-    """
+    """Prepare a surface; `InputError` is raised if it cannot be encoded with this precision."""
     given, (surface, plane) = surface, _heights(surface)
     blocks, first = surface.blocks, surface.blocks[0]
     arrays = tuple(filled(block) for block in blocks)
@@ -160,15 +149,12 @@ def prepare(surface: Surface, quality: Quality) -> Prepared:
     absolute = None if precision is None else precision.absolute(extent)
     if quality.rms is not None and extent:
         rms = quality.rms.absolute(extent) or None  # 0: every value is exact, as of a surface that is one point
-    divisions = DEFAULT_STEPS
-    if absolute is None and rms is None:
-        largest = max(points, key=lambda array: array.size)
-        divisions = default_steps([largest[..., channel] for channel in range(geometric)])
+    divisions = _divisions(points, geometric) if absolute is None and rms is None else DEFAULT_DIVISIONS
     arrangement = None
     if len(blocks) > 1 or (geometric > 1 and may_share(first, points[0])):
         arrangement = unshared(blocks)
-        if geometric > 1:
-            lattices = choose_lattices(valid, geometric, absolute, None, steps=divisions)
+        if geometric > 1:  # sides are shared by points, not by heights
+            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions)
             arrangement = arranged(blocks, points, lattices[:geometric])
     if arrangement is None:
         small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
@@ -225,6 +211,12 @@ def _kinds(block: Block) -> tuple[AttributeKind, ...]:
         AttributeKind(name, array.dtype, array.shape[2] if array.ndim == 3 else 0)
         for name, array in block.attributes.items()
     )
+
+
+def _divisions(points: Sequence[NDArray[Any]], geometric: int) -> float:
+    """Into how many lattice steps the widest extent is divided where all values come back bit for bit."""
+    largest = max(points, key=lambda array: array.size)
+    return default_divisions([largest[..., channel] for channel in range(geometric)])
 
 
 def _takes_small_tiles(surface: Surface, valid: NDArray[Any]) -> bool:

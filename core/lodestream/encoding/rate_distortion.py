@@ -23,14 +23,14 @@ from ..quantization.band_steps import MOST_BASE
 
 __all__ = ["MOST_TRIES", "IndexChooser", "longest_base"]
 
-#: Squared error that a bit is worth, in squared steps of one point of the surface.
+#: Squared error that a bit is worth, in squared quantization steps of one point of the surface.
 _WORTH = 0.05
-_FIRST_CLASS = 8.0  # number of the class whose coefficients are about a step
+_FIRST_CLASS = 8.0  # number of the class whose coefficients are about a quantization step
 #: How many coefficients the Laplace distribution counts for among those that were seen of a class.
 _PRIOR = 8.0
 #: Coefficients in one call of a kernel, unless a band has more.
 _AT_ONCE = 1 << 18
-#: The search for a base: how often, how close to the error wanted, and by which power steps grow with it.
+#: The search for a base: how often, how close to the error wanted, and by which power quantization steps grow with it.
 MOST_TRIES = 10
 _CLOSE = 0.997
 _ERROR_TO_STEP = 1.2
@@ -59,9 +59,9 @@ class IndexChooser:
         self._room = np.empty(8 * len(TRANSITIONS) * widest, np.int16), np.empty(2 * widest, np.float32)
 
     def begin(self, steps: NDArray[np.int64], rules: NDArray[np.float32]) -> None:
-        """Choose all indices anew; what was learned of the last ones serves, with other steps, too.
+        """Choose all indices anew; what was learned of the last ones serves, with other quantization steps, too.
 
-        For ``steps`` and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        For the shapes of ``steps`` and ``rules`` see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         self._steps, self._rules = steps, rules
         self._relative = np.zeros(self._table.size)
@@ -75,9 +75,9 @@ class IndexChooser:
 
         Parameters
         ----------
-        numbers : int64
+        numbers : int64, shape (chosen band,)
             Of the bands in the table.
-        coefficients : int32, flat, see `tiles.gather`
+        coefficients : int32, shape (`TileTable.size`,), see `tiles.gather`
             What the indices are to stand for.
         """
         bands = self._table.bands[numbers]
@@ -90,7 +90,7 @@ class IndexChooser:
             )
 
     def end(self) -> NDArray[np.int32]:
-        """All indices, flat; what they cost is estimated from them when others are chosen."""
+        """All indices, shape (`TileTable.size`,); what they cost is estimated from them when others are chosen."""
         self._bits = -np.log2(self._counts / self._counts.sum(axis=2, keepdims=True))
         chosen = self.chosen
         del self.chosen, self._relative, self._classes

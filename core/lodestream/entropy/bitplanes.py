@@ -133,6 +133,7 @@ def code_passes(
         state = np.zeros(kernels.PASSES_STATE, np.int64)
     symbols = np.zeros(0, np.uint16) if symbols is None else symbols
     arrays = known, sign, flags, early, true, models, data, costs, symbols, state
+    # A kernel cannot be interrupted: it returns after so many coefficients, and `state` says where to go on.
     while kernels.passes(reading, trellis, bands, runs, *arrays, _AT_ONCE) < len(runs):
         pass
 
@@ -149,10 +150,10 @@ def pass_gains(
     ``weights`` are the squared norms of the bands' synthesis functions, one a band; ``early`` is that of the whole
     tile coded.
     """
-    errors, part = np.zeros(passes + 1), np.empty(passes + 1)
+    errors, own = np.zeros(passes + 1), np.empty(passes + 1)
     for rows, worth in _parts(bands, weights):
-        kernels.pass_gains(rows, worth, true, early, part)
-        errors += part
+        kernels.pass_gains(rows, worth, true, early, own)
+        errors += own
     return errors
 
 

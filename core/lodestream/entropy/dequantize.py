@@ -61,6 +61,6 @@ def spread_bands(
     while start < numbers.size:
         reached = sizes[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(sizes, reached + _AT_ONCE, side="right")))
-        part = numbers[start:stop]
-        kernels.spread(known, sign, early, bands, origins, steps, part, state, finer, out, *origin)
+        batch = numbers[start:stop]
+        kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)
         start = stop

@@ -75,7 +75,10 @@ class TileCoder:
         self.tiles = [Tiles(table, quantiser if k < geometric else None, large) for k, table in enumerate(tables)]
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
-        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain."""
+        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain.
+
+        ``costs``, float64, shape (pass,), get by its number the bits written when each pass ended.
+        """
         tiles = self.tiles[channel]
         if tile >= tiles.large:
             return self._of_string(tile, channel, first, passes, costs)
@@ -110,7 +113,7 @@ class TileCoder:
 
 
 def planes_of(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
-    """Bit-planes of a tile's largest magnitude."""
+    """Bit-planes of a tile's largest magnitude; ``true`` are flat, shape (coefficient,), as `gather` gives them."""
     largest = 0
     for place, stride, height, _ in table.of_tile(tile)[:, :4]:
         frame = true[place - stride - 1 : place + (height + 1) * stride - 1]

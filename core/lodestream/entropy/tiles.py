@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..grid.layout import REMEMBERED, Band, Layout
 from ..kernels import PASSES_STATE
-from ..quantization.band_steps import Quantiser, step_of
+from ..quantization.band_steps import Quantiser, band_step
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
 from .dequantize import UNANNOUNCED, spread_bands
@@ -74,11 +74,13 @@ class TileTable:
                 stride, across = width + 2, (width + 7) // 8
                 place = size + 2 * stride + 2
                 flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
+                # Children are later tiles: they look the place of their parents up here.
                 own[band.grid, kind] = band, place, stride
                 parent = above.get((band.grid, kind))
                 joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
                 rows.append((place, stride, height, width, flags, *joined, kind))
                 origins.append((number, band.rows[0], band.columns[0]))
+                # Two rows and two columns of zeros around each band: contexts read beyond its sides without asking.
                 size += (height + 4) * stride + 2
                 blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
             first.append(len(rows))
@@ -95,7 +97,7 @@ class TileTable:
             for band in bands:
                 key = tile.level, band.grid, band.kind
                 if key not in found:
-                    found[key] = step_of(band, tile.level, self.layout, quantiser)
+                    found[key] = band_step(band, tile.level, self.layout, quantiser)
         return np.array(
             [
                 found[tile.level, band.grid, band.kind]
@@ -106,7 +108,7 @@ class TileTable:
         )
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
-        """The rows of one tile's bands, a view."""
+        """The rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""
         return self.bands[self.first[tile] : self.first[tile + 1]]
 
 
@@ -151,14 +153,15 @@ class Tiles:
         state: NDArray[np.int64] | None = None,
         symbols: NDArray[np.uint16] | None = None,
     ) -> None:
-        """Read or write runs of passes, see `bitplanes.code_passes`."""
+        """Read or write runs of passes; `bitplanes.code_passes` tells the shapes of all arrays."""
         arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
         code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state, symbols)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
         """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
 
-        Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
+        ``coefficients`` have the shape (row, column) of each grid. Unknown bits are replaced by the reconstruction
+        point; what the remaining passes told counts as unknown.
         """
         state = np.full(len(self.table.layout.tiles), remaining, np.int8)
         first, last = self.table.first[tile : tile + 2]
@@ -170,8 +173,9 @@ class Tiles:
     ) -> None:
         """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
 
-        ``coefficients`` are arrays of the grids, zeros so far: tiles that were not announced are passed over. Those of
-        levels above ``whole`` are multiplied by 2**`FRACTION_BITS`.
+        ``state`` has the shape (tile,); ``coefficients`` are the grids' arrays, shape (row, column), zeros so far:
+        tiles that were not announced are passed over. Those of levels above ``whole`` are multiplied by
+        2**`FRACTION_BITS`.
         """
         tiles_of = self.table.layout.tiles_of
         last = self.table.first[tiles_of(level).stop]
@@ -218,7 +222,7 @@ def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
 
 
 def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
-    """The flat array of the coefficients (with their signs) of all tiles, from the arrays of the grids."""
+    """The signed coefficients of all tiles, shape (`TileTable.size`,), from those of the grids, (row, column)."""
     flat = np.zeros(table.size, np.int32)
     for number, bands in enumerate(table.members):
         for band, row in zip(bands, table.of_tile(number), strict=True):

@@ -26,6 +26,11 @@ def find_curve(points: int, segments: NDArray[np.int64], places: Sequence[int], 
     places : sequence of int
         Where in the file each segment is: the number of its `what`.
     what : str
+
+    Raises
+    ------
+    FormatError
+        If a segment joins anything but neighbours, or segments are missing.
     """
     expected = np.stack((np.arange(points), (np.arange(points) + 1) % points), axis=-1)
     shared = min(len(segments), points)

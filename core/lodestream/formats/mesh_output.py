@@ -91,7 +91,7 @@ def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], NDArray[
 
 
 def exact_float(values: NDArray[Any], name: str, kind: str) -> NDArray[Any]:
-    """Values in the smallest type of floats that holds them; floats as they are.
+    """Values of any shape in the smallest type of floats that holds them; floats as they are.
 
     Raises
     ------
@@ -126,13 +126,19 @@ def words_of(kind: str, surface: Surface) -> dict[str, str]:
 
 
 def check_count(count: int, most: int, kind: str) -> None:
-    """Refuse more vertices than a format can number."""
+    """Refuse more vertices than a format can number.
+
+    Raises
+    ------
+    FormatError
+        If there are more than ``most``; ``kind`` names the format in the message.
+    """
     if count > most:
         raise FormatError(f"expected at most {number(most)} vertices for {kind}, got {number(count)}")
 
 
 def write_lines(file: BinaryIO, keyword: str, columns: Sequence[NDArray[Any]]) -> None:
-    """Write a line of text for each index of arrays of one length: the keyword, if any, and numbers that read back."""
+    """Write lines of text from columns of shape (line,): the keyword, if any, and numbers that read back."""
     template = " ".join([*[keyword] * bool(keyword), *(_spell(column.dtype) for column in columns)]) + "\n"
     for start in range(0, len(columns[0]), _LINES):
         block = [column[start : start + _LINES].tolist() for column in columns]

@@ -26,7 +26,13 @@ def pad(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def check_faces(source: Source, count: int) -> None:
-    """Refuse more faces than a surface of the vertices allowed could have."""
+    """Refuse more faces than a surface of the vertices allowed could have.
+
+    Raises
+    ------
+    TooLargeError
+        If there are.
+    """
     most = min(2 * source.max_vertices, MOST_FACES)  # each quad may be cut in two
     if count > most:
         raise TooLargeError(f"expected at most {number(most)} faces, got {number(count)} or more")

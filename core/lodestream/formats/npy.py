@@ -56,7 +56,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read_header(file: IO[bytes]) -> NpyHeader:
-    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled."""
+    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled.
+
+    Raises
+    ------
+    FormatError
+        If there is none of version 1.0 or 2.0, or a length in it is negative.
+    """
     head = BytesIO(file.read(_HEAD))
     try:
         version = npy_format.read_magic(head)
@@ -75,7 +81,13 @@ def read_header(file: IO[bytes]) -> NpyHeader:
 
 
 def read_values(file: IO[bytes], header: NpyHeader) -> NDArray[Any]:
-    """Read the array that follows its header, whose size has been checked."""
+    """Read the array that follows its header, of the shape and dtype said there, whose size has been checked.
+
+    Raises
+    ------
+    FormatError
+        If the file ends before its values do.
+    """
     shape = header.shape[::-1] if header.fortran else header.shape
     values = np.empty(shape, header.dtype)
     rest = values.reshape(-1).view(np.uint8).data
@@ -90,7 +102,13 @@ def read_values(file: IO[bytes], header: NpyHeader) -> NDArray[Any]:
 
 
 def read(source: Source) -> Surface:
-    """Read the one array of an NPY file."""
+    """Read the one array of an NPY file.
+
+    Raises
+    ------
+    FormatError
+        If the file is cut short, goes on behind its array, or the array is no surface.
+    """
     with source.path.open("rb") as file:
         header = read_header(file)
         source.check_array(header.shape, header.dtype)

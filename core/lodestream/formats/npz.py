@@ -48,6 +48,11 @@ def read(source: Source) -> Surface:
 
     Those are vectors or arrays under the usual names, or under those that options give; or the numbers dx, dy, xmin,
     xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``.
+
+    Raises
+    ------
+    FormatError
+        If no array is a surface, or coordinates stand beside points that have their own.
     """
     with _refusals(), ZipFile(source.path) as archive:
         members = _members(archive)

@@ -33,7 +33,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read a mesh that is a structured surface."""
+    """Read a mesh that is a structured surface.
+
+    Raises
+    ------
+    FormatError
+        If the file is not whole, or its faces are no grid.
+    """
     lines = _Lines(source)
     vertices, faces = lines.counts()
     source.check_vertices(vertices, f"{number(vertices)} vertices")

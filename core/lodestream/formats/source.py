@@ -74,12 +74,26 @@ class Source:
     allowed: Collection[str] | None = None
 
     def check_vertices(self, count: int, shape: str) -> None:
-        """Refuse a surface of too many vertices; `shape` says in words where the count comes from."""
+        """Refuse a surface of too many vertices; `shape` says in words where the count comes from.
+
+        Raises
+        ------
+        TooLargeError
+            If ``count`` is above `max_vertices`.
+        """
         if count > self.max_vertices:
             raise TooLargeError(f"expected at most {number(self.max_vertices)} vertices, got {shape}")
 
     def check_array(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        """Refuse, by its header alone, an array that is no surface or is larger than allowed."""
+        """Refuse, by its header alone, an array that is no surface or is larger than allowed.
+
+        Raises
+        ------
+        FormatError
+            If no surface has this shape or type.
+        TooLargeError
+            If it has too many vertices, or too many values for each.
+        """
         refusal = refuse_array(shape, dtype)
         if refusal:
             raise FormatError(refusal)
@@ -90,7 +104,13 @@ class Source:
             raise TooLargeError(f"expected at most {_MAX_CHANNELS} values for each vertex allowed, got {words}")
 
     def check_expansion(self, promised: int) -> None:
-        """Refuse a compressed file that promises implausibly more bytes than it has."""
+        """Refuse a compressed file that promises implausibly more bytes than it has.
+
+        Raises
+        ------
+        TooLargeError
+            If it would expand more than deflate can.
+        """
         if promised > max(_HARMLESS_BYTES, self.size * _MAX_EXPANSION):
             raise TooLargeError(
                 f"expected a file that expands at most {_MAX_EXPANSION} times, got {number(self.size)} bytes that "
@@ -102,7 +122,13 @@ class Source:
         return {"name": self.stem, "format": format_name}
 
     def integer_option(self, name: str, low: int, high: int) -> int | None:
-        """Value of the option `name` as an integer from `low` to `high`; None when it was not given."""
+        """Value of the option `name` as an integer from `low` to `high`; None when it was not given.
+
+        Raises
+        ------
+        OptionError
+            If it is no whole number, or outside the bounds.
+        """
         value = self.options.get(name)
         if value is None:
             return None

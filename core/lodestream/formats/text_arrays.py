@@ -41,7 +41,15 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the array of one file as heights, of two as planar points, of three as x, y and z; always float64."""
+    """Read the array of one file as heights, of two as planar points, of three as x, y and z; always float64.
+
+    Raises
+    ------
+    OptionError
+        If there are more than three files.
+    FormatError
+        If they are of different shapes, or are no arrays.
+    """
     paths = (source.path, *source.more)
     if len(paths) > _MOST_FILES:
         raise OptionError(f"expected one to three files of text, got {len(paths)}")

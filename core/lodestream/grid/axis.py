@@ -64,17 +64,18 @@ def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int)
         index, sign = outside, 1
         if closed:
             index %= midpoints
+        # On short runs a reflection at one end may land beyond the other: reflected until inside.
         while not 0 <= index < midpoints:
             if index < 0:
                 index, mirror = (-1 - index, True) if left else (-2 - index, index != -1)
             else:
                 mirror = right or index != midpoints
                 index = 2 * midpoints - 1 - index if right else 2 * midpoints - index
-            if not mirror:
+            if not mirror:  # the virtual midpoint itself, about which the details are odd: 0 stays 0 from here on
                 index, sign = 0, 0
             sign = -sign
         table[place] = index, sign
-    table.setflags(write=False)
+    table.setflags(write=False)  # it is remembered, and shared by all who ask
     return table
 
 
@@ -110,7 +111,7 @@ class AxisStep:
         return self.run < self.coarse
 
     def extension(self, reach: int) -> NDArray[np.int64]:
-        """Details beyond the ends of the run, see `extension`."""
+        """Details beyond the ends of the run, shape (2 reach, 2); see `extension`."""
         return extension(self.midpoints, self.left, self.right, self.wraps, reach)
 
 
@@ -128,4 +129,5 @@ def axis_step(
     wraps = closed and length % 2 == 0 and midpoints > 0
     run = midpoints if wraps else midpoints + 1 if midpoints else coarse
     left, right = (False, False) if closed else clamped
+    # With a gap before the last node the run ends at the gap, which is a free end whatever holds that node.
     return AxisStep(length, coarse, midpoints, run, wraps, left, right and run == coarse)

@@ -189,6 +189,8 @@ class Layout:
                     for j in range(across):
                         parent = -1
                         if level > 1:
+                            # The last tile takes what is left, so a level may have one tile fewer than twice those
+                            # below it, or one more: that one has the last parent too.
                             up = min(i >> halves[0], parents_down - 1), min(j >> halves[1], parents_across - 1)
                             parent = before + up[0] * parents_across + up[1]
                         members = self._members(group, level, bounds, (i, j))
@@ -266,9 +268,11 @@ class Layout:
         for axis in range(2):
             start, stop = bounds[axis][place[axis]], bounds[axis][place[axis] + 1]
             last = place[axis] == len(bounds[axis]) - 2
+            # A side that comes from an interface is coded there: the first and the last band leave its nodes out.
             first = start + (taken[2 * axis] and place[axis] == 0)
             nodes = (first, stop - (taken[2 * axis + 1] and last)), first
             details = fine[axis] - coarse[axis]
+            # There are up to two details fewer than nodes, and as many where an axis wraps; those of a stopped axis: 0.
             start, stop = min(start, details), details if last else min(stop, details)
             spans.append((nodes, ((coarse[axis] + start, coarse[axis] + stop), start)))
         bands = []

@@ -94,10 +94,11 @@ class VertexCounter:
                 continue
             interface = self._interfaces[side.interface]
             if interface.length == 1:
-                line[1:] = False
+                line[1:] = False  # a pole: all of the line is one vertex
                 held.setdefault(self._owners.get((side.interface, 0), (side.interface, 0)), places[0])
                 continue
             if side.interface in self._used:
+                # Not its ends, which other interfaces may share: these are counted by owner below.
                 line[slice(None) if interface.closed else slice(1, -1)] = False
             self._used.add(side.interface)
             if not interface.closed:
@@ -150,6 +151,7 @@ def covers(shape: tuple[int, int], closed: Closed, patches: Sequence[Patch]) -> 
         for columns in _cells(shape[1], closed[1], patch.closed[1], patch.columns)
     ]
     whole = [n if wraps else max(n - 1, 1) for n, wraps in zip(shape, closed, strict=True)]
+    # As many cells as the block has, and none twice: then each is there.
     area = sum((b - a) * (d - c) for (a, b), (c, d) in cells)
     return area == whole[0] * whole[1] and not _overlap(cells)
 

@@ -109,7 +109,10 @@ def assemble(own: Numbered, layout: Layout, level: int, shape: Shape, grids: Seq
 def level_masks(
     patches: Sequence[Patch], layout: Layout, level: int, masks: Sequence[NDArray[np.bool_] | None]
 ) -> list[NDArray[np.bool_] | None]:
-    """Which nodes of a level stand for valid points: those at whose place the full grid has one."""
+    """Which nodes of a level stand for valid points, bool, shape (row, column) of each block; None: all.
+
+    They do where the full grid, which ``masks`` are of, has a point at their place.
+    """
     found: list[NDArray[np.bool_] | None] = []
     for own, mask in zip(numbered_by_block(patches, len(masks)), masks, strict=True):
         coarse = mask

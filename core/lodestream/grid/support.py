@@ -68,11 +68,13 @@ def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
     if not step.midpoints:
         return samples.copy()
     line = np.zeros(step.length, np.bool_)
-    if step.tail:
+    if step.tail:  # a node beyond a gap is kept as it is, and nothing else depends on it
         line[step.coarse - 1] = samples[-1]
         if not samples[:-1].any():
             return line
     run = samples[:-1] if step.tail else samples
+    # A midpoint needs the nodes on either side and its detail; a node, the details that updated it; and a detail, the
+    # nodes from which the third step predicted it.
     inner = run[1::2]
     nodes = np.zeros(step.run, np.bool_)
     nodes |= run[::2]

@@ -17,13 +17,14 @@ __all__ = ["pack_cells", "unpack_cells"]
 
 
 def pack_cells(cells: NDArray[np.bool_]) -> dict[str, Any]:
-    """Write a set of cells, a bool array with an entry for each cell."""
+    """Write a set of cells: bool, shape (row of cells, column of cells)."""
     packed = zlib.compress(np.packbits(cells).tobytes(), 9)
     return {"shape": list(cells.shape), "cells": base64.b64encode(packed).decode("ascii")}
 
 
 def unpack_cells(entry: Any, shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Read what `pack_cells` wrote for a grid of so many rows and columns of cells; None when it was for another one.
+    """Read what `pack_cells` wrote for a grid of so many rows and columns of cells; None when it was for
+    another one. The array is bool, of that shape.
 
     Raises
     ------

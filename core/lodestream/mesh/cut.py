@@ -15,7 +15,7 @@ __all__ = ["irregular", "trace"]
 def irregular(valence: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Which umbrellas are no part of a grid: inner ones without four quads, outer ones with more than two.
 
-    `valence` is the number of quads, negative at a border.
+    `valence`, shape (umbrella,), is the number of quads, negative at a border.
     """
     wrong: NDArray[np.bool_] = ((valence >= 0) & (valence != 4)) | (valence < -2)
     return wrong

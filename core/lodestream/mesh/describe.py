@@ -71,7 +71,11 @@ def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
 
 
 def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -> NDArray[np.int32]:
-    """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column."""
+    """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column.
+
+    `corners` are half-edges, int32 of shape (H, W), `faces` int32 of shape (H or H - 1,
+    W or W - 1); -1: none.
+    """
     corners = corners.copy()
     line, beside = corners[SIDES[side]], faces[SIDES[side]]
     beside = np.concatenate([beside, beside[-1:]])[: len(line)]
@@ -82,7 +86,10 @@ def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -
 def poles_of(
     vertices: NDArray[np.int64], closed: Closed, points: NDArray[Any], kinds: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """The sides of a grid that are collapsed to a point; `kinds` are those that are one vertex."""
+    """The sides of a grid that are collapsed to a point; `kinds` are those that are one vertex.
+
+    `vertices` has shape (H, W), -1 for none; `points` shape (V, C).
+    """
     poles = []
     for side, place in SIDES.items():
         line = vertices[place]
@@ -100,7 +107,8 @@ def join_blocks(
 ) -> tuple[list[RecognisedBlock], int]:
     """Say of each block whether its border is joined to others, or to itself.
 
-    The second result is the number of vertices that will be joined although they only lie at the same place.
+    `points` has shape (V, C). The second result is the number of vertices that will be joined although they only lie
+    at the same place.
     """
     borders = [_border(block, grid) for block, grid in zip(blocks, grids, strict=True)]
     shared = np.bincount(np.concatenate(borders), minlength=1) > 1

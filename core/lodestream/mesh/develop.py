@@ -49,12 +49,15 @@ _PIECES, _NO_ROOM = 64, 2
 
 
 def develop_quads(twins: NDArray[np.int32]) -> Development:
-    """Lay out quads that are wound alike. Where an inner vertex has not four quads, the piece `turns` or overlaps."""
+    """Lay out quads that are wound alike, of twins of shape (4 F,).
+
+    Where an inner vertex has not four quads, the piece `turns` or overlaps.
+    """
     return _laid_out(4, twins)
 
 
 def develop_triangles(twins: NDArray[np.int32]) -> Development:
-    """Lay out triangles that are wound alike, on a lattice with three directions."""
+    """Lay out triangles that are wound alike, of twins of shape (3 F,), on a lattice with three directions."""
     return _laid_out(3, twins)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .. import kernels
 from ..surface import Closed
 from .develop import Development
-from .walks import parts
+from .walks import batches
 
 __all__ = ["Grid", "make_grid"]
 
@@ -47,8 +47,8 @@ class Grid:
 def _bounds(faces: NDArray[np.int64], laid: Development, down: int, across: int) -> tuple[int, int, int, int]:
     """Lowest and highest row and column of the nodes, after the periods `down` and `across` (0: none)."""
     bounds = np.tile([np.iinfo(np.int64).max, np.iinfo(np.int64).min], 2)
-    for part in parts(len(faces)):
-        kernels.mesh_bounds(faces[part], laid.first, laid.heading, bounds)
+    for batch in batches(len(faces)):
+        kernels.mesh_bounds(faces[batch], laid.first, laid.heading, bounds)
     top, bottom, left, right = (int(bound) for bound in bounds)
     rows = (0, down - 1) if down else (top, bottom + 1)
     columns = (0, across - 1) if across else (left, right + 1)
@@ -91,8 +91,8 @@ def make_grid(
         return None
     nodes = np.full((height, width), -1, np.int32)
     cells = np.full((down, across), -1, np.int32)
-    for part in parts(len(faces)):
-        run = faces[part]
+    for batch in batches(len(faces)):
+        run = faces[batch]
         if kernels.mesh_fill(run, laid.first, laid.heading, identity, top, left, *closed, nodes, cells) < len(run):
             return None
     return _in_order(Grid(nodes, cells, closed, False), vertex)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import kernels
-from .walks import parts, walk
+from .walks import batches, walk
 
 __all__ = ["Corners", "find_pieces", "find_twins", "find_umbrellas", "join_pieces", "orient", "turn"]
 
@@ -44,17 +44,17 @@ def find_twins(corners: Corners, vertices: int) -> tuple[NDArray[np.int32], int,
         Pairs of twins that run the same way: their faces are wound differently.
     """
     start = np.zeros(vertices + 1, np.int32)
-    for part in parts(len(corners)):
-        kernels.mesh_count_edges(corners[part], start)
+    for batch in batches(len(corners)):
+        kernels.mesh_count_edges(corners[batch], start)
     np.cumsum(start, out=start)
     order = np.empty(start[-1], np.int32)
-    for part in parts(len(corners)):
-        kernels.mesh_sort_edges(corners, part.start, part.stop, start[:-1], order)
+    for batch in batches(len(corners)):
+        kernels.mesh_sort_edges(corners, batch.start, batch.stop, start[:-1], order)
     # Half-edges of one vertex meet at the other one, whose number is higher.
     met = np.full((vertices, 2), -1, np.int32)
     twins = np.full(4 * len(corners), -1, np.int32)
     crossed = np.array([_NO_HALF_EDGE])
-    same = sum(kernels.mesh_match_edges(corners, order[part], met, twins, crossed) for part in parts(len(order)))
+    same = sum(kernels.mesh_match_edges(corners, order[batch], met, twins, crossed) for batch in batches(len(order)))
     return twins, -1 if crossed[0] == _NO_HALF_EDGE else int(crossed[0]), same
 
 
@@ -70,7 +70,10 @@ def find_pieces(twins: NDArray[np.int32], piece: NDArray[np.int32]) -> int:
 
 
 def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertices: int) -> NDArray[np.int64]:
-    """Number pieces that share a vertex alike: for each piece the number of its part, in order."""
+    """Number pieces that share a vertex alike: for each piece the number of its part, in order, shape (piece,).
+
+    `corners` has shape (F, 3) or (F, 4), `piece` shape (F,).
+    """
     part = np.arange(pieces)
     if pieces < 2:
         return part

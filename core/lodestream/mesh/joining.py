@@ -20,12 +20,12 @@ from .cells import unpack_cells
 
 __all__ = [
     "SIDES",
-    "Part",
+    "NumberedBlock",
     "Pole",
     "change_of",
     "join_points",
+    "numbered_blocks",
     "on_border",
-    "parts_of",
     "poles_of",
     "wraps",
 ]
@@ -51,7 +51,7 @@ class Pole(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class NumberedBlock:
     """A block, its points as numbers among those of all blocks, what is said of its faces, and which cells have one."""
 
     block: Block
@@ -61,7 +61,7 @@ class Part:
     joins: bool  # its border, to others at the same place
 
     @staticmethod
-    def of(block: Block, start: int, faces: Mapping[str, Any], blocks: int) -> Part:
+    def of(block: Block, start: int, faces: Mapping[str, Any], blocks: int) -> NumberedBlock:
         """A block of so many, whose points are numbered from `start`."""
         height, width = block.shape
         valid = np.ones(block.shape, np.bool_) if block.mask is None else block.mask
@@ -74,10 +74,10 @@ class Part:
         if left_out is not None:
             cells &= ~left_out
         points = start + np.arange(height * width).reshape(height, width)
-        return Part(block, points, faces, cells, bool(faces.get("joined", blocks > 1)))
+        return NumberedBlock(block, points, faces, cells, bool(faces.get("joined", blocks > 1)))
 
     def border(self) -> NDArray[np.int64]:
-        """The points that may lie at the place of others: valid ones with fewer than four faces."""
+        """The points that may lie at the place of others, shape (point,): valid ones with fewer than four faces."""
         if not self.joins or self.block.points.ndim != 3:
             return self.points[:0, 0]
         border = on_border(self.cells, self.block.shape)
@@ -92,7 +92,10 @@ def wraps(block: Block, axis: int) -> bool:
 
 
 def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which nodes of a grid have fewer than four faces, from the cells that have one; fewer cells on open axes."""
+    """Which nodes of a grid of this shape have fewer than four faces, from the cells that have one.
+
+    `cells` is bool of shape (row of cells, column of cells), one fewer on open axes.
+    """
     full = np.zeros(shape, np.bool_)
     full[: cells.shape[0], : cells.shape[1]] = cells
     for axis in (0, 1):
@@ -116,7 +119,7 @@ def _face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[s
     return faces
 
 
-def parts_of(surface: Surface) -> list[Part]:
+def numbered_blocks(surface: Surface) -> list[NumberedBlock]:
     """The blocks of a surface.
 
     Raises
@@ -124,12 +127,12 @@ def parts_of(surface: Surface) -> list[Part]:
     InputError
         When the metadata's ``faces`` are not of the form that they should have.
     """
-    parts, start = [], 0
+    numbered, start = [], 0
     for number, block in enumerate(surface.blocks):
         faces = _face_map(surface.metadata, number, len(surface.blocks))
-        parts.append(Part.of(block, start, faces, len(surface.blocks)))
-        start += parts[-1].points.size
-    return parts
+        numbered.append(NumberedBlock.of(block, start, faces, len(surface.blocks)))
+        start += numbered[-1].points.size
+    return numbered
 
 
 def poles_of(surface: Surface) -> list[Pole]:
@@ -155,7 +158,7 @@ def poles_of(surface: Surface) -> list[Pole]:
 
 
 def join_points(
-    surface: Surface, parts: Sequence[Part], poles: Sequence[Pole]
+    surface: Surface, numbered: Sequence[NumberedBlock], poles: Sequence[Pole]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], list[Pole]]:
     """Find the points that are one.
 
@@ -168,15 +171,15 @@ def join_points(
     poles : list of Pole
         Those that lie at one place, as in a window of the surface they need not.
     """
-    joined = np.arange(sum(part.points.size for part in parts))
-    numbers = _that_count(parts, poles)
+    joined = np.arange(sum(own.points.size for own in numbered))
+    numbers = _that_count(numbered, poles)
     if not numbers.size:
         return joined, joined, []
     place = np.full(len(joined), -1)
     place[numbers] = _places(surface, numbers)
     borders: dict[int, list[NDArray[np.int64]]] = {}
-    for part in parts:
-        borders.setdefault(int(part.faces.get("part", 0)), []).append(part.border())
+    for own in numbered:
+        borders.setdefault(int(own.faces.get("part", 0)), []).append(own.border())
     for several in borders.values():
         index = np.concatenate(several)
         if not index.size:
@@ -184,10 +187,10 @@ def join_points(
         joined[index] = index[_first_equal([place[index]])]
     there = []
     for pole in poles:
-        line = parts[pole.block].points[SIDES[pole.side]]
+        line = numbered[pole.block].points[SIDES[pole.side]]
         if (place[line] == place[line[0]]).all():
             there.append(pole)
-            if not parts[pole.block].joins:
+            if not numbered[pole.block].joins:
                 joined[line] = joined[line].min()
     vertex = np.arange(len(joined))
     together = np.flatnonzero(joined != vertex)
@@ -199,7 +202,7 @@ def join_points(
 
 
 def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
-    """How the points that are one by their values differ from those that an arrangement says.
+    """How the points that are one by their values differ from those that the arrangement of blocks says.
 
     Parameters
     ----------
@@ -214,7 +217,7 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
     """
     nothing = Change(np.empty(0, np.int64), np.empty((0, 2), np.int64))
     try:
-        numbers = _that_count(parts_of(surface), poles_of(surface))
+        numbers = _that_count(numbered_blocks(surface), poles_of(surface))
     except InputError:
         return nothing, nothing  # its metadata make no mesh
     if not numbers.size:
@@ -225,10 +228,10 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
     return first, find_change(numbers, places.changed(first), numbers[_first_equal(columns)])
 
 
-def _that_count(parts: Sequence[Part], poles: Sequence[Pole]) -> NDArray[np.int64]:
+def _that_count(numbered: Sequence[NumberedBlock], poles: Sequence[Pole]) -> NDArray[np.int64]:
     """The points that may be joined with others, increasing."""
-    sides = [parts[pole.block].points[SIDES[pole.side]] for pole in poles]
-    return np.unique(np.concatenate([*(part.border() for part in parts), *sides]))
+    sides = [numbered[pole.block].points[SIDES[pole.side]] for pole in poles]
+    return np.unique(np.concatenate([*(own.border() for own in numbered), *sides]))
 
 
 def _places(surface: Surface, numbers: NDArray[np.int64]) -> NDArray[np.int64]:

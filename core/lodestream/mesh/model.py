@@ -94,7 +94,7 @@ class Mesh:
 
 
 def name_faces(mesh: Mesh, faces: ArrayLike) -> str:
-    """Name the first few of some faces."""
+    """Name the first few of some faces, whose numbers have any shape."""
     numbers = np.unique(np.asarray(faces)).tolist()
     words = [mesh.face_name(number) for number in numbers[:_NAMED]]
     if len(numbers) > _NAMED:

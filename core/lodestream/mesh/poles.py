@@ -48,7 +48,11 @@ def find_fans(
 def leaving_half_edges(
     twins: NDArray[np.int32], umbrella: NDArray[np.int32], valence: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open."""
+    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open.
+
+    `twins` and `umbrella` have an entry a half-edge, shape (4 F,), `valence` and the result one an umbrella, shape
+    (U,).
+    """
     halves = np.flatnonzero(umbrella >= 0).astype(np.int32)
     leaving = np.empty(len(valence), np.int32)
     leaving[umbrella[halves]] = halves

@@ -11,7 +11,7 @@ from .. import kernels
 from .halfedges import Corners
 from .model import Mesh
 from .patchwork import Quads
-from .walks import parts
+from .walks import batches
 
 __all__ = ["equal_rows", "sort_attributes", "tear"]
 
@@ -22,11 +22,11 @@ def rows_of_vertices(corners: Corners, rows: NDArray[np.int32], row_of: NDArray[
     Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face; of no use when they differ.
     """
     row_of[:] = -1
-    return all(kernels.mesh_rows(corners[part], rows[part], row_of) for part in parts(len(corners)))
+    return all(kernels.mesh_rows(corners[batch], rows[batch], row_of) for batch in batches(len(corners)))
 
 
 def equal_rows(values: NDArray[Any]) -> NDArray[np.int32]:
-    """Number rows of values so that equal ones, bit for bit, have the same number."""
+    """Number rows of values, shape (row, ...), so that equal ones, bit for bit, have the same number: shape (row,)."""
     packed = np.ascontiguousarray(values).reshape(len(values), -1)
     keys = packed.view(np.dtype((np.void, packed.dtype.itemsize * packed.shape[1]))).reshape(-1)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
@@ -67,9 +67,12 @@ def sort_attributes(mesh: Mesh) -> tuple[dict[str, NDArray[np.int32]], dict[str,
 
 
 def tear(quads: Quads, twins: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Part faces in `twins` where an attribute differs across their edge; for each attribute the number of edges."""
+    """Part faces in `twins`, shape (4 F,), where an attribute differs across their edge.
+
+    Gives for each attribute the number of such edges, shape (attribute,).
+    """
     torn, there = np.zeros(len(quads.attributes), np.int64), np.empty(len(quads.attributes), np.int64)
-    for part in parts(len(quads.corners)):
-        kernels.mesh_tear(quads.attributes, part.start, part.stop, twins, there)
+    for batch in batches(len(quads.corners)):
+        kernels.mesh_tear(quads.attributes, batch.start, batch.stop, twins, there)
         torn += there
     return torn

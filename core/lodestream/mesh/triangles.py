@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .. import kernels
 from .develop import Development, develop_triangles
 from .halfedges import Corners
-from .walks import parts
+from .walks import batches
 
 __all__ = ["Pairing", "pair_in_order", "pair_triangles"]
 
@@ -71,9 +71,9 @@ class _Survey:
         low, high = np.full(shape, np.iinfo(np.int64).max), np.full(shape, np.iinfo(np.int64).min)
         single, length = np.zeros(shape, np.uint8), np.zeros(shape)
         twins = twins.reshape(-1, 4)
-        for part in parts(len(corners)):
+        for batch in batches(len(corners)):
             kernels.mesh_survey(
-                *(corners[part], twins[part], points, laid.piece[part], laid.first[part], laid.heading[part]),
+                *(corners[batch], twins[batch], points, laid.piece[batch], laid.first[batch], laid.heading[batch]),
                 *(low, high, single, length),
             )
         return _Survey(high - low, single.view(np.bool_), length)

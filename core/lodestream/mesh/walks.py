@@ -1,4 +1,4 @@
-"""Kernels over whole meshes, called for a part at a time: between calls whoever waits can interrupt them."""
+"""Kernels over whole meshes, called for a batch at a time: between calls whoever waits can interrupt them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 from ..kernels import Kernel
 
-__all__ = ["parts", "walk"]
+__all__ = ["batches", "walk"]
 
 #: Faces or steps of one call: some hundredths of a second where memory is read at random.
 _AT_ONCE = 1 << 16
 
 
-def parts(count: int) -> Iterator[slice]:
+def batches(count: int) -> Iterator[slice]:
     """Divide so many faces into runs for one call each."""
     for first in range(0, count, _AT_ONCE):
         yield slice(first, min(first + _AT_ONCE, count))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..surface import Block, Surface
 from .cells import unpack_cells
-from .joining import Part, join_points, parts_of, poles_of, wraps
+from .joining import NumberedBlock, join_points, numbered_blocks, poles_of, wraps
 
 __all__ = ["Weld", "weld"]
 
@@ -55,22 +55,22 @@ def weld(surface: Surface) -> Weld:
     InputError
         When the metadata's ``faces`` or ``poles`` are not of the form that they should have.
     """
-    parts = parts_of(surface)
-    joined, vertex, poles = join_points(surface, parts, poles_of(surface))
+    numbered = numbered_blocks(surface)
+    joined, vertex, poles = join_points(surface, numbered, poles_of(surface))
     quads, triangles = [], []
-    for number, part in enumerate(parts):
+    for number, own in enumerate(numbered):
         degenerate = any(pole.block == number and pole.kind == "degenerate" for pole in poles)
-        part_quads, part_triangles = _faces(part, joined, degenerate)
-        quads.append(part_quads)
-        triangles.append(part_triangles)
-    edges = np.concatenate([_edges(part) for part in parts])
+        own_quads, own_triangles = _faces(own, joined, degenerate)
+        quads.append(own_quads)
+        triangles.append(own_triangles)
+    edges = np.concatenate([_edges(own) for own in numbered])
     edges = edges[joined[edges[:, 0]] != joined[edges[:, 1]]]
     return _compressed(surface.blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles), edges)
 
 
-def _edges(part: Part) -> NDArray[np.int64]:
+def _edges(own: NumberedBlock) -> NDArray[np.int64]:
     """The edges of a block that is a curve, over the points of the surface; of others none."""
-    block, count = part.block, part.points.size
+    block, count = own.block, own.points.size
     if 1 not in block.shape:
         return np.empty((0, 2), np.int64)
     closed = wraps(block, 0 if block.shape[1] == 1 else 1)
@@ -78,15 +78,17 @@ def _edges(part: Part) -> NDArray[np.int64]:
     ends = np.stack((one, (one + 1) % count), axis=-1)
     if block.mask is not None:
         ends = ends[block.mask.reshape(-1)[ends].all(axis=1)]
-    return part.points.reshape(-1)[ends]
+    return own.points.reshape(-1)[ends]
 
 
-def _faces(part: Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _faces(
+    own: NumberedBlock, joined: NDArray[np.int64], degenerate: bool
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Quads and triangles of a block in the order of its cells, over the points of the surface."""
-    rows, width = part.block.shape
-    r, c = np.nonzero(part.cells)
+    rows, width = own.block.shape
+    r, c = np.nonzero(own.cells)
     below, right = (r + 1) % rows, (c + 1) % width
-    points, faces = part.points, part.faces
+    points, faces = own.points, own.faces
     corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
     collapsed = np.zeros(len(corners), np.bool_)
     for k in range(4):
@@ -100,9 +102,9 @@ def _faces(part: Part, joined: NDArray[np.int64], degenerate: bool) -> tuple[NDA
     diagonal = faces.get("diagonal")
     if diagonal is not None:
         main = np.full(len(quads), diagonal == "main")
-        crossed = unpack_cells(faces.get("crossed"), part.cells.shape)
+        crossed = unpack_cells(faces.get("crossed"), own.cells.shape)
         if crossed is not None:
-            main ^= crossed[part.cells][~collapsed]
+            main ^= crossed[own.cells][~collapsed]
         quads, fans = quads[:0], np.concatenate([_halves(quads, main), fans])
     quads = np.concatenate([quads, folded]) if len(folded) else quads
     if faces.get("reversed"):

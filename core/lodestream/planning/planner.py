@@ -81,7 +81,7 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
             return kept, "bytes"
         kept.append(mark)
         if mark is marks[-1]:
-            break
+            break  # complete, even if it meets a tolerance too
         if rms is not None and mark.rms <= rms:
             return kept, "rms"
         if worst is not None and mark.max_error <= worst:
@@ -103,6 +103,7 @@ def _slices_of_layers(index: Index, level: int) -> Plan:
         if record.level <= level:
             marks.append(Mark(size, layer, record.level, size, record.rms, record.max_error))
     state = index.levels[level]
+    # Layers that add nothing up to this level end where the level does: its own state, with its errors, says it better.
     marks = [mark for mark in marks if mark.sent < size]
     marks.append(Mark(size, level, level, size, state.rms, state.max_error))
     return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), "level")
@@ -168,6 +169,7 @@ def _selected(index: Index, target: Target) -> Plan:
             size += chunk.range.length
         state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
         last, ended = Mark(size, number, finest, size, state.rms, state.max_error), "complete"
+    # A state of the same bytes as the last is the last.
     marks = [mark for mark in marks if mark.sent < size] + [last]
     if target.level is None:
         marks, ended = _until(marks, target, index.header.extent)
@@ -175,7 +177,7 @@ def _selected(index: Index, target: Target) -> Plan:
 
 
 def _mark(size: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
-    unknown = float("nan")
+    unknown = float("nan")  # layers tell errors of the whole surface: of a window on the way they say nothing
     return Mark(size, number, level, size, *((unknown, unknown) if partial else (rms, max_error)))
 
 
@@ -216,6 +218,7 @@ def _less(chosen: Plan, cached: RangeSet) -> Plan:
                 sent += gaps[passed].length
                 passed += 1
             begun = max(end - gaps[passed].offset, 0) if passed < len(gaps) else 0
+            # A mark inside a gap stands that far into it; one behind what is cached, where the gap before it ends.
             marks.append(replace(mark, sent=sent + begun))
             mark = next(todo, None)
         planned += place.length

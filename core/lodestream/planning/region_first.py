@@ -51,7 +51,7 @@ def region_first(index: Index, chosen: Plan, region: Region) -> Plan:
     ahead = behind = 0
     for mark, places in _between(chosen):
         for place in places:
-            if not steps:
+            if not steps:  # without the first state nothing can be drawn, inside the region or out of it
                 head.append(place)
                 ahead += place.length
                 continue
@@ -82,7 +82,7 @@ def _between(chosen: Plan) -> Iterator[tuple[Mark, list[ByteRange]]]:
         places = []
         while sent < mark.sent:
             place = todo.pop()
-            size = min(place.length, mark.sent - sent)
+            size = min(place.length, mark.sent - sent)  # slices were put together: a state may end inside one
             places.append(ByteRange(place.offset, size))
             if size < place.length:
                 todo.append(ByteRange(place.offset + size, place.length - size))
@@ -95,7 +95,7 @@ def _marks(steps: list[_Step]) -> Iterator[Mark]:
     unknown = float("nan")
     end = steps[-1]
     for in_region in (True, False):
-        before = 0
+        before = 0  # a state that adds nothing to what comes ahead, or behind, gets no mark there
         for step in steps:
             size = step.ahead if in_region else step.behind
             if size > before and step is not end:

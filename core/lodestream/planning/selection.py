@@ -43,7 +43,7 @@ class Selection:
                 raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
 
     def channels(self, header: Header) -> NDArray[np.bool_]:
-        """Which channels are wanted."""
+        """Which channels are wanted: bool, shape (channel,)."""
         chosen = [True] * header.point_channels
         for kind in header.attributes:
             chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
@@ -78,7 +78,7 @@ class Selection:
         capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
 
     def tiles(self, header: Header) -> NDArray[np.bool_]:
-        """Which tiles are wanted."""
+        """Which tiles are wanted: bool, shape (tile,)."""
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
         if header.arrangement is not None:

@@ -93,6 +93,7 @@ class WindowErrors:
             inside = int(np.count_nonzero(mask[slice(*rows), slice(*columns)]))
         if not inside:
             return 0.0, 0.0
+        # A cell that the window only touches counts whole: all that its errors come from may lie inside.
         squares = float((counts[window] * fractions[..., 0] ** 2).sum())
         # Rounding of these sums is far below the steps of the codes; a bound stays one all the same.
         rms = math.sqrt(squares / inside) * (1 + 2.0**-40)
@@ -137,7 +138,7 @@ def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
     errors = np.stack([rms, np.sqrt(gathered(np.maximum, figures[..., 1]))], axis=1)
     known = header.extent * _FRACTIONS[:_NOTHING]
     if errors.max() > known[0]:
-        return None
+        return None  # then no layer gets codes: a bound that is too low would be worse than none
     # The last of the falling bounds that is not below.
     codes = np.searchsorted(-known, -errors, side="right") - 1
     return np.where(errors == 0, _NOTHING, codes).astype(np.uint8)
@@ -149,13 +150,13 @@ def is_divided(header: Header) -> bool:
 
 
 def no_errors(header: Header) -> NDArray[np.uint8]:
-    """As `layer_codes` of a layer without errors."""
+    """As `layer_codes` of a layer without errors: shape (cell, 2)."""
     count = _cell_counts(header.shape, CELL, None).size
     return np.full((count, 2), _NOTHING, np.uint8)
 
 
 def serialize_window_errors(layers: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Payload of the section from the codes of each layer, see `layer_codes`."""
+    """Payload of the section from the codes of each layer, shape (cell, 2), see `layer_codes`."""
     out = FieldWriter()
     out.byte(CELL[0] | CELL[1] << 4)
     for row in np.stack(layers, axis=1):

@@ -1,1 +1,1 @@
-"""From values to integers and back: the lattice of each channel, steps of bands, and errors measured."""
+"""From values to integers and back: the lattice of each channel, quantization steps of bands, and errors measured."""

@@ -1,6 +1,6 @@
-"""Coefficients in steps: what a stream made for one root mean square error codes in place of whole lattice steps.
+"""Quantization steps of bands: what a stream made for one root mean square error codes in place of lattice steps.
 
-Each band has a step, so that one step of any coefficient changes the surface by about as much. What is coded, plane by
+Each band has a step, so that one of any coefficient changes the surface by about as much. What is coded, plane by
 plane, are the *indices*: a coefficient is its index times its band's step. A *trellis* halves the distance between the
 values that are within reach without longer indices, see `trellis`.
 """
@@ -13,41 +13,41 @@ import numpy as np
 
 from ..grid.layout import Band, Layout
 
-__all__ = ["MOST_BASE", "Quantiser", "step_of", "steps_along"]
+__all__ = ["MOST_BASE", "Quantiser", "band_step", "lifting_steps_along"]
 
 #: Largest `Quantiser.base`.
 MOST_BASE = (1 << 24) - 1
 
 #: Of a node and of a detail along an axis: 2**16 over the norm of its synthesis function with the four-point rule, by
-#: the axis's steps from there to the finest level; further steps halve it for each two of them.
+#: the axis's lifting steps from there to the finest level; further ones halve it for each two of them.
 _ALONG = np.array([[65536, 53303, 39201, 27993, 19842, 14039], [65536, 77936, 69201, 52586, 37885, 26915]], np.int64)
 
 
 @dataclass(frozen=True)
 class Quantiser:
-    """How the coordinates of a stream are quantised.
+    """How the coordinates of a stream are quantized.
 
     Attributes
     ----------
     base : int
-        The step of a coefficient that changes one point alone, in lattice steps; 1 to 2**24 - 1.
+        The quantization step of a coefficient that changes one point alone, in lattice steps; 1 to 2**24 - 1.
     """
 
     base: int
 
 
-def step_of(band: Band, level: int, layout: Layout, quantiser: Quantiser) -> int:
-    """The step of a band of a level, in lattice steps; at least 1 and below 2**26."""
+def band_step(band: Band, level: int, layout: Layout, quantiser: Quantiser) -> int:
+    """The quantization step of a band of a level, in lattice steps; at least 1 and below 2**26."""
     product = quantiser.base
     for axis in range(2):
-        product *= _along(*steps_along(band, level, layout, axis))
+        product *= _along(*lifting_steps_along(band, level, layout, axis))
     return max(1, product >> 32)
 
 
-def steps_along(band: Band, level: int, layout: Layout, axis: int) -> tuple[int, bool]:
-    """Steps of an axis from a band of a level to the finest level, and whether the band has details along it.
+def lifting_steps_along(band: Band, level: int, layout: Layout, axis: int) -> tuple[int, bool]:
+    """Lifting steps of an axis from a band of a level to the finest, and whether the band has details along it.
 
-    The points of a curve reach across the parts beside it, as nodes do.
+    Across itself an interface counts as a node: its points change the patches beside it.
     """
     first = max(level, 1)
     if layout.grids[band.grid].interface and axis == 1:

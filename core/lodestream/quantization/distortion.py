@@ -20,9 +20,9 @@ __all__ = ["Original", "coordinate_distances", "originals_of", "other_originals"
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
 
-#: Points in one call of a kernel, and parts of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
+#: Points in one call of a kernel, and cells of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
 _AT_ONCE = 1 << 20
-_PARTS = 16
+_CELLS = 16
 _EVERY = np.zeros(0, np.bool_)
 
 
@@ -184,7 +184,17 @@ def coordinate_distances(
                 cells += [patch[..., 0, :] for patch in patches]
             totals = [math.fsum(math.fsum(patch[..., k, 0].flat) for patch in patches) for k in range(len(worst))]
             return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
-    # Integers that float64 cannot tell apart, or squares that it cannot hold.
+    return _distances_of_values(originals, lattices, coordinates, fractions, channel)
+
+
+def _distances_of_values(
+    originals: Sequence[Original],
+    lattices: Sequence[Lattice],
+    coordinates: Sequence[NDArray[np.int32]],
+    fractions: Sequence[int],
+    channel: int,
+) -> list[tuple[float, float]]:
+    """As `coordinate_distances`, of integers that float64 cannot tell apart, or where it cannot hold the squares."""
     compared = []
     last = channel + len(lattices)
     for original, place in zip(originals, coordinates, strict=True):
@@ -225,6 +235,6 @@ def _distances(
     counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
     arrays = original.points, coordinates, rules, counted, figures
     shapes = rows, columns, channels, channel, *coordinates.shape[1:]
-    for first in range(0, down * across, _PARTS):
-        kernels.square_distances(*arrays, *shapes, first, min(first + _PARTS, down * across))
+    for first in range(0, down * across, _CELLS):
+        kernels.square_distances(*arrays, *shapes, first, min(first + _CELLS, down * across))
     return figures

@@ -37,7 +37,21 @@ _STRIP = 1 << 15  # values worked on together, so that what is in between stays 
 
 @dataclass(frozen=True)
 class Lattice:
-    """One channel's lattice: ``rule`` is "affine" or "decimal", see the module."""
+    """One channel's lattice.
+
+    >>> metres = Lattice("affine", 100.0, 0.5)
+    >>> metres.coordinates(np.array([[99.0, 100.0, 101.2]]))
+    array([[-2,  0,  2]], dtype=int32)
+    >>> metres.values(np.array([[-2, 0, 2]], np.int32), np.dtype("f8"))
+    array([[ 99., 100., 101.]])
+
+    Attributes
+    ----------
+    rule : str
+        "affine" or "decimal", see the module.
+    origin, step : float
+        Of that rule; in the unit of the values where it is affine.
+    """
 
     rule: str
     origin: float
@@ -49,7 +63,7 @@ class Lattice:
         return 1.0 / self.step if self.rule == "decimal" else self.step
 
     def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any], fraction: int = 0) -> NDArray[Any]:
-        """Values of lattice coordinates over 2**fraction, any shape, in the given dtype."""
+        """Values of lattice coordinates over 2**fraction, int32 of any shape, in the given dtype."""
         q = coordinates.astype(np.float64)
         q *= 2.0**-fraction
         if self.rule == "decimal":
@@ -61,7 +75,7 @@ class Lattice:
         return to_dtype(q, dtype)
 
     def coordinates(self, values: NDArray[Any], out: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
-        """Nearest lattice coordinates of values of any dtype, into an array of their shape or a new one."""
+        """Nearest lattice coordinates of values of any dtype, int32, into an array of their shape or a new one."""
         if out is None:
             out = np.empty(values.shape, np.int32)
         height = max(1, _STRIP * len(values) // values.size)
@@ -196,7 +210,7 @@ def _checked(flat: NDArray[Any], lattice: Lattice) -> Lattice | None:
 def offset_lattice(values: NDArray[Any]) -> Lattice | None:
     """A lattice off which float32 values, shape (row, column), lie by as much as their neighbours do, or None.
 
-    Its step divides most differences of neighbours in a row, but for their rounding. Lossy compressors that quantise
+    Its step divides most differences of neighbours in a row, but for their rounding. Lossy compressors that quantize
     blocks of a raster leave such values: the lattice does not restore them, but `residual` finds the offsets.
     """
     if values.dtype != np.float32 or values.ndim != 2 or values.shape[1] < 2:

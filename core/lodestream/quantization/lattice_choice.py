@@ -12,10 +12,10 @@ from ..errors import InputError
 from ..target import Tolerance
 from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
 
-__all__ = ["DEFAULT_STEPS", "attribute_lattices", "channel_of", "choose_lattices"]
+__all__ = ["DEFAULT_DIVISIONS", "attribute_lattices", "channel_of", "choose_lattices"]
 
-#: Steps of the widest extent, unless something else is known to cost less.
-DEFAULT_STEPS = 2.0**20
+#: Lattice steps of the widest extent, unless something else is known to cost less.
+DEFAULT_DIVISIONS = 2.0**20
 #: Sums and differences of reconstructions on their way to such values do not overflow.
 LARGEST_VALUE = 1e300
 
@@ -31,7 +31,7 @@ def choose_lattices(
     precision: float | None,
     bits: int | None = None,
     *,
-    steps: float = DEFAULT_STEPS,
+    divisions: float = DEFAULT_DIVISIONS,
 ) -> list[Lattice]:
     """A lattice for each channel.
 
@@ -45,14 +45,19 @@ def choose_lattices(
         leaves out is stored.
     bits : int, optional
         Keep no more of any channel than so many bits of its range.
-    steps : float
-        Into how many the widest extent is divided where there is neither a lattice nor a precision.
+    divisions : float
+        Into how many lattice steps the widest extent is divided where there is neither a lattice nor a precision.
 
     Returns
     -------
     list of Lattice
         The channels' own lattices where found (attributes: always when found; coordinates: unless the precision
         allows a coarser one), otherwise one step for all coordinates.
+
+    Raises
+    ------
+    InputError
+        If a value is above `LARGEST_VALUE` in magnitude.
     """
     count = 1 if points.ndim == 2 else points.shape[2]
     spans = []
@@ -66,13 +71,13 @@ def choose_lattices(
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:
         raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
-    wanted = widest / steps if precision is None else _step_for(points.dtype, precision, geometric, spans)
+    wanted = widest / divisions if precision is None else _step_for(points.dtype, precision, geometric, spans)
     lattices = []
     for channel in range(count):
         low, high = spans[channel]
         own = find_lattice(channel_of(points, channel))
         if channel >= geometric:
-            lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_STEPS))
+            lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_DIVISIONS))
         elif own is not None and (precision is None or own.spacing >= wanted):
             lattices.append(own)
         else:

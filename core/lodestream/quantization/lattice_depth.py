@@ -16,17 +16,17 @@ from ..grid.layout import Layout
 from ..transform.pyramid import allocate, forward
 from .lattice import LATTICE_BITS, precision_lattice
 
-__all__ = ["default_steps"]
+__all__ = ["default_divisions"]
 
-#: Steps of the widest extent, in the order of preference, and bits a value that a finer division must save.
+#: Lattice steps of the widest extent, in the order of preference, and bits a value that a finer division must save.
 _USUAL = 2.0**20
 _FINEST = 2.0**LATTICE_BITS - 8
 _WORTH = 0.7
 _WINDOW = 256
 
 
-def default_steps(channels: Sequence[NDArray[Any]]) -> float:
-    """Into how many steps to divide the widest extent of coordinates without a lattice.
+def default_divisions(channels: Sequence[NDArray[Any]]) -> float:
+    """Into how many lattice steps to divide the widest extent of coordinates without a lattice.
 
     Parameters
     ----------

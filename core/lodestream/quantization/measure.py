@@ -74,7 +74,7 @@ def _difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def extent_of(points: NDArray[Any], geometric: int) -> float:
-    """Range of heights, or diagonal of the box of the points."""
+    """Range of heights, shape (row, column), or diagonal of the box of points, shape (row, column, channel)."""
     if points.ndim == 2:
         return float(points.max()) - float(points.min())
     flat = points[..., :geometric].reshape(-1, geometric)

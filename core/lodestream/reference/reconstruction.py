@@ -48,13 +48,13 @@ def reconstruct(
             rows, columns = grid.shape(upper)
             for axis in (1, 0):
                 if grid.stepped(upper, axis):
-                    patch = array[:rows, :columns]
+                    corner = array[:rows, :columns]
                     line = grid.axes[upper][axis]
                     pair = _pair(header, channel, upper, number, axis)
                     if axis:
-                        patch[:] = inverse(np.ascontiguousarray(patch.T), line, pair).T
+                        corner[:] = inverse(np.ascontiguousarray(corner.T), line, pair).T
                     else:
-                        patch[:] = inverse(patch, line, pair)
+                        corner[:] = inverse(corner, line, pair)
     return arrays
 
 

@@ -58,7 +58,7 @@ def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | N
 
 
 def agree(original: NDArray[Any], restored: NDArray[Any]) -> bool:
-    """Whether contiguous arrays of one dtype are the same bit for bit."""
+    """Whether contiguous arrays of one dtype and shape are the same bit for bit."""
     unsigned = np.dtype(f"u{original.dtype.itemsize}")
     return np.array_equal(original.view(unsigned), restored.view(unsigned))
 
@@ -73,6 +73,7 @@ def decode_chunk(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     """
     if not data:
         return restored.copy()
+    # The encoder stores plain values where nothing is shorter: longer data are damaged, or meant to cost time.
     if len(data) > 1 + restored.nbytes:
         raise CorruptStreamError(
             f"expected at most {1 + restored.nbytes} bytes of residual for {restored.size} values, got {len(data)}",
@@ -103,7 +104,7 @@ def decode_chunk(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
     coded = np.frombuffer(data, np.uint8, length, start_of_coded).copy()
     stored = np.frombuffer(data[end:], np.uint8).copy()
     used = code_differences(True, line, differences, exponents, marks, most, count, coded, stored)[1]
-    if used != stored.size:
+    if used != stored.size:  # checked behind the kernel, since only the coded lengths tell how many are needed
         raise CorruptStreamError(f"expected {used} bytes of lower bits, got {stored.size}", offset + end)
     with np.errstate(over="ignore"):
         values = from_line(rule, argument, line + differences, dtype)
@@ -122,11 +123,11 @@ def _with_differences(
         patterns = original.view(specials.dtype)
         special = ~np.isfinite(original)
         marks[special] = np.searchsorted(specials, patterns[special]) + 1
-        original = np.where(special, restored, original)
+        original = np.where(special, restored, original)  # no difference: their patterns are listed
     with np.errstate(over="ignore"):
         differences = to_line(rule, argument, original)[0] - line
     if (differences == np.iinfo(np.int64).min).any():
-        return []
+        return []  # its magnitude is no int64, so that the kernel could not code it: another rule, or plain values
     most = int(most_bits(differences, exponents, marks))
     # A value takes at most 90 decisions of 11 bits.
     coded = np.empty(64 + 128 * original.size, np.uint8)

@@ -62,5 +62,5 @@ def code_differences(
 
 
 def most_bits(differences: _Ints, exponents: NDArray[np.int32], marks: NDArray[np.uint8]) -> int:
-    """The largest sum of a difference's bits and its exponent, of those that have no mark."""
+    """The largest sum of a difference's bits and its exponent, of those that have no mark; all of shape (value,)."""
     return kernels.most_bits(differences, exponents, marks)

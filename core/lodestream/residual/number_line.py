@@ -43,12 +43,14 @@ def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDAr
     magnitudes = signed & ((1 << (bits - 1)) - 1)
     exponents = (magnitudes >> (23 if bits == 32 else 52)).astype(np.int32)
     magnitudes >>= argument
+    # Below -0.0, whose place is -1, patterns of negative floats run downwards: neighbours on the line differ by one.
     return np.where(signed < 0, ~magnitudes, magnitudes), exponents
 
 
 def from_line(rule: int, argument: int, places: _Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Undo `to_line`: values of ``dtype``, shape (value,); the places may be any numbers."""
     if rule == DECIMALS:
+        # A hostile chunk may name any place; honest ones are whole numbers that float64 holds.
         whole = np.clip(places, -(2**53), 2**53).astype(np.float64)
         with np.errstate(over="ignore"):
             return np.asarray((whole / 10.0**argument).astype(dtype))
@@ -76,6 +78,7 @@ def decimal_places(values: NDArray[Any]) -> int | None:
     if values.dtype.kind != "f" or not values.size:
         return None
     every = np.arange(MOST_DECIMALS + 1)
+    # Most floats fail within a few values: all scales are tried on a sample, and all values with the first that holds.
     some = every[_are_decimals(values[:: max(1, values.size // _SAMPLE)], every)]
     return int(some[0]) if some.size and _are_decimals(values, some[:1])[0] else None
 

@@ -1,4 +1,4 @@
-"""Values that lie on one lattice chunk by chunk, each chunk with an offset of its own, as some compressors leave them.
+"""Values that lie on one lattice stretch by stretch, each with an offset of its own, as some compressors leave them.
 
 LERC, for one, quantises blocks of 8 x 8 heights from the least of each. Such values are float32(n step + offset) with
 a whole n, and the offset is that of a value before, more often than not of the last one. What is known of an offset is
@@ -56,13 +56,13 @@ def code_offsets(
 
 
 def places_of(values: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Patterns as whole numbers in the order of the values."""
+    """Patterns of values of any shape as whole numbers in the order of the values."""
     signed = values.view(np.int32).astype(np.int64)
     return np.where(signed < 0, ~(signed & 0x7FFFFFFF), signed)
 
 
 def values_at(places: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Undo `places_of`; places may be any numbers."""
+    """Undo `places_of`, of any shape; places may be any numbers."""
     inside = np.clip(places, -(2**31), 2**31 - 1)
     patterns = np.where(inside < 0, ~inside | 2**31, inside)
     return patterns.astype(np.uint32).view(np.float32)

@@ -188,7 +188,7 @@ class Download:
             self.reception.stopped_for = why
         if self._connection.state in (State.OPENED, State.STREAMING):
             self._outbox.append(self._connection.send(Stop()))
-        self._turning = False
+        self._turning = False  # a stop that is under way in order to open again serves: its end is now the last
 
     def tick(self, now: float) -> float | None:
         """Set the time, in seconds of any clock that does not go back; stops when the target's time limit is over.
@@ -240,7 +240,7 @@ class Download:
         )
 
     def _open(self, cached: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
-        self.window.grant(self.window.size)
+        self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
         return self._connection.send(Open(self.reception.target, self.window.size, cached, container))
 
     def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:

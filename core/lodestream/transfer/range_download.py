@@ -158,6 +158,8 @@ class RangeDownload:
             If the server does not support Range, or the answer does not match the request.
         RemoteError
             With the code ``other-container`` if the file has changed.
+        TruncatedStreamError
+            If the file ends before what was asked for.
         """
         asked = self._asked
         if asked is None:
@@ -298,7 +300,7 @@ class RangeDownload:
 
         def read(offset: int, length: int) -> bytes:
             for gap in store.ranges.missing(offset, min(length, size - offset)):
-                raise _MissingError(*gap)
+                raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
 
         self._needed = None

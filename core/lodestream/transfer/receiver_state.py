@@ -192,6 +192,7 @@ class ReceiverState:
         RemoteError
             With the code ``other-container`` if it differs from the one before.
         """
+        # What is cached is of one container: bytes of another would be taken for it, and decode to nothing of either.
         if (self.container or container) != (container or self.container) or self.size not in (None, size):
             raise RemoteError(
                 "other-container",
@@ -210,6 +211,7 @@ class ReceiverState:
         """
         check_length(metadata[1], metadata[0], section=True)
         self.planned, self._service = planned, (index, metadata)
+        # Where the file comes from its first byte on, its order is known before its index is.
         if prefix and self._order is None:
             self._follow([(0, planned)], [], [metadata])
         return self._advance()
@@ -268,20 +270,21 @@ class ReceiverState:
         self.data_bytes += len(data)
         views = []
         for start, length in list(self.cached.missing(offset, len(data))):
-            piece = data[start - offset : start - offset + length]
+            new = data[start - offset : start - offset + length]
+            # A hostile sender could send bytes one by one: each range that is kept counts for itself too.
             self._kept += length + _PIECE
             if self._kept > self.decoder.capacity.bytes:
                 raise TooLargeError(f"expected at most {self.decoder.capacity.bytes:,} bytes of a container, got more")
             self.cached.add(start, length)
             self._count(start, length)
             if self._sink is not None:
-                self._sink(start, piece)
+                self._sink(start, new)
             if self._store is not None:
-                self._store.write(start, piece)
+                self._store.write(start, new)  # the decoder gets it in the plan's order, from `_advance`
             else:
-                self._copy(start, piece)
+                self._copy(start, new)
                 self._fed.add(start, length)
-                views += self.decoder.feed_at(start, piece)
+                views += self.decoder.feed_at(start, new)
         return views + self._advance()
 
     def missing(self) -> Iterator[tuple[int, int]]:
@@ -382,7 +385,7 @@ class ReceiverState:
                 self._order.popleft()
             self._fed.add(offset, size)
             views += self.decoder.feed_at(offset, self._store.read(offset, size))
-            if self.plan is not None:
+            if self.plan is not None:  # before, the same bytes may be needed again to read the header or the index
                 self._store.used(offset, size)
         return views
 
@@ -414,12 +417,13 @@ class ReceiverState:
         place = self._service[0]
         header = self.decoder.header
         if header is None:
+            # Only to read the header: the real decoder must be fed in the order that is not known yet.
             scratch = Decoder(
                 selection_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
             )
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):
-            return None
+            return None  # the section of masks, without which the index cannot be counted through, is not there yet
         self.decoder.capacity.take(INDEX_GROWTH * place[1])
         return self.follow(index_from(store.read(*place), ByteRange(*place), header))

@@ -144,7 +144,7 @@ class Sender:
             return
         slice_ = self._slices[0]
         if slice_.offset != wanted.offset or slice_.length < wanted.length:
-            return
+            return  # it was read for a plan that another `Open` has replaced since
         if len(data) != wanted.length:
             raise CorruptStreamError(f"expected {wanted.length} bytes, got {len(data)}", wanted.offset)
         self._slices.popleft()

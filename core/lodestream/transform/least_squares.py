@@ -60,7 +60,10 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArray[np.float64]]:
-    """All levels of a surface, from the coarsest to the input itself (as float64); see `coarsen`."""
+    """All levels of a surface, shape (H, W) or (H, W, C), from the coarsest to the input itself (as float64).
+
+    See `coarsen`.
+    """
     levels = [_as_floats(points)]
     while (coarser := _coarsen(levels[-1], closed)).shape != levels[-1].shape:
         levels.append(coarser)

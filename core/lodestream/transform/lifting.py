@@ -58,13 +58,17 @@ def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
 
 
 def inverse_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
-    """Undo `forward_step` in place; what comes out is within +-`CLAMP`, for any magnitudes below 2^29."""
+    """Undo `forward_step` in place, on shape (row, column).
+
+    What comes out is within +-`CLAMP`, for any magnitudes below 2^29.
+    """
     _step(values, axis, step, predictor, True)
 
 
 def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: bool) -> None:
     if not step.midpoints:
         return
+    # A transposed or reversed view: the kernel takes rows with their samples side by side.
     if values.strides[1] != values.itemsize or values.strides[0] < 0:
         packed = values.copy(order="C")
         _step(packed, axis, step, predictor, inverse)
@@ -77,7 +81,7 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
     for part in _parts(axis, lines, step.length):
         plane = values[:, part] if axis == 0 else values[part]
         done = 0
-        while done < step.run:
+        while done < step.run:  # very long axes take several calls, between which an interruption is heard
             done = kernels.lift(inverse, axis, plane, step.midpoints, step.run, table, *predictor, done, work)
 
 

@@ -45,7 +45,7 @@ _NORM_LEVELS = 6
 
 
 def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
-    """An int32 array for a channel's coefficients.
+    """An int32 array of this shape, (row, column), for a channel's coefficients.
 
     It is a window of a slightly wider one: rows then never lie a power of two apart, where a column's samples would
     compete for the same lines of the cache.
@@ -55,7 +55,7 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
 
 
 def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
-    """A copy from `allocate`."""
+    """A copy from `allocate`, shape (row, column)."""
     copy = allocate(array.shape)
     copy[...] = array
     return copy
@@ -81,6 +81,7 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     fitted = set(fitted_steps(layout))
     for level in range(layout.levels, 0, -1):
         for axis in range(2):
+            # All patches have one predictor, and all interfaces another: a short side alone is no sample to fit it to.
             corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
             for which in (axis, INTERFACES) if axis == 0 else (axis,):
                 if fit and (level - 1, which) in fitted:
@@ -111,9 +112,10 @@ def inverse(
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
-    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
-    lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
-    ``level``.
+    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2). Without ``whole``,
+    the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count lattice steps, those
+    above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than ``level``.
+
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
 
@@ -125,6 +127,7 @@ def inverse(
     for finer in range(1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
+                # The first level with details missing: from here on in eighths, clipped to what the kernel takes.
                 corner = _corner(arrays[k], layout.shape(k, whole))
                 np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
                 corner <<= FRACTION_BITS
@@ -136,9 +139,12 @@ def inverse(
 def inverse_level(
     array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
 ) -> None:
-    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place."""
+    """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place.
+
+    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2).
+    """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
-    for axis in (1, 0):
+    for axis in (1, 0):  # the forward transform's axes in reverse: rounding makes the order matter
         if steps[axis].midpoints:
             inverse_step(
                 corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
@@ -146,7 +152,10 @@ def inverse_level(
 
 
 def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
-    """Turn a level of a grid into nodes of the level below and details before the third step, in place."""
+    """Turn a level of a grid, shape (row, column), into nodes of the level below and details before the third step.
+
+    In place; the details are what a third step that predicts nothing would leave.
+    """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in range(2):
         if steps[axis].midpoints:
@@ -177,7 +186,10 @@ def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: t
 
 
 def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches."""
+    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches.
+
+    The arrays have the shape (row, column) of each grid.
+    """
     for k, grid in enumerate(layout.grids):
         rows, columns = layout.shape(k, 0)
         for side, source in enumerate(grid.sources):
@@ -201,7 +213,10 @@ def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source,
 def take_details(
     arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], patch: int, level: int
 ) -> None:
-    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already."""
+    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already.
+
+    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2).
+    """
     grid, steps = layout.grids[patch], layout.steps(patch, level)
     if grid.interface:
         return
@@ -217,6 +232,7 @@ def take_details(
         if points.size == 1:
             target[step.coarse :] = 0  # a pole
             continue
+        # The interface is whole at this level, so its own forward step tells the details: they are never sent twice.
         line = points.reshape(1, -1).copy()
         forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
         target[step.coarse :] = line[0, step.coarse :]
@@ -233,24 +249,24 @@ class _Sample(NamedTuple):
     details: NDArray[np.int32]
     largest: int
 
-    def patches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
+    def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
         """Factors and details, so many as a kernel takes at once."""
         for start in range(0, self.details.size, _AT_ONCE):
-            patch = slice(start, start + _AT_ONCE)
-            yield self.first[patch], self.second[patch], self.details[patch]
+            batch = slice(start, start + _AT_ONCE)
+            yield self.first[batch], self.second[batch], self.details[batch]
 
     def bits(self, a: int, b: int) -> float:
         """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
         total = np.zeros(1)
-        for patch in self.patches():
-            kernels.predictor_bits(*patch, self.largest, a, b, total)
+        for batch in self.batches():
+            kernels.predictor_bits(*batch, self.largest, a, b, total)
         return float(total[0])
 
     def moments(self, a: float, b: float, weighted: bool) -> list[float]:
         """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
         sums = np.zeros(5)
-        for patch in self.patches():
-            kernels.predictor_moments(*patch, a, b, weighted, sums)
+        for batch in self.batches():
+            kernels.predictor_moments(*batch, a, b, weighted, sums)
         found: list[float] = sums.tolist()
         return found
 
@@ -265,6 +281,7 @@ def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]
             costs[ab] = sample.bits(*ab)
         return costs[ab]
 
+    # Bits are not convex in (a, b), and bumpy from rounding: several starts, then a search in steps that get smaller.
     best = min([*_CANDIDATES, *_least_squares(sample)], key=bits)
     for reach in (4, 2, 1):
         around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
@@ -294,9 +311,9 @@ def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sam
     largest, height = 0, max(1, _AT_ONCE // width)
     for start in range(0, count, height):
         stop = min(start + height, count)
-        patch = slice(start * width, stop * width)
+        batch = slice(start * width, stop * width)
         planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
-        largest = max(largest, kernels.predictor_factors(*planes, first[patch], second[patch], details[patch]))
+        largest = max(largest, kernels.predictor_factors(*planes, first[batch], second[batch], details[batch]))
     return _Sample(first, second, details, largest)
 
 
@@ -308,7 +325,7 @@ def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
         uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
-            break
+            break  # one factor is all but a multiple of the other: nothing tells a from b
         a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
         found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
     return found
@@ -330,6 +347,7 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
         for patch, grid in enumerate(layout.grids):
             for side, source in enumerate(grid.sources):
                 if source is not None and source.grid == number and not grid.interface:
+                    # Across the side its points count as nodes of the patch; a pole's only point does so all along it.
                     across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
                     return norms * points * _line_norms(layout, predictors, patch)[across, :, 0][:, None, None]
     return norms

@@ -16,7 +16,7 @@ import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import RemoteProtocolError
 from lodestream_client import sync
-from lodestream_client.requests import answers, api
+from lodestream_client.requests import answers, api, calls
 
 from ..conftest import Run
 from ..scripted import Answer, Asked, document, scripted
@@ -50,7 +50,7 @@ def test_no_more_is_read_than_an_answer_may_have(asynchronous: bool) -> None:
 
 
 def test_the_bounds_are_what_the_manual_says() -> None:
-    assert api.Call("GET", "").most == answers.LONGEST_ANSWER == 16 * 2**20
+    assert calls.Call("GET", "").most == answers.LONGEST_ANSWER == 16 * 2**20
     assert api._LONGEST_LIST == 64 * 2**20
 
 

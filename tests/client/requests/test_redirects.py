@@ -15,7 +15,7 @@ import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import RemoteProtocolError
 from lodestream_client import sync
-from lodestream_client.requests import addresses, api
+from lodestream_client.requests import addresses, calls
 
 from ..conftest import Run
 from ..files import ranged
@@ -145,10 +145,10 @@ def test_a_token_for_http_is_not_one_for_https(landed: str) -> None:
         return httpx.Response(401) if len(shown) > 1 else httpx.Response(307, headers={"location": landed})
 
     given = "http://localhost"
-    call = api.Call("GET", f"{given}/v1/surfaces")
-    options = {**api.client_options(given), "transport": httpx.MockTransport(answer)}
+    call = calls.Call("GET", f"{given}/v1/surfaces")
+    options = {**calls.client_options(given), "transport": httpx.MockTransport(answer)}
     with httpx.Client(**options) as http:
-        http.request(**api.request_options(call, given, TOKEN))
+        http.request(**calls.request_options(call, given, TOKEN))
     assert shown == [SHOWN, None]
 
 

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from lodestream.errors import LodestreamError
 from lodestream.planning.byte_ranges import RangeSet
 from lodestream_client.stream import cache
-from lodestream_client.stream.cache import Part
+from lodestream_client.stream.cache import CacheFile
 
 SIZE = 5000
 FILE = Random(1).randbytes(SIZE)
 NAME, OTHER = "ab" * 32, "cd" * 32
 
 
-def fill(part: Part, places: list[tuple[int, int]]) -> RangeSet:
+def fill(part: CacheFile, places: list[tuple[int, int]]) -> RangeSet:
     """Keep what is not kept yet of these places; all of it."""
     for place in places:
         for offset, length in list(part.ranges.missing(*place)):
@@ -28,7 +28,7 @@ def fill(part: Part, places: list[tuple[int, int]]) -> RangeSet:
     return part.ranges.copy()
 
 
-def check(part: Part, expected: RangeSet) -> None:
+def check(part: CacheFile, expected: RangeSet) -> None:
     assert part.ranges == expected
     for offset, length in expected:
         assert part.read(offset, length) == FILE[offset : offset + length]
@@ -45,15 +45,15 @@ def test_what_was_written_is_there_again(
     tmp_path_factory: pytest.TempPathFactory, first: list[tuple[int, int]], second: list[tuple[int, int]]
 ) -> None:
     folder = tmp_path_factory.mktemp("cache")
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     kept = fill(part, first)
     check(part, kept)
     part.close()
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     check(part, kept)
     kept = fill(part, second)
     part.close()
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     check(part, kept)
     part.close()
 
@@ -63,7 +63,7 @@ def test_a_file_that_was_cut_or_damaged_gives_what_is_whole(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     folder = tmp_path_factory.mktemp("cache")
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     kept = [part.ranges.copy()]
     ends = [0]
     for offset in range(0, SIZE, 1000):
@@ -80,38 +80,38 @@ def test_a_file_that_was_cut_or_damaged_gives_what_is_whole(
         content[place] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
     whole = sum(end <= place for end in ends) - 1
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     check(part, kept[whole])
     check(part, fill(part, [(0, SIZE)]))
     part.close()
-    part = Part(folder, NAME, SIZE)
+    part = CacheFile(folder, NAME, SIZE)
     assert part.ranges == RangeSet([(0, SIZE)])
     part.close()
 
 
 def test_another_size_is_another_container(tmp_path: Path) -> None:
-    part = Part(tmp_path, NAME, SIZE)
+    part = CacheFile(tmp_path, NAME, SIZE)
     fill(part, [(0, 100)])
     part.close()
-    part = Part(tmp_path, NAME, SIZE + 1)
+    part = CacheFile(tmp_path, NAME, SIZE + 1)
     assert part.ranges.total == 0
     part.close()
 
 
 def test_one_at_a_time(tmp_path: Path) -> None:
-    part = Part(tmp_path, NAME, SIZE)
+    part = CacheFile(tmp_path, NAME, SIZE)
     with pytest.raises(LodestreamError, match="another program"):
-        Part(tmp_path, NAME, SIZE)
-    other = Part(tmp_path, OTHER, SIZE)
+        CacheFile(tmp_path, NAME, SIZE)
+    other = CacheFile(tmp_path, OTHER, SIZE)
     other.discarded = True
     other.close()
     assert not (tmp_path / f"{OTHER}.part").exists()
     part.close()
-    Part(tmp_path, NAME, SIZE).close()
+    CacheFile(tmp_path, NAME, SIZE).close()
 
 
 def test_a_disk_that_is_full_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    part = Part(tmp_path, NAME, SIZE)
+    part = CacheFile(tmp_path, NAME, SIZE)
     monkeypatch.setattr(os, "pwrite", lambda *_: 3)
     with pytest.raises(OSError, match="expected to write"):
         part.write(0, FILE[:100])
@@ -125,7 +125,7 @@ def test_what_nobody_comes_back_to_is_removed(tmp_path: Path) -> None:
     for name, age in ((old, 40), (new, 20), (in_use, 40), ("download", 40), (foreign, 40)):
         path = tmp_path / f"{name}.part"
         if not path.exists():
-            part = Part(tmp_path, name, SIZE)
+            part = CacheFile(tmp_path, name, SIZE)
             fill(part, [(0, 100)])
             if name != in_use:
                 part.close()
@@ -156,7 +156,7 @@ def test_the_folder_is_the_users_or_the_one_named(monkeypatch: pytest.MonkeyPatc
 def test_a_name_from_a_server_leads_nowhere_else(tmp_path: Path, name: Any) -> None:
     folder = tmp_path / "one" / "two"
     with pytest.raises(LodestreamError, match="expected a container's name of 64 hexadecimal digits"):
-        Part(folder, name, SIZE)
+        CacheFile(folder, name, SIZE)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -164,7 +164,7 @@ def test_the_folder_and_the_file_are_the_users_alone(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     before = os.umask(0)
     try:
-        part = Part(folder, NAME, SIZE)
+        part = CacheFile(folder, NAME, SIZE)
     finally:
         os.umask(before)
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -182,11 +182,11 @@ def test_no_link_is_followed(tmp_path: Path) -> None:
     for target in (victim, nowhere):
         path.symlink_to(target)
         with pytest.raises(OSError, match="symbolic links"):
-            Part(folder, NAME, SIZE)
+            CacheFile(folder, NAME, SIZE)
         path.unlink()
     path.hardlink_to(victim)
     with pytest.raises(OSError, match="it is not changed"):
-        Part(folder, NAME, SIZE)
+        CacheFile(folder, NAME, SIZE)
     assert victim.read_bytes() == b"of somebody else"
     assert not nowhere.exists()
 
@@ -196,22 +196,22 @@ def test_no_other_file_is_written(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / f"{NAME}.part"
     path.write_bytes(content)
     if content == b"LODE":  # what a program that was killed may leave
-        Part(tmp_path, NAME, SIZE).close()
+        CacheFile(tmp_path, NAME, SIZE).close()
         assert not path.exists()
         return
     with pytest.raises(OSError, match="it is not changed"):
-        Part(tmp_path, NAME, SIZE)
+        CacheFile(tmp_path, NAME, SIZE)
     assert path.read_bytes() == content
 
 
 def test_what_is_no_file_is_no_wait(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / f"{NAME}.part")
     with pytest.raises(OSError, match="it is not changed"):
-        Part(tmp_path, NAME, SIZE)
+        CacheFile(tmp_path, NAME, SIZE)
 
 
 def test_one_that_is_removed_while_it_is_opened_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = Part(tmp_path, NAME, SIZE)
+    first = CacheFile(tmp_path, NAME, SIZE)
     lock = fcntl.flock
 
     def wait_for_it(handle: int, how: int) -> None:
@@ -221,7 +221,7 @@ def test_one_that_is_removed_while_it_is_opened_is_made_again(tmp_path: Path, mo
         lock(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", wait_for_it)
-    second = Part(tmp_path, NAME, SIZE)
+    second = CacheFile(tmp_path, NAME, SIZE)
     fill(second, [(0, 100)])
     second.close()
     assert (tmp_path / f"{NAME}.part").stat().st_size > 100

@@ -95,7 +95,7 @@ def test_the_plain_file_of_any_web_server() -> None:
     st.sampled_from([None, 500, 4096]),
     st.sampled_from([None, 5000.0]),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_whatever_breaks_the_surface_comes_once_and_whole(
     acts: dict[int, Act], transport: Any, window: int | None, rate: float | None
 ) -> None:
@@ -118,7 +118,7 @@ def test_whatever_breaks_the_surface_comes_once_and_whole(
     st.sampled_from(["stop", "close"]),
     st.sampled_from(["auto", "ws", "http"]),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_stop_at_any_time_is_obeyed(acts: dict[int, Act], number: int, stop: Act, transport: Any) -> None:
     world = World({**acts, number: stop}, transport=transport, window=700, close_timeout=3.0, silence=2.0, deadline=1e6)
     try:

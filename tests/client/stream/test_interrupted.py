@@ -45,7 +45,7 @@ CAME = 100_000
 
 # Half of the file is written, then nothing happens.
 STALLED = """\
-import sys, time, lodestream.formats as formats
+import sys, time, lodestream.formats.writing as formats
 whole = formats.write_stream
 def stall(surface, name, file):
     class Half:
@@ -390,7 +390,7 @@ def test_two_pulls_of_one_surface(surface: str, terrain: Terrain, folder: Path, 
     assert identity.name is not None
     assert identity.size is not None
     out = tmp_path / "o.npy"
-    part = cache.Part(folder, identity.name, identity.size)
+    part = cache.CacheFile(folder, identity.name, identity.size)
     try:
         code, _, stderr = run("pull", surface, out)
         assert code == 0

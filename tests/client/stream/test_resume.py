@@ -298,7 +298,7 @@ def test_two_pulls_do_not_write_the_same_file(run: Run, surface: str, folder: Pa
     identity = sync.identify(surface)
     assert identity.name is not None
     assert identity.size is not None
-    part = cache.Part(folder, identity.name, identity.size)
+    part = cache.CacheFile(folder, identity.name, identity.size)
     code, _, stderr = run("pull", surface, tmp_path / "o.npy", "--resume")
     assert code == 1
     assert "another program is receiving the same surface" in stderr
@@ -323,7 +323,7 @@ def test_bytes_that_no_checksum_of_ours_covers_are_not_met_twice(
     identity = sync.identify(surface)
     assert identity.name is not None
     assert identity.size is not None
-    part = cache.Part(folder, identity.name, identity.size)
+    part = cache.CacheFile(folder, identity.name, identity.size)
     part.write(0, bytes(2000))
     part.close()
     code, _, stderr = run("pull", surface, tmp_path / "o.npy", "--resume")

@@ -95,7 +95,9 @@ class World:
         with patch("random.uniform", lambda least, most: most / 2):
             while (effect := self.core.effect) is not None:
                 self.step(effect)
-                while (view := self.session.next_view()) is not None:
+                while (view := self.core.next_view()) is not None:
+                    if self.session.transports.transport == "ws":
+                        assert self.session.messages() == [], "credit does not wait for whoever looks at a view"
                     self.views.append(view)
         return self
 

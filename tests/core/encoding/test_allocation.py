@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream.encoding.allocation import TileCurve, _layer_ends, assign_layers, step_slopes
+from lodestream.encoding.allocation import TileCurve, _layer_ends, assign_layers, hull_slopes
 from lodestream.grid.layout import Layout
 
 
@@ -58,7 +58,7 @@ def test_layers_add_every_plane_once_and_parents_never_after_children(layout: La
 def test_slopes_fall_towards_lower_planes_and_keep_the_sum(planes: int, worth: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     curve = TileCurve(0, 0, 100 * rng.random(planes) + 0.01, rng.normal(size=planes))
-    slopes = step_slopes(curve, lambda slope: worth)
+    slopes = hull_slopes(curve, lambda slope: worth)
     assert slopes.shape == (planes,)
     assert (np.diff(slopes[::-1]) <= 1e-12).all()
     assert np.isclose((slopes * curve.bits).sum(), curve.gains.clip(0).sum())
@@ -68,8 +68,8 @@ def test_passes_are_one_step_where_two_would_save_less_than_a_segment_takes() ->
     # Of 100 bits each, the first worth 3 a bit and the second 1: where both come together, two steps save
     # 100 * 100 * (3 - 1) / (3 * 100 + 1 * 100) = 50 bits.
     curve = TileCurve(0, 0, np.array([100.0, 100.0]), np.array([100.0, 300.0]))
-    assert step_slopes(curve, lambda slope: 49.0).tolist() == [1.0, 3.0]
-    assert step_slopes(curve, lambda slope: 51.0).tolist() == [2.0, 2.0]
+    assert hull_slopes(curve, lambda slope: 49.0).tolist() == [1.0, 3.0]
+    assert hull_slopes(curve, lambda slope: 51.0).tolist() == [2.0, 2.0]
 
 
 def many_tiles(tiles: int = 500, passes: int = 16) -> tuple[Layout, list[TileCurve]]:

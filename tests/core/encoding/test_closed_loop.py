@@ -49,7 +49,7 @@ def check(surface: ls.Surface, base: int) -> None:
         for reconstruction, grid in zip(reconstructions, grids, strict=True):
             assert np.array_equal(reconstruction, grid)
         distance = np.abs(reconstructions[-1] - lattice_coordinates(prepared, number, lattice)[-1]).max()
-        assert distance < 8 * base + 8  # of the last part: the two belong to each other
+        assert distance < 8 * base + 8  # of the last patch: the two belong to each other
 
 
 @settings(max_examples=30)

@@ -311,7 +311,7 @@ def test_a_precision_leaves_attributes_as_they_are() -> None:
     assert not index_of(container).header.exact
 
 
-def test_pictures_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
+def test_reconstructions_of_the_widest_lattices_have_the_errors_that_are_told() -> None:
     """Their coefficients and nodes reach what reconstructions in eighths of a step are kept within."""
     rng = np.random.default_rng(8)
     points = rng.choice([-(2**23), 0, 1, 2**23 - 1], (70, 90), p=[0.45, 0.05, 0.05, 0.45])

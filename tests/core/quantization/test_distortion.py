@@ -49,10 +49,10 @@ def test_values_are_those_of_the_lattice_bit_for_bit(dtype: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_distances_are_those_of_the_picture(dtype: str) -> None:
+def test_distances_are_those_of_the_reconstruction(dtype: str) -> None:
     for shape, geometric in itertools.product([(259, 515), (1, 3), (3, 1025)], (1, 2, 3)):
         numbers = coordinates((geometric, *shape))
-        # Where there are many parts it is their sums that count, and every third lattice is enough.
+        # Where there are many cells it is their sums that count, and every third lattice is enough.
         step = 3 if min(shape) > kernels.PART_ROWS else 1
         for number, fraction in itertools.product(range(0, len(LATTICES), step), (0, 4)):
             lattices = (LATTICES[number:] + LATTICES[:number])[:geometric]
@@ -83,9 +83,9 @@ def plain_distances(
     totals = []
     rows, columns = original.shape[0], original.shape[1]
     for top, left in itertools.product(range(0, rows, PART_ROWS), range(0, columns, PART_COLUMNS)):
-        part = squares[top : top + PART_ROWS, left : left + PART_COLUMNS]
-        sums = np.zeros(part.shape[1])
-        for row in part:
+        cell = squares[top : top + PART_ROWS, left : left + PART_COLUMNS]
+        sums = np.zeros(cell.shape[1])
+        for row in cell:
             sums += row
         total = 0.0
         for own in sums.tolist():
@@ -113,7 +113,7 @@ def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.Monke
                 channels = [slice(k, k + 1) for k in range(geometric)]
                 expected += [plain_distances(original[..., own], shown[..., own], known) for own in channels]
             for at_once in (1, 16):
-                monkeypatch.setattr(distortion, "_PARTS", at_once)
+                monkeypatch.setattr(distortion, "_CELLS", at_once)
                 found = coordinate_distances([Original(original, mask)], lattices, [numbers], [3] * geometric)
                 assert found == expected
 

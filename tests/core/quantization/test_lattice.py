@@ -175,7 +175,7 @@ def test_integers_are_rounded_and_clipped_to_their_range(dtype: str) -> None:
         assert int(near[0]) == edge
 
 
-def test_float32_pictures_that_overshoot_stay_finite() -> None:
+def test_float32_reconstructions_that_overshoot_stay_finite() -> None:
     values = to_dtype(np.array([1e39, -1e39, 3.4028235e38]), np.dtype(np.float32))
     largest = np.finfo(np.float32).max
     np.testing.assert_array_equal(values, np.array([largest, -largest, largest], np.float32))

@@ -2,7 +2,7 @@
  * Limits on the memory that decoding a container may take, computed from its header before memory is allocated.
  *
  * A header of a few hundred bytes can announce a surface of billions of points. The numbers are those of the Python
- * library (`lodestream.capacity`); what differs is how much there is, since a program in a browser cannot ask.
+ * library (`lodestream.container.capacity`); what differs is how much there is, since a program in a browser cannot ask.
  */
 import { TooLargeError } from "../errors";
 import type { Shape } from "../types";

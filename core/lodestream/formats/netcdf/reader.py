@@ -56,7 +56,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read one variable, its coordinates, and those that options make attributes."""
+    """Read one variable, its coordinates, and those that options make attributes.
+
+    Raises
+    ------
+    OptionError
+        If the option ``resolution`` is given for a file that is not one of VMEC.
+    """
     with _opened(source) as dataset:
         if vmec.is_vmec(dataset) and not {"variable", "x", "y"} & set(source.options):
             check_allowed(("vmec",), source.allowed)

@@ -29,7 +29,13 @@ def is_vmec(dataset: Any) -> bool:
 
 
 def read(source: Source, dataset: Any) -> Surface:
-    """Evaluate the boundary at the points of the option ``resolution``, as x, y, z closed in both directions."""
+    """Evaluate the boundary at the points of the option ``resolution``, as x, y, z closed in both directions.
+
+    Raises
+    ------
+    FormatError
+        If it has more modes than a boundary of a stellarator has.
+    """
     rows, columns = _resolution(source)
     source.check_vertices(rows * columns, f"{rows} x {columns} points")
     xm, xn = (_row(dataset, name) for name in ("xm", "xn"))

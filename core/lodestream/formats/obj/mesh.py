@@ -220,7 +220,13 @@ class ObjFile:
         return tuple(found)
 
     def points(self) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-        """Points, (V, 3), and their attributes."""
+        """Points, (V, 3), and their attributes.
+
+        Raises
+        ------
+        FormatError
+            If there is none.
+        """
         if not self._values[b"v"]:
             raise FormatError("expected points (v x y z), got none")
         points = np.concatenate(self._values[b"v"])
@@ -229,7 +235,13 @@ class ObjFile:
         return np.ascontiguousarray(points[:, :3]), {COLOR: np.ascontiguousarray(points[:, 3:])}
 
     def mesh(self) -> Mesh:
-        """The points and faces, with what their corners have."""
+        """The points and faces, with what their corners have.
+
+        Raises
+        ------
+        FormatError
+            If a corner of a face names a normal, or a place in a texture, that there is not.
+        """
         points, attributes = self.points()
         corners = self._joined(0)
         of_corners: dict[str, CornerAttribute] = {}

@@ -32,6 +32,11 @@ def read(source: Source) -> Surface:
     """Read a mesh that is a structured surface, or lines that join points one after another to a curve, (N, 1, 3).
 
     Colours behind the coordinates of points, normals and places in a texture are attributes.
+
+    Raises
+    ------
+    FormatError
+        If nothing joins the points, or they are joined to no grid.
     """
     file = ObjFile(source)
     if file.face_count:

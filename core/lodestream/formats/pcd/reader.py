@@ -57,6 +57,11 @@ def read(source: Source) -> Surface:
     """Read an organised cloud (HEIGHT above 1); points with a coordinate that is not finite are holes.
 
     Packed colours (``rgb``, ``rgba``) become "color", normals "normal"; other fields keep their name.
+
+    Raises
+    ------
+    FormatError
+        If the file is not whole, or HEIGHT is 1: points without a grid.
     """
     with source.path.open("rb") as file:
         header = _read_header(file.read(_HEAD))

@@ -60,7 +60,7 @@ class Numbers(Protocol):
         """Read integers; None where there are none."""
 
     def array(self, place: int, count: int, layout: Layout, kind: str) -> NDArray[Any]:
-        """Give numbers of kind ``f`` or ``i``; a binary file's are not copied.
+        """Give numbers of kind ``f`` or ``i``, shape (count,); a binary file's are not copied.
 
         Raises
         ------

@@ -62,6 +62,11 @@ def read(source: Source) -> Surface:
     rows, float64 for text. Where IBLANK is 0 there is a hole; other values than 0 and 1 are kept as an attribute. A Q
     file gives ``density``, ``momentum`` and ``stagnation_energy``, and its reference numbers as ``scalars`` in the
     metadata; a function file ``function_1`` and so on.
+
+    Raises
+    ------
+    OptionError
+        If there are two Q files.
     """
     numbers = open_numbers(source.path)
     layout = find_layout(numbers, ["grid"], dimensions_of(source))

@@ -33,6 +33,11 @@ def read(source: Source, header: PlyHeader) -> Surface:
 
     Properties of the vertices beside x, y and z are attributes, and so are places in a texture that faces have for
     their corners. Other properties of faces, and other elements, are left out, which ``recognised`` says.
+
+    Raises
+    ------
+    FormatError
+        If faces have no list of vertices, or are no grid.
     """
     rows = {element.name: element.rows for element in header.elements}
     source.check_vertices(rows.get("vertex", 0), f"{number(rows.get('vertex', 0))} vertices")
@@ -60,7 +65,13 @@ def read(source: Source, header: PlyHeader) -> Surface:
 
 
 def read_curve(source: Source, header: PlyHeader) -> Surface:
-    """Read points that edges join one after another, as a curve of shape (N, 1, 3)."""
+    """Read points that edges join one after another, as a curve of shape (N, 1, 3).
+
+    Raises
+    ------
+    FormatError
+        If edges do not name two vertices each, or join them in no single line.
+    """
     tables = read_elements(source.path, header)
     points, attributes = _vertices(tables)
     source.check_vertices(len(points), f"{number(len(points))} vertices")

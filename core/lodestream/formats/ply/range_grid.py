@@ -28,6 +28,11 @@ def read(source: Source, header: PlyHeader) -> Surface:
     """Read the grid whose rows and columns ``obj_info`` tells; an empty list is a hole.
 
     Properties of the vertices beside x, y and z are attributes. Other lines of ``obj_info`` are not kept.
+
+    Raises
+    ------
+    FormatError
+        If the grid has another size than ``obj_info`` tells, or vertices lack a coordinate.
     """
     rows, columns = (_size(header, name) for name in _SIZES)
     source.check_vertices(rows * columns, f"a range grid of {rows} x {columns}")

@@ -17,7 +17,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read a range grid, or a mesh or curve that is a structured surface."""
+    """Read a range grid, or a mesh or curve that is a structured surface.
+
+    Raises
+    ------
+    FormatError
+        If nothing joins the vertices, or they are joined to no grid.
+    """
     header = read_header(source.path)
     names = [element.name for element in header.elements]
     if range_grid.ELEMENT in names:

@@ -27,7 +27,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the heights as float64, whatever their digits say."""
+    """Read the heights as float64, whatever their digits say.
+
+    Raises
+    ------
+    FormatError
+        If the size in its header is not two whole numbers, or GDAL cannot read the rest.
+    """
     header, length = _header(source)
     try:
         columns, rows = (int(header[key]) for key in (b"ncols", b"nrows"))

@@ -43,7 +43,13 @@ _MOST_BANDS = 1 << 12
 
 
 def require_rasterio(format_name: str) -> Any:
-    """The module rasterio, imported now."""
+    """The module rasterio, imported now.
+
+    Raises
+    ------
+    UnavailableError
+        If it is not installed; ``format_name`` is what the message says needs it.
+    """
     try:
         import rasterio
     except ImportError:

@@ -79,7 +79,13 @@ def require_pillow() -> Any:
 
 
 def read(source: Source) -> Surface:
-    """Read heights: the shades themselves, or what the colours stand for; transparent pixels are holes."""
+    """Read heights: the shades themselves, or what the colours stand for; transparent pixels are holes.
+
+    Raises
+    ------
+    FormatError
+        If the file is not whole, or Pillow cannot read it.
+    """
     depth, kind = _header(source)
     pillow = require_pillow()
     _check_pixels(source)

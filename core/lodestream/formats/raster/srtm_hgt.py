@@ -34,7 +34,15 @@ def named(name: str) -> Mapping[str, str]:
 
 
 def read(source: Source) -> Surface:
-    """Read the heights, and lay them where the option ``tile`` says."""
+    """Read the heights, and lay them where the option ``tile`` says.
+
+    Raises
+    ------
+    FormatError
+        If the file is not as long as a tile is.
+    OptionError
+        If the option names no corner of a tile.
+    """
     if source.size not in {2 * rows * columns for rows, columns in _SHAPES}:
         known = ", ".join(f"{number(2 * rows * columns)} ({rows} x {columns})" for rows, columns in _SHAPES)
         raise FormatError(f"expected an SRTM tile of {known} bytes, got {number(source.size)}")

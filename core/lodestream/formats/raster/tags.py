@@ -134,7 +134,7 @@ def describe(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str], ba
     names : sequence of str
         Of the bands: "" for that of the heights, which is the first.
     bands : sequence of arrays
-        Their values, without those of holes.
+        Their values, of shape (value,), without those of holes.
     """
     from rasterio.enums import ColorInterp
 

@@ -35,7 +35,15 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the grid of a legacy file of VTK; an index plane of a volume (option ``plane``)."""
+    """Read the grid of a legacy file of VTK; an index plane of a volume (option ``plane``).
+
+    Raises
+    ------
+    FormatError
+        If the file is not whole, or holds no structured grid.
+    TooLargeError
+        If it promises more points or arrays than it can hold.
+    """
     with source.path.open("rb") as file:
         head = file.read(_HEAD)
     dataset = re.search(rb"^\s*DATASET\s+(\w+)", head, re.MULTILINE | re.IGNORECASE)

@@ -50,7 +50,13 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def read(source: Source) -> Surface:
-    """Read the grid of each file as a block; an index plane of volumes (option ``plane``)."""
+    """Read the grid of each file as a block; an index plane of volumes (option ``plane``).
+
+    Raises
+    ------
+    FormatError
+        If a file is not whole, or holds no structured grid; of several files the message names the one.
+    """
     readings = []
     for path in (source.path, *source.more):
         try:

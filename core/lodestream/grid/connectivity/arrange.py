@@ -130,10 +130,12 @@ class _Matching:
                     continue
                 place = draft.along(across)[-(side % 2)] % shape[across]
                 line = line_of(block, along, place, draft.along(along) % shape[along], geometric)
-                if (line[1:, :-1] == line[:-1, :-1]).all():
+                if (line[1:, :-1] == line[:-1, :-1]).all():  # all in one place: a pole, if no hole is among them
                     if line[:, -1].all():
                         self.poles.add((number, side))
                     continue
+                # The lesser of both directions is the key, so that sides that run against each other meet. A closed
+                # side was turned before, together with all that it touches, and meets others as it is.
                 forward, backward = line.tobytes(), line[::-1].tobytes()
                 against = backward < forward and not draft.closed[along]
                 key = draft.closed[along], backward if against else forward
@@ -181,6 +183,8 @@ def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
     for root in related:
         if root in met:
             continue
+        # All that is related gets a direction from the first. If a way round contradicts it, as on a Moebius band,
+        # there is none that suits all: these axes are coarsened only as far as they need no direction.
         met[root], consistent, pending, members = False, True, [root], []
         while pending:
             one = pending.pop()

@@ -140,12 +140,13 @@ def _edges(points: NDArray[np.intp], valid: NDArray[np.bool_], offsets: NDArray[
     inside = side[1:] == side[:-1]
     position = np.arange(len(points)) - offsets[side]
     firm = valid[1:] & valid[:-1] & (points[1:] != points[:-1])
-    return _Edges(*(patch[inside] for patch in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
+    return _Edges(*(each[inside] for each in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
 
 
 def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) -> list[Link]:
     low, high = np.minimum(edges.start, edges.stop), np.maximum(edges.start, edges.stop)
     firm = np.flatnonzero(edges.firm)
+    # Edges of the same two points stand together, whichever way they run: each is linked with the next.
     order = firm[np.lexsort((firm, high[firm], low[firm]))]
     same = (low[order[1:]] == low[order[:-1]]) & (high[order[1:]] == high[order[:-1]])
     if not same.any():
@@ -156,6 +157,7 @@ def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) ->
     shift = np.where(sign == 1, j - i, j + i + 1)
     pairs = np.stack([edges.side[one], edges.side[other], sign, shift, i])
     pairs = pairs[:, np.lexsort(pairs[::-1])]
+    # Along a run source, target, sign and shift stay, and the position grows by one: a run ends where that ends.
     fresh = (np.diff(pairs[:4]) != 0).any(axis=0) | (np.diff(pairs[4]) != 1)
     starts = np.concatenate([[0], np.flatnonzero(fresh) + 1])
     lasts = np.concatenate([starts[1:], [pairs.shape[1]]]) - 1

@@ -18,7 +18,7 @@ enum {
     FRACTION_BITS = 3,
     LARGEST = 1 << 28, /* magnitude of a coefficient */
     WIDEST_STEP = 1 << 26,
-    WINDOW_FIELDS = 3, /* tile, first row, first column */
+    ORIGIN_FIELDS = 3, /* tile, first row, first column */
 };
 
 /* How the magnitudes of a band become coefficients when some passes remain. Products stay below 2^31: what would lead
@@ -141,26 +141,26 @@ static void clear(struct places at) {
 
 int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
                     const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
-                    const int64_t *windows, int64_t windows_count, const int64_t *steps, int64_t steps_count,
+                    const int64_t *origins, int64_t origins_count, const int64_t *steps, int64_t steps_count,
                     const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
                     int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch, int64_t first_row,
                     int64_t first_column) {
     if (sign_count != known_count || early_count != known_count || bands_count != steps_count * BAND_FIELDS ||
-        windows_count != steps_count * WINDOW_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
+        origins_count != steps_count * ORIGIN_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
         first_column < 0)
         return LODE_REFUSED;
     for (int64_t i = 0; i < numbers_count; i++) {
         if (numbers[i] < 0 || numbers[i] >= steps_count)
             return LODE_REFUSED;
-        const int64_t *band = bands + numbers[i] * BAND_FIELDS, *window = windows + numbers[i] * WINDOW_FIELDS;
-        int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = window[0];
+        const int64_t *band = bands + numbers[i] * BAND_FIELDS, *origin = origins + numbers[i] * ORIGIN_FIELDS;
+        int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = origin[0];
         int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
-        if (window[1] < first_row || window[2] < first_column || height < 0 || width < 0 || height > INT32_MAX ||
+        if (origin[1] < first_row || origin[2] < first_column || height < 0 || width < 0 || height > INT32_MAX ||
             stride < width || stride < 1 || stride > INT32_MAX || offset < 0 || offset > known_count - width ||
             (height - 1) * stride > known_count - width - offset || tile < 0 || tile >= state_count ||
             state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
             return LODE_REFUSED;
-        int64_t top = window[1] - first_row, left = window[2] - first_column;
+        int64_t top = origin[1] - first_row, left = origin[2] - first_column;
         if (top > rows - height || left > columns - width)
             return LODE_REFUSED;
         struct places at = {known + offset,           sign + offset, early + offset, stride,

@@ -1,0 +1,110 @@
+"""What a request over HTTP needs done, as values, and how httpx is asked to do it."""
+
+from __future__ import annotations
+
+import functools
+import ssl
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from . import addresses
+from .answers import LONGEST_ANSWER, Answer
+from .bodies import Body
+
+if TYPE_CHECKING:
+    import httpx
+
+__all__ = ["TIMEOUT", "Call", "Flow", "Pause", "client_options", "request_options"]
+
+T = TypeVar("T")
+
+#: Seconds for each step of a request: connecting, one chunk sent, one chunk received.
+TIMEOUT = 30.0
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request to make; the complete answer is sent back.
+
+    With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
+    bytes are read.
+    """
+
+    method: str
+    url: str
+    parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    body: Body | None = None
+    partial: bool = False
+    most: int = LONGEST_ANSWER
+
+
+@dataclass(frozen=True)
+class Pause:
+    """A wait of so many seconds."""
+
+    seconds: float
+
+
+Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
+
+
+def client_options(url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False) -> dict[str, Any]:
+    """Arguments for an httpx client of the server at `url`.
+
+    Parameters
+    ----------
+    url : str
+    timeout : float
+        Seconds for each step.
+    asynchronous : bool
+        Whether it is an asyncio client.
+    """
+
+    def guard(request: httpx.Request) -> None:
+        # httpx itself lets a token go on from a host's port 80 to its port 443; here an origin is an origin.
+        if not addresses.same_origin(str(request.url), url):
+            request.headers.pop("Authorization", None)
+
+    async def guard_later(request: httpx.Request) -> None:
+        guard(request)
+
+    return {
+        "follow_redirects": True,
+        "timeout": timeout,
+        "verify": _trusted(),
+        # No proxy of the environment comes between two programs on one machine.
+        "trust_env": not addresses.is_loopback(url),
+        "headers": {"Accept-Encoding": "identity"},
+        "event_hooks": {"request": [guard_later if asynchronous else guard]},
+    }
+
+
+@functools.cache
+def _trusted() -> ssl.SSLContext:
+    # Reading all the certificates takes longer than many a request.
+    import httpx
+
+    return httpx.create_ssl_context()
+
+
+def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
+    """Arguments for the ``request`` method of an httpx client, except the body of a single file.
+
+    The token is sent only to the server at `url`, wherever redirects lead.
+    """
+    headers = dict(call.headers)
+    if token is not None and addresses.same_origin(call.url, url):
+        headers["Authorization"] = f"Bearer {token}"
+    options: dict[str, Any] = {"method": call.method, "url": call.url, "headers": headers}
+    if call.method not in ("GET", "HEAD"):
+        options["follow_redirects"] = False  # nothing is changed, and no file sent, where nobody said so
+    if call.parameters:
+        options["params"] = dict(call.parameters)
+    if call.body is not None and len(call.body.files) > 1:
+        options["files"] = call.body.form()
+    elif call.body is not None:
+        headers["Content-Length"] = str(call.body.size)
+        headers["Content-Type"] = "application/octet-stream"
+    return options
