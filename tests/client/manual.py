@@ -21,6 +21,7 @@ COMMANDS = (
     "push",
     "retry",
     "pull",
+    "view",
     "list",
     "rm",
     "formats",
