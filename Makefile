@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels page test test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -18,8 +18,30 @@ demo: kernels ## stream a million points over a slow link, stop early, and show 
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
 # of pytest's share two processors, since some of the tests wait for a clock.
-test: kernels ## run the tests; ARGS="-k name" for some of them
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 4 --dist loadfile $(ARGS)
+PYTEST := -m pytest -q -n 4 --dist loadfile
+COVERAGE := build/coverage
+
+test: kernels ## run the tests; ARGS="-k name" for some of them; COVER=1 as cover does
+ifdef COVER
+	@rm -rf $(COVERAGE) && mkdir -p $(COVERAGE)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/coverage run $(PYTEST) $(ARGS)
+	@$(BIN)/coverage combine --quiet && $(BIN)/coverage report
+else
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(ARGS)
+endif
+
+cover: ## run the tests and say which lines of Python none of them runs, in whatever process
+	@$(MAKE) --no-print-directory test COVER=1
+
+# Rules and tables, the protocol, the client's core, what the pages say. It leaves out all that takes long: codec and
+# formats but for examples, whole streams, the server but for its settings, faults, kernels.
+CHECKED := tests/test_doctests.py $(wildcard tests/core/test_*_docs.py) tests/core/test_public.py \
+	tests/core/test_target.py tests/core/test_text.py tests/core/test_quality.py tests/core/protocol \
+	tests/core/container/test_format_docs.py tests/core/container/test_index_pages.py tests/core/planning/test_byte_ranges.py \
+	tests/core/grid/test_axis.py tests/client/stream/test_core.py tests/client/commands/test_arguments.py
+
+check: lint kernels ## lint and a subset of the tests: about a minute
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(CHECKED)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
