@@ -9,7 +9,7 @@
 
 #include "band_fields.h"
 #include "binary_coder.h"
-#include "surroundings.h"
+#include "contexts.h"
 #include "trellis.h"
 
 enum {

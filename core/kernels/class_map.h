@@ -10,7 +10,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "surroundings.h"
+#include "contexts.h"
 
 enum {
     STRIPE_ROWS = BLOCK,

@@ -28,7 +28,7 @@ import lodestream as ls
 from lodestream.errors import CorruptStreamError, LodestreamError
 from lodestream.target import Region
 from lodestream_client import aio, sync
-from lodestream_client.stream import transport
+from lodestream_client.stream import reconnecting
 from lodestream_server import running_server
 from tests.links import Link, faults_of
 
@@ -166,12 +166,12 @@ def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None =
 @contextmanager
 def _hasty() -> Iterator[None]:
     """Waits between attempts that are in proportion to links of milliseconds."""
-    usual = transport._FIRST_PAUSE, transport._LONGEST_PAUSE
-    transport._FIRST_PAUSE, transport._LONGEST_PAUSE = 0.002, 0.1
+    usual = reconnecting._FIRST_PAUSE, reconnecting._LONGEST_PAUSE
+    reconnecting._FIRST_PAUSE, reconnecting._LONGEST_PAUSE = 0.002, 0.1
     try:
         yield
     finally:
-        transport._FIRST_PAUSE, transport._LONGEST_PAUSE = usual
+        reconnecting._FIRST_PAUSE, reconnecting._LONGEST_PAUSE = usual
 
 
 async def _all(url: str, container: bytes, count: int, until: tuple[float, float], seed: int, report: Report) -> None:

@@ -39,7 +39,7 @@ from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
 
 if TYPE_CHECKING:
-    from ..stream.transport import Transport
+    from ..stream.reconnecting import Transport
     from ..sync import Stream
 
 __all__ = ["PullOptions", "register", "run"]

@@ -9,7 +9,7 @@ from typing import TypeAlias, TypedDict
 from lodestream.target import Target
 from lodestream.transfer.receiver_state import Sink, Store
 
-from .transport import Transport
+from .reconnecting import Transport
 
 __all__ = ["ConnectKeywords", "ConnectOptions", "Received"]
 

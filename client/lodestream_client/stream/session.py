@@ -23,7 +23,7 @@ from ..requests import addresses, answers, problems
 from .effects import Flow, Send, Wait
 from .options import ConnectOptions
 from .pacing import Link, window_for
-from .transport import Transports
+from .reconnecting import Transports
 
 if TYPE_CHECKING:
     from lodestream.decoding.decoder import View

@@ -19,7 +19,7 @@ import lodestream_client as client
 from lodestream.errors import RemoteError, RemoteProtocolError
 from lodestream.transfer.receiver_state import ReceiverState
 from lodestream_client import sync
-from lodestream_client.stream.transport import Transport
+from lodestream_client.stream.reconnecting import Transport
 from lodestream_server import running_server
 from tests.links import Fault, linked
 

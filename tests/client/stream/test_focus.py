@@ -17,7 +17,7 @@ from lodestream.errors import OptionError
 from lodestream.target import Region
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import aio, sync
-from lodestream_client.stream import transport
+from lodestream_client.stream import reconnecting
 from tests.links import Fault, linked
 
 NEAR: Region = ((0, 50), (0, 60))
@@ -27,8 +27,8 @@ Heights = NDArray[np.int16]
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "_FIRST_PAUSE", 0.002)
-    monkeypatch.setattr(transport, "_LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr(reconnecting, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(reconnecting, "_LONGEST_PAUSE", 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def near_first(views: list[ls.View], region: Region, heights: Heights) -> float:
 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
-def test_what_is_looked_at_comes_first(surface: str, heights: Heights, transport: transport.Transport) -> None:
+def test_what_is_looked_at_comes_first(surface: str, heights: Heights, transport: reconnecting.Transport) -> None:
     with sync.connect(surface, transport=transport) as plain:
         assert near_first(list(plain), NEAR, heights) > 0.8
     with sync.connect(surface, transport=transport, window=4096) as stream:
@@ -77,7 +77,7 @@ def test_what_is_looked_at_comes_first(surface: str, heights: Heights, transport
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_what_is_looked_at_comes_first_for_asyncio(
-    surface: str, heights: Heights, transport: transport.Transport
+    surface: str, heights: Heights, transport: reconnecting.Transport
 ) -> None:
     async def run() -> tuple[aio.Stream, list[ls.View]]:
         async with aio.connect(surface, transport=transport, window=4096) as stream:
@@ -94,7 +94,7 @@ def test_what_is_looked_at_comes_first_for_asyncio(
 @pytest.mark.parametrize("transport", ["ws", "http"])
 @pytest.mark.parametrize("seed", range(4))
 def test_looking_here_and_there_over_a_link_that_breaks(
-    surface: str, heights: Heights, transport: transport.Transport, seed: int
+    surface: str, heights: Heights, transport: reconnecting.Transport, seed: int
 ) -> None:
     random = Random(seed)
     lengths = [random.randrange(3000, 60_000) for _ in range(6)]
@@ -153,7 +153,7 @@ def test_what_is_kept_on_disk_is_not_sent_again(surface: str, heights: Heights) 
 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
-def test_a_region_that_is_not_there(surface: str, transport: transport.Transport) -> None:
+def test_a_region_that_is_not_there(surface: str, transport: reconnecting.Transport) -> None:
     with sync.connect(surface, transport=transport, window=4096) as stream:
         next(stream)
         with pytest.raises(OptionError, match="expected rows within 0:420"):

@@ -24,7 +24,7 @@ import lodestream_client as client
 from lodestream_client import sync
 from lodestream_client.__main__ import main
 from lodestream_client.stream import cache
-from lodestream_client.stream.transport import Transport
+from lodestream_client.stream.reconnecting import Transport
 from tests.links import Fault, linked
 from tests.server.programs import Server, descendants
 

@@ -24,7 +24,7 @@ from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Even
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
-from lodestream_client.stream import effects, transport
+from lodestream_client.stream import effects
 from lodestream_client.stream.aio_io import AsyncIO
 from lodestream_client.stream.stream import BaseStream
 from lodestream_client.stream.sync_io import SyncIO
@@ -40,8 +40,8 @@ def asynchronous(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "_FIRST_PAUSE", 0.002)
-    monkeypatch.setattr(transport, "_LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr(reconnecting, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(reconnecting, "_LONGEST_PAUSE", 0.05)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import lodestream as ls
 import lodestream_client as client
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
-from lodestream_client.stream import cache, transport
+from lodestream_client.stream import cache
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
 
@@ -39,8 +39,8 @@ LATER = Fault(cut_down=0)
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waits between attempts that are in proportion to a link within one machine."""
-    monkeypatch.setattr(transport, "_FIRST_PAUSE", 0.002)
-    monkeypatch.setattr(transport, "_LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr(reconnecting, "_FIRST_PAUSE", 0.002)
+    monkeypatch.setattr(reconnecting, "_LONGEST_PAUSE", 0.05)
 
 
 def follow(url: str, asynchronous: bool, **options: Any) -> tuple[list[ls.View], BaseStream]:

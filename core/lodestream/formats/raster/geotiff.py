@@ -17,8 +17,8 @@ from ...surface import Surface
 from ..notes import listing, metadata_left_out, survives, warn, warn_left_out
 from ..source import Source
 from . import gdal, tiff_guard
-from .flat import even_heights, geotransform
 from .tags import describe, missing
+from .writing_heights import even_heights, geotransform
 
 __all__ = ["READ_OPTIONS", "read", "sniff", "write"]
 

@@ -21,7 +21,7 @@ from ...quantization.lattice import Lattice, find_lattice, to_dtype
 from ...surface import Surface
 from ..notes import listing, metadata_left_out, warn
 from ..source import Source, number
-from .flat import even_heights
+from .writing_heights import even_heights
 
 __all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
 

@@ -10,7 +10,7 @@ from websockets.http11 import Response
 import lodestream as ls
 from lodestream.errors import LodestreamError, RemoteError
 from lodestream_client.errors import SilenceError, UnreachableError
-from lodestream_client.stream.transport import Transport, Transports
+from lodestream_client.stream.reconnecting import Transport, Transports
 
 ONE, FILE = "http://one/v1/surfaces/ab", "http://three/ab.lode"
 LOST = UnreachableError("no connection")
