@@ -24,7 +24,7 @@ from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Even
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
-from lodestream_client.stream import effects
+from lodestream_client.stream import effects, reconnecting
 from lodestream_client.stream.aio_io import AsyncIO
 from lodestream_client.stream.stream import BaseStream
 from lodestream_client.stream.sync_io import SyncIO

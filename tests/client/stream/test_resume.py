@@ -23,7 +23,7 @@ import lodestream as ls
 import lodestream_client as client
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
-from lodestream_client.stream import cache
+from lodestream_client.stream import cache, reconnecting
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
 
