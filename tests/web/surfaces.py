@@ -50,7 +50,9 @@ def encoded(chance: Random, number: int) -> bytes:
     while True:
         options: dict[str, Any] = {}
         if chance.random() < 0.25:
-            options = chance.choice([{"precision": "1e-3d"}, {"rms": "1e-3d"}, {"rms": "1e-2d"}, {"precision": "1e-2d"}])
+            options = chance.choice(
+                [{"precision": "1e-3d"}, {"rms": "1e-3d"}, {"rms": "1e-2d"}, {"precision": "1e-2d"}]
+            )
         try:
             made = surface(chance, number)
             with all_large() if chance.random() < 0.3 else nullcontext():
@@ -94,7 +96,9 @@ def heights(chance: Random, rng: np.random.Generator, shape: tuple[int, int], nu
     if kind == 3:
         return rng.integers(limits.min, limits.max, shape, dtype, endpoint=True)
     room = float(limits.max) - float(limits.min)
-    scaled = (values - values.min()) / max(float(np.ptp(values)), 1e-9) * min(room, chance.choice([50.0, 3e4, 1e18])) / 2
+    scaled = (
+        (values - values.min()) / max(float(np.ptp(values)), 1e-9) * min(room, chance.choice([50.0, 3e4, 1e18])) / 2
+    )
     return np.clip(np.rint(scaled + limits.min / 4), limits.min, limits.max / 2).astype(dtype)
 
 
