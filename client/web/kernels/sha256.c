@@ -13,34 +13,40 @@ static const uint32_t CONSTANTS[64] = {
     0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2,
 };
 
-static uint32_t turned(uint32_t word, int by) {
+static inline uint32_t turned(uint32_t word, int by) {
     return word >> by | word << (32 - by);
 }
+
+/* A round: of eight words the last becomes the first, so that after eight rounds each has its name again. */
+#define ROUND(a, b, c, d, e, f, g, h, i)                                                                               \
+    h += (turned(e, 6) ^ turned(e, 11) ^ turned(e, 25)) + (g ^ (e & (f ^ g))) + CONSTANTS[i] + w[i];                   \
+    d += h;                                                                                                            \
+    h += (turned(a, 2) ^ turned(a, 13) ^ turned(a, 22)) + ((a & b) | (c & (a | b)));
 
 /* Take whole blocks of 64 bytes into a state of eight words, which the caller begins, pads and ends. */
 EXPORTED(sha256)
 void sha256(uint32_t *state, const uint8_t *data, int32_t blocks) {
     for (; blocks > 0; blocks--, data += BLOCK) {
-        uint32_t w[64], s[8];
+        uint32_t w[64];
         for (int i = 0; i < 16; i++)
             w[i] = (uint32_t)data[4 * i] << 24 | (uint32_t)data[4 * i + 1] << 16 | (uint32_t)data[4 * i + 2] << 8 |
                    data[4 * i + 3];
         for (int i = 16; i < 64; i++)
             w[i] = w[i - 16] + (turned(w[i - 15], 7) ^ turned(w[i - 15], 18) ^ w[i - 15] >> 3) + w[i - 7] +
                    (turned(w[i - 2], 17) ^ turned(w[i - 2], 19) ^ w[i - 2] >> 10);
-        for (int i = 0; i < 8; i++)
-            s[i] = state[i];
-        for (int i = 0; i < 64; i++) {
-            uint32_t one = turned(s[4], 6) ^ turned(s[4], 11) ^ turned(s[4], 25);
-            uint32_t first = s[7] + one + ((s[4] & s[5]) ^ (~s[4] & s[6])) + CONSTANTS[i] + w[i];
-            uint32_t two = turned(s[0], 2) ^ turned(s[0], 13) ^ turned(s[0], 22);
-            uint32_t second = two + ((s[0] & s[1]) ^ (s[0] & s[2]) ^ (s[1] & s[2]));
-            for (int j = 7; j > 0; j--)
-                s[j] = s[j - 1];
-            s[4] += first;
-            s[0] = first + second;
+        uint32_t a = state[0], b = state[1], c = state[2], d = state[3];
+        uint32_t e = state[4], f = state[5], g = state[6], h = state[7];
+        for (int i = 0; i < 64; i += 8) {
+            ROUND(a, b, c, d, e, f, g, h, i)
+            ROUND(h, a, b, c, d, e, f, g, i + 1)
+            ROUND(g, h, a, b, c, d, e, f, i + 2)
+            ROUND(f, g, h, a, b, c, d, e, i + 3)
+            ROUND(e, f, g, h, a, b, c, d, i + 4)
+            ROUND(d, e, f, g, h, a, b, c, i + 5)
+            ROUND(c, d, e, f, g, h, a, b, i + 6)
+            ROUND(b, c, d, e, f, g, h, a, i + 7)
         }
-        for (int i = 0; i < 8; i++)
-            state[i] += s[i];
+        state[0] += a, state[1] += b, state[2] += c, state[3] += d;
+        state[4] += e, state[5] += f, state[6] += g, state[7] += h;
     }
 }
