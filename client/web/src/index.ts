@@ -14,5 +14,6 @@ export type { Description, Kept } from "./transfer/questions";
 export type { Transport } from "./transfer/roads";
 export { serveHost } from "./transfer/serve-host";
 export type { SocketClass } from "./transfer/socket";
-export type { Phase, Progress, StreamState } from "./transfer/stream";
+export { MemoryStore, type Store } from "./transfer/store";
+export { type Phase, type Progress, Stream, type StreamOptions, type StreamState } from "./transfer/stream";
 export * from "./types";

@@ -182,13 +182,36 @@ describe.each(WAYS)("%s", (_, way) => {
     expect(kept.size).toBe(served.data.length);
     const held = kept.pieces.reduce((sum, [, data]) => sum + data.length, 0);
     expect(held).toBe(first.progress.dataBytes);
-    const again = connect(served.static, {}, options({ kept }));
+    // A file that is the same but for its name.
+    const again = connect(served.static, {}, options({ kept: { ...kept, version: undefined } }));
     let last: SurfaceView | undefined;
     for await (const view of again) last = view;
     expect(again.ended).toBe("complete");
     expect(again.progress.dataBytes).toBeLessThanOrEqual(served.data.length - held);
     expect((await last!.surface()).blocks[0]!.points).toEqual(whole.blocks[0]!.points);
     await again.close();
+  });
+
+  it("bytes of a file that has changed since are not mixed with others", async () => {
+    const first = connect(served.static, { maxBytes: 9000 }, options({ keep: true }));
+    for await (const _view of first);
+    const kept = await first.kept();
+    expect(kept.version).toMatch(/^"/);
+    expect(kept.container).toBeUndefined();
+    await first.close();
+    const again = connect(served.static, {}, options({ kept }));
+    for await (const _view of again);
+    expect(again.ended).toBe("complete");
+    await again.close();
+    const other = connect(served.static, {}, options({ kept: { ...kept, version: '"another"' } }));
+    const views: SurfaceView[] = [];
+    const received = async () => {
+      for await (const view of other) views.push(view);
+    };
+    await expect(received()).rejects.toMatchObject({ code: "other-container" });
+    expect(views.length).toBeGreaterThan(0); // what is held is shown at once
+    expect(views.at(-1)!.bytes).toBeLessThanOrEqual(9000);
+    await other.close();
   });
 
   it("a token, a rate that changes, and a link that breaks", async () => {

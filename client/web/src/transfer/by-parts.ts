@@ -31,8 +31,9 @@ export class PartsRoad<View extends ViewInfo> {
   constructor(
     private readonly journey: Journey<View>,
     private readonly source: PartSource,
+    version?: string,
   ) {
-    this.download = new RangeDownload(journey.reception);
+    this.download = new RangeDownload(journey.reception, version);
   }
 
   /** Identifies this version of the file: its entity tag, or else its date; undefined if it has neither. */

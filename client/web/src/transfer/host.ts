@@ -53,6 +53,7 @@ export class Host implements Questions {
       store: this.store,
       container: kept?.container ?? options.container,
       size: kept?.size ?? options.size,
+      version: kept?.version,
       onState: (state) => this.tell({ kind: "state", state, progress: this.own.progress }),
       onProgress: (progress) => {
         this.tell({ kind: "progress", progress });
@@ -116,7 +117,7 @@ export class Host implements Questions {
 
   kept(): Kept {
     const { container, size } = this.own.reception;
-    return { container, size, pieces: this.store?.all() ?? [] };
+    return { container, size, version: this.own.version, pieces: this.store?.all() ?? [] };
   }
 
   private get own(): Stream<View> {

@@ -15,6 +15,8 @@ export interface Kept {
   readonly container: string | undefined;
   /** Bytes of the container. */
   readonly size: number | undefined;
+  /** What tells this version of a file on a web server from others: its entity tag, or else its date. */
+  readonly version: string | undefined;
   /** Runs of its bytes, by where they begin, in any order. */
   readonly pieces: readonly (readonly [offset: number, data: Uint8Array])[];
 }

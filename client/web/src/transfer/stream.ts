@@ -89,6 +89,8 @@ export interface StreamOptions extends PlainStreamOptions {
   readonly onBytes?: Sink | undefined;
   /** Bytes that are held already, and where others are kept. */
   readonly store?: Store | undefined;
+  /** What tells the version of the file that they belong to: its entity tag, or else its date. */
+  readonly version?: string | undefined;
   /** In place of the platform's own; Node 20 has no WebSocket. */
   readonly WebSocket?: SocketClass | undefined;
   readonly fetch?: typeof globalThis.fetch | undefined;
@@ -138,12 +140,15 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.closeTimeout = positive("closeTimeout", options.closeTimeout ?? 5);
     this.link = limitRate === undefined ? undefined : new Link(limitRate);
     if (typeof source === "string") {
-      const roads = new Roads(source, options.transport ?? "auto", options.deadline ?? 60, options.pauses);
+      const sockets = options.WebSocket ?? platformSocket();
+      const transport = options.transport ?? "auto";
+      const own = sockets === undefined && transport === "auto" ? "http" : transport;
+      const roads = new Roads(source, own, options.deadline ?? 60, options.pauses);
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
       const http = new HttpParts(containerUrl(roads.url), roads.url, token, fetch);
-      this.parts = () => new PartsRoad(this, http);
+      this.parts = () => new PartsRoad(this, http, options.version);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
-      this.socket = new SocketRoad(this, roads.url, { token, window }, options.WebSocket ?? platformSocket());
+      this.socket = new SocketRoad(this, roads.url, { token, window }, sockets);
       this.roads = roads;
     } else this.parts = () => new PartsRoad(this, new BlobParts(source));
     this.reception = new Reception(target, decoder, {
@@ -158,6 +163,11 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   /** The URL of the surface or file; undefined for a file of this machine. */
   get url(): string | undefined {
     return this.roads?.url;
+  }
+
+  /** What tells this version of a file from others, as far as its server says: its entity tag, or else its date. */
+  get version(): string | undefined {
+    return this.made?.version ?? this.options.version;
   }
 
   /** What to receive, where to stop, and in which order. */
