@@ -406,6 +406,25 @@ describe("a file", () => {
   });
 });
 
+describe("a link that is far away", () => {
+  it.each(["ws", "http"] as const)("shows the first picture after two round trips: %s", async (transport) => {
+    const roundTrip = 1.2;
+    const source = transport === "ws" ? served.surface : served.static;
+    await faulty(
+      source,
+      () => ({ delay: roundTrip / 2 }),
+      async (link) => {
+        const stream = streamOf(link.url, {}, transport === "ws" ? { transport } : {});
+        const began = performance.now();
+        await stream.next();
+        // The proxy takes connections at once, where a far server takes a round trip.
+        expect((performance.now() - began) / 1000).toBeLessThan(2 * roundTrip);
+        await stream.close();
+      },
+    );
+  });
+});
+
 describe("a limited rate", () => {
   it("is kept, told, and can be changed", async () => {
     const progress: Progress[] = [];
