@@ -22,7 +22,6 @@ from lodestream.mask import encode_mask
 from tests.core.coding import decode_runs, encode_runs, passes_of
 
 
-
 def main(seed: int, count: int) -> None:
     """Steps, tiles, masks and pieces by turns."""
     for number in range(seed, seed + count):
