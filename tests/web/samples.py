@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ def main() -> None:
     """Integers, floats with exactness, and integers with a hole."""
     rows, columns = np.mgrid[: _SHAPE[0], : _SHAPE[1]]
     heights = np.rint(10 * terrain(_SHAPE, 4))
-    surfaces = {
+    surfaces: dict[str, Any] = {
         "integers": heights.astype(np.int16),
         "floats": (terrain(_SHAPE, 5) / 3).astype(np.float32),
         "holes": np.where(np.hypot(rows - 90, columns - 70) < 30, np.nan, heights),

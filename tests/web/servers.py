@@ -21,11 +21,11 @@ from tests.core.surfaces import terrain
 
 
 def main(folder: Path) -> None:
-    """Serve a terrain of 181 x 140 integers."""
+    """Serve a terrain of 361 x 281 integers."""
     files = folder / "files"
     files.mkdir(parents=True)
     container = files / "terrain.lode"
-    heights = np.rint(10 * terrain((181, 140), 4)).astype(np.int16)
+    heights = np.rint(10 * terrain((361, 281), 4)).astype(np.int16)
     container.write_bytes(ls.encode(ls.Surface(heights, metadata={"name": "terrain"})))
     token, _ = TokenFile(folder / "closed" / "tokens.json").create("tests", ("read", "write"))
     with (

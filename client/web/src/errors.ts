@@ -4,12 +4,7 @@
  */
 
 /** Base class of all errors of Lodestream. */
-export class LodestreamError extends Error {
-  constructor(message: string) {
-    super(message);
-    this.name = new.target.name;
-  }
-}
+export class LodestreamError extends Error {}
 
 /** The caller's input cannot be used. */
 export class InputError extends LodestreamError {}
@@ -71,3 +66,51 @@ export class UnreachableError extends LodestreamError {}
 
 /** The server sent nothing for longer than allowed. */
 export class SilenceError extends LodestreamError {}
+
+/** The classes that are made of a message alone, by their names. */
+const PLAIN_CLASSES = {
+  LodestreamError,
+  InputError,
+  TooLargeError,
+  OptionError,
+  UnavailableError,
+  NotFoundError,
+  StreamError,
+  TruncatedStreamError,
+  UnsupportedVersionError,
+  ProtocolError,
+  LocalProtocolError,
+  RemoteProtocolError,
+  UnreachableError,
+  SilenceError,
+};
+
+// A bundler shortens the names of classes, not those of keys.
+for (const [name, kind] of Object.entries({ ...PLAIN_CLASSES, CorruptStreamError, RemoteError })) {
+  kind.prototype.name = name;
+}
+
+/** An error as it goes from one thread to another, where its class would be lost. */
+export interface PlainError {
+  readonly name: string;
+  readonly message: string;
+  readonly code?: string;
+  readonly offset?: number;
+}
+
+/** What is to be told of an error. */
+export function plainError(error: unknown): PlainError {
+  const { name, message } = error instanceof Error ? error : new Error(String(error));
+  if (error instanceof RemoteError) return { name, message, code: error.code };
+  if (error instanceof CorruptStreamError) return { name, message, offset: error.offset };
+  return { name, message };
+}
+
+/** The error that was told. */
+export function errorFrom({ name, message, code, offset }: PlainError): Error {
+  if (name === "RemoteError") return new RemoteError(code ?? "internal", message);
+  if (name === "CorruptStreamError")
+    return new CorruptStreamError(message.replace(/ \(at byte \d+\)$/, ""), offset ?? 0);
+  const kind = Object.hasOwn(PLAIN_CLASSES, name) ? PLAIN_CLASSES[name as keyof typeof PLAIN_CLASSES] : Error;
+  return new kind(message);
+}

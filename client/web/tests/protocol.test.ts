@@ -22,6 +22,7 @@ import {
 import { MAX_OPENING, toAddress } from "../src/protocol/opening";
 import { parse, serialize } from "../src/protocol/wire";
 import { ROOT } from "./golden";
+import { run } from "./python";
 import { hex, recording } from "./recording";
 
 const PAGE = readFileSync(join(ROOT, "docs/protocol.md"), "utf8");
@@ -252,6 +253,45 @@ describe("messages", () => {
     expect(() => parse(Uint8Array.of(0x81, 0xa4, 0x74, 0x79, 0x70, 0x65, 0xa2, 0xff, 0xfe))).toThrow(MessageError);
   });
 });
+
+const SEED = Number(process.env.SEED ?? Math.floor(Math.random() * 2 ** 30));
+
+describe(`random messages, seed ${SEED}`, () => {
+  it("are taken for what Python takes them for", () => {
+    const verdict = (message: Uint8Array): string => {
+      try {
+        return parse(message).type;
+      } catch (error) {
+        if (error instanceof MessageError) return error.code;
+        if (error instanceof UnsupportedVersionError) return "unsupported-version";
+        throw error;
+      }
+    };
+    const seen = new Set<string>();
+    for (const line of run("tests.web.messages", SEED, 20_000).trim().split("\n")) {
+      const [text, expected] = JSON.parse(line) as [string, string];
+      const message = new Uint8Array(Buffer.from(text, "hex"));
+      const found = verdict(message);
+      // Floats that are whole are integers here, and keys are text only.
+      const lenient = expected === "bad-message" && (message.includes(0xcb) || message.includes(0xca));
+      if (!lenient && !differs(message)) expect(found, text).toBe(expected);
+      seen.add(found);
+    }
+    for (const each of ["bad-message", "bad-target", "unsupported-version", "segments", "header", "open"]) {
+      expect(seen).toContain(each);
+    }
+  });
+});
+
+/** Whether a message has a key that is bytes, which Python ignores where it is not known. */
+function differs(message: Uint8Array): boolean {
+  try {
+    unpack(message);
+    return false;
+  } catch (error) {
+    return /a key that is not text/.test((error as Error).message);
+  }
+}
 
 describe("unpack", () => {
   it("takes what MessagePack can hold", () => {

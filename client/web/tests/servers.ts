@@ -83,6 +83,10 @@ export class Faulty {
   }
 
   private carry(near: Socket, fault: Fault): void {
+    if (fault.cutDown === 0 && !fault.vanish) {
+      near.destroy();
+      return;
+    }
     const far = connect(Number(this.given.port), this.given.hostname);
     let left = fault.cutDown ?? Number.POSITIVE_INFINITY;
     for (const socket of [near, far]) {

@@ -1,6 +1,6 @@
 /** Kinds and bounds of a container's sections, and the payloads of those that are short (docs/format.md). */
-import { decode } from "@msgpack/msgpack";
 import { CorruptStreamError, UnsupportedVersionError } from "../errors";
+import { unpack as unpackStrictly } from "../msgpack";
 import type { ByteRange } from "../types";
 import { crc32 } from "./crc";
 import { FieldReader } from "./fields";
@@ -59,14 +59,7 @@ export type Metadata = Record<string, unknown>;
 
 /** One MessagePack value and nothing after it; throws any kind of error where that is not so. */
 export function unpack(data: Uint8Array): unknown {
-  const value = decode(data, {
-    useBigInt64: true,
-    mapKeyConverter: (key) => {
-      if (typeof key !== "string") throw new TypeError(`expected a map from strings, got the key ${key}`);
-      return key;
-    },
-  });
-  return withNumbers(value);
+  return withNumbers(unpackStrictly(data));
 }
 
 /** Integers that numbers hold exactly as numbers. */

@@ -46,7 +46,7 @@ interface Begun {
 export class Decoder {
   /** All states so far. */
   readonly layers: View[] = [];
-  /** How much memory may be taken; it counts what has been read. */
+  /** How much memory may be taken. */
   readonly capacity: Capacity;
   readonly #module: WebAssembly.Module;
   readonly #wish: Wish;

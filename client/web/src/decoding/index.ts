@@ -3,3 +3,6 @@ export { Decoder, type DecoderOptions, decode } from "./decoder";
 export { coordinatesOf, type Placement, placementOf } from "./heights";
 export type { RulePlane } from "./rules";
 export { View } from "./view";
+export { serveDecoder } from "./worker/host";
+export type { Port } from "./worker/messages";
+export { RemoteDecoder, type RemoteView } from "./worker/remote";

@@ -56,7 +56,6 @@ export const CODES: Readonly<Record<string, { readonly close: number; readonly t
 
 /** The other side sent something that the protocol does not allow; `code`, a key of `CODES`, is the answer to send. */
 export class MessageError extends RemoteProtocolError {
-  override name = "MessageError";
   readonly code: string;
 
   constructor(code: string, message: string) {

@@ -224,7 +224,7 @@ function unpacked(message: Uint8Array): Record<string, unknown> {
 }
 
 function checkVersion(version: unknown): void {
-  if (typeof version !== "number" || !Number.isInteger(version)) {
+  if (typeof version !== "bigint" && !Number.isInteger(version)) {
     throw new MessageError("bad-message", `expected open.version to be an integer, got ${show(version)}`);
   }
   if (version !== VERSION) {

@@ -31,8 +31,9 @@ export class PartsRoad<View extends ViewInfo> {
   constructor(
     private readonly journey: Journey<View>,
     private readonly source: PartSource,
+    version?: string,
   ) {
-    this.download = new RangeDownload(journey.reception);
+    this.download = new RangeDownload(journey.reception, version);
   }
 
   /** Identifies this version of the file: its entity tag, or else its date; undefined if it has neither. */
@@ -110,8 +111,7 @@ export class PartsRoad<View extends ViewInfo> {
       journey.met();
       flight.answer = answer;
     } else if (piece !== undefined) {
-      await journey.pace(piece.length);
-      journey.take(() => download.receive(flight.part, piece));
+      await this.use(flight.part, piece);
     } else {
       this.flights.delete(flight);
       download.finish(flight.part, seconds());
@@ -120,6 +120,19 @@ export class PartsRoad<View extends ViewInfo> {
     // The next piece is asked for when this one has been used.
     flight.next = flight.answer!.read().then((next) => ({ flight, piece: next }));
     flight.next.catch(ignore);
+  }
+
+  /** Take a piece of an answer, at a limited rate little by little. */
+  private async use(part: Part, piece: Uint8Array): Promise<void> {
+    const { journey, download } = this;
+    for (let start = 0; start < piece.length && !journey.stopped; ) {
+      const portion = piece.subarray(start, start + journey.portion);
+      await journey.pace(portion.length);
+      this.tick();
+      if (journey.reception.ended !== undefined) return;
+      journey.take(() => download.receive(part, portion));
+      start += portion.length;
+    }
   }
 
   private leave(flight: Flight): void {

@@ -20,6 +20,8 @@ export interface Journey<View extends ViewInfo> {
   parting(): number;
   /** Declare a connection, or a request, that has been answered as expected. */
   met(): void;
+  /** Bytes to take at once, so that at a limited rate they come one after another. */
+  readonly portion: number;
   /** Wait as long as so many bytes take at the rate allowed. */
   pace(size: number): Promise<void>;
   /** Take bytes, whose views are handed on. */

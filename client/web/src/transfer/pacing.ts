@@ -8,6 +8,8 @@ import { MAX_CREDIT } from "../protocol/messages";
 const WINDOW_SECONDS = 0.25;
 const WINDOW_LEAST = 1024;
 
+const PORTION_LEAST = 128;
+
 /**
  * A simulated link of limited rate behind the real one: a token bucket without burst; the caller passes the time.
  *
@@ -22,6 +24,11 @@ export class Link {
    */
   constructor(readonly rate: number) {
     if (!(rate > 0)) throw new OptionError(`expected a positive rate, got ${rate}`);
+  }
+
+  /** Bytes of a piece that arrives at once: a twentieth of a second's. */
+  get portion(): number {
+    return Math.max(Math.round(this.rate / 20), PORTION_LEAST);
   }
 
   /** Seconds from `now` until `size` more bytes have passed. */

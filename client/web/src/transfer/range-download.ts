@@ -85,15 +85,18 @@ export class RangeDownload<View extends ViewInfo> {
   /** Number of requests so far. */
   requests = 0;
   private validator: string | undefined;
+  private etag: string | undefined;
   private needed: Place | undefined;
   private gap = MIN_WINDOW;
   private readonly parts = new Set<Part>();
 
-  /** @param etag Strong entity tag of the file, if it is known. */
+  /** @param version See `version`, of a file of which something is held. */
   constructor(
     readonly reception: Reception<View>,
-    private etag?: string,
+    version?: string,
   ) {
+    this.validator = version;
+    this.etag = version?.startsWith('"') ? version : undefined;
     reception.keep();
   }
 

@@ -1,6 +1,6 @@
 /** Bytes of one container that have come and are not decoded yet, or are kept by the caller. */
 
-import { RangeSet } from "../planning/ranges";
+import { bisectLeft, bisectRight, RangeSet } from "../planning/ranges";
 
 /** Storage for the bytes of one container. */
 export interface Store {
@@ -17,16 +17,20 @@ export interface Store {
 /** Bytes in memory; those that are used are forgotten, unless all are to be kept. */
 export class MemoryStore implements Store {
   readonly ranges = new RangeSet();
-  private pieces: [offset: number, data: Uint8Array][] = [];
+  // By where they begin; they do not overlap.
+  private readonly starts: number[] = [];
+  private readonly pieces: Uint8Array[] = [];
   private readonly done = new RangeSet();
 
   constructor(private readonly keepAll = false) {}
 
   read(offset: number, length: number): Uint8Array {
     const found = new Uint8Array(length);
-    for (const [start, data] of this.pieces) {
+    const end = offset + length;
+    for (let number = this.before(offset); number < this.starts.length && this.starts[number]! < end; number++) {
+      const [start, data] = [this.starts[number]!, this.pieces[number]!];
       const first = Math.max(start, offset);
-      const last = Math.min(start + data.length, offset + length);
+      const last = Math.min(start + data.length, end);
       if (first < last) found.set(data.subarray(first - start, last - start), first - offset);
     }
     return found;
@@ -34,17 +38,29 @@ export class MemoryStore implements Store {
 
   write(offset: number, data: Uint8Array): void {
     this.ranges.add(offset, data.length);
-    this.pieces.push([offset, data]);
+    const number = bisectRight(this.starts, offset);
+    this.starts.splice(number, 0, offset);
+    this.pieces.splice(number, 0, data);
   }
 
   used(offset: number, length: number): void {
     if (this.keepAll) return;
     this.done.add(offset, length);
-    this.pieces = this.pieces.filter(([at, data]) => !this.done.covers(at, data.length));
+    const first = this.before(offset);
+    for (let number = bisectLeft(this.starts, offset + length) - 1; number >= first; number--) {
+      if (!this.done.covers(this.starts[number]!, this.pieces[number]!.length)) continue;
+      this.starts.splice(number, 1);
+      this.pieces.splice(number, 1);
+    }
   }
 
-  /** Everything that is stored, as [offset, bytes] in the order in which it came. */
-  all(): readonly (readonly [offset: number, data: Uint8Array])[] {
-    return this.pieces;
+  /** Everything that is stored, as [offset, bytes] by rising offsets. */
+  all(): (readonly [offset: number, data: Uint8Array])[] {
+    return this.starts.map((start, number) => [start, this.pieces[number]!] as const);
+  }
+
+  /** The last piece that begins at an offset or before it; the first one if there is none. */
+  private before(offset: number): number {
+    return Math.max(bisectRight(this.starts, offset) - 1, 0);
   }
 }

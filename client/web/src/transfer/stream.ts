@@ -89,6 +89,8 @@ export interface StreamOptions extends PlainStreamOptions {
   readonly onBytes?: Sink | undefined;
   /** Bytes that are held already, and where others are kept. */
   readonly store?: Store | undefined;
+  /** What tells the version of the file that they belong to: its entity tag, or else its date. */
+  readonly version?: string | undefined;
   /** In place of the platform's own; Node 20 has no WebSocket. */
   readonly WebSocket?: SocketClass | undefined;
   readonly fetch?: typeof globalThis.fetch | undefined;
@@ -138,12 +140,15 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.closeTimeout = positive("closeTimeout", options.closeTimeout ?? 5);
     this.link = limitRate === undefined ? undefined : new Link(limitRate);
     if (typeof source === "string") {
-      const roads = new Roads(source, options.transport ?? "auto", options.deadline ?? 60, options.pauses);
+      const sockets = options.WebSocket ?? platformSocket();
+      const transport = options.transport ?? "auto";
+      const own = sockets === undefined && transport === "auto" ? "http" : transport;
+      const roads = new Roads(source, own, options.deadline ?? 60, options.pauses);
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
       const http = new HttpParts(containerUrl(roads.url), roads.url, token, fetch);
-      this.parts = () => new PartsRoad(this, http);
+      this.parts = () => new PartsRoad(this, http, options.version);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
-      this.socket = new SocketRoad(this, roads.url, { token, window }, options.WebSocket ?? platformSocket());
+      this.socket = new SocketRoad(this, roads.url, { token, window }, sockets);
       this.roads = roads;
     } else this.parts = () => new PartsRoad(this, new BlobParts(source));
     this.reception = new Reception(target, decoder, {
@@ -153,6 +158,16 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       sink: options.onBytes,
     });
     this.current = { phase: "idle", transport: this.transport };
+  }
+
+  /** The URL of the surface or file; undefined for a file of this machine. */
+  get url(): string | undefined {
+    return this.roads?.url;
+  }
+
+  /** What tells this version of a file from others, as far as its server says: its entity tag, or else its date. */
+  get version(): string | undefined {
+    return this.made?.version ?? this.options.version;
   }
 
   /** What to receive, where to stop, and in which order. */
@@ -289,6 +304,10 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     if (this.current.phase !== "streaming") this.tell({ phase: "streaming" });
   }
 
+  get portion(): number {
+    return this.link?.portion ?? Number.POSITIVE_INFINITY;
+  }
+
   async pace(size: number): Promise<void> {
     const { link } = this;
     if (link === undefined) return;
@@ -304,7 +323,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
 
   take(receive: () => View[]): void {
     let views: View[];
-    const before = this.reception.wireBytes;
+    const before = this.progress;
     try {
       views = receive();
     } catch (error) {
@@ -315,7 +334,9 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       else this.views.push(...views);
       this.waiting.wake();
     }
-    if (this.reception.wireBytes > before) this.options.onProgress?.(this.progress);
+    const now = this.progress;
+    const moved = (["wireBytes", "received", "planned", "size"] as const).some((key) => now[key] !== before[key]);
+    if (moved) this.options.onProgress?.(now);
   }
 
   async room(): Promise<void> {

@@ -1,0 +1,59 @@
+/** The worker's end: a decoder that does what is posted to it. */
+import { plainError } from "../../errors";
+import type { Surface } from "../../types";
+import { Decoder } from "../decoder";
+import { type Answer, buffersOf, type Call, type Port, type Request } from "./messages";
+
+/** Decode for the other end of a port; one decoder at a time, which `open` replaces. */
+export function serveDecoder(port: Port): void {
+  let decoder: Decoder | null = null;
+  let told = 0; // views that the other end knows of
+  port.addEventListener("message", ({ data }) => {
+    const { id, call } = data as Request;
+    let surface: Surface | null = null;
+    let error: Answer["error"] = null;
+    try {
+      if (call.do === "open") {
+        decoder = new Decoder(call.module, call.options);
+        told = 0;
+      } else if (decoder === null) {
+        throw new Error("expected a decoder to be opened first");
+      } else {
+        surface = carryOut(decoder, call);
+      }
+    } catch (caught) {
+      error = plainError(caught);
+    }
+    const views = (decoder?.layers.slice(told) ?? []).map((view) => view.info);
+    told += views.length;
+    const answer: Answer = { id, views, metadata: decoder?.metadata ?? null, surface, error };
+    port.postMessage(answer, surface ? buffersOf(surface) : []);
+  });
+}
+
+function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): Surface | null {
+  switch (call.do) {
+    case "feed":
+      decoder.feed(call.chunk);
+      return null;
+    case "feedAt":
+      decoder.feedAt(call.offset, call.chunk);
+      return null;
+    case "focus":
+      decoder.focus(call.region);
+      return null;
+    case "finish":
+      decoder.finish();
+      return null;
+    case "surface":
+      return viewOf(decoder, call.view).surface(call.level ?? undefined);
+    case "window":
+      return viewOf(decoder, call.view).window(call.region);
+  }
+}
+
+function viewOf(decoder: Decoder, number: number) {
+  const view = decoder.layers[number];
+  if (!view) throw new RangeError(`expected a view of 0 to ${decoder.layers.length - 1}, got ${number}`);
+  return view;
+}

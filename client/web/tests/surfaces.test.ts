@@ -1,0 +1,62 @@
+import { beforeAll, describe, expect, it } from "vitest";
+import { Decoder, type View } from "../src/decoding";
+import { loadKernels } from "../src/kernels/instance";
+import type { Region } from "../src/types";
+import { expectations, figures } from "./decoded";
+import { digests, type Expected } from "./golden";
+import { run } from "./python";
+
+/** Surfaces that are compared: `LODESTREAM_SURFACES=2000` for all that is promised. */
+const COUNT = Number(process.env.LODESTREAM_SURFACES ?? 48);
+const SEED = Number(process.env.LODESTREAM_SEED ?? 1);
+const AT_ONCE = 24;
+
+interface Case {
+  container: string;
+  expected: Expected;
+  window: { region: Region; layer: number; sha256: string[] } | null;
+  followed: {
+    slices: [number, number][];
+    pieces: number;
+    views: (number | null)[][];
+    complete: boolean;
+    sha256: string[][];
+  };
+}
+
+let kernels: WebAssembly.Module;
+beforeAll(async () => {
+  kernels = await loadKernels();
+});
+
+describe("random surfaces", () => {
+  const starts = Array.from({ length: Math.ceil(COUNT / AT_ONCE) }, (_, i) => SEED + i * AT_ONCE);
+  it.each(starts)(`are what Python decodes: ${AT_ONCE} from %i on`, { timeout: 600_000 }, (start) => {
+    const lines = run("tests.web.surfaces", start, Math.min(AT_ONCE, SEED + COUNT - start))
+      .trim()
+      .split("\n");
+    for (const [i, line] of lines.entries()) check(JSON.parse(line) as Case, `surface ${start + i}`);
+  });
+});
+
+function check({ container, expected, window, followed }: Case, name: string): void {
+  const data = new Uint8Array(Buffer.from(container, "base64"));
+  expect(expectations(kernels, data), name).toEqual(expected);
+  if (window) {
+    const decoder = new Decoder(kernels);
+    decoder.feed(data);
+    expect(digests(decoder.layers[window.layer]!.window(window.region)), `${name}, window`).toEqual(window.sha256);
+  }
+  const decoder = new Decoder(kernels);
+  const views: View[] = [];
+  for (const [offset, length] of followed.slices) {
+    for (let at = offset; at < offset + length; at += followed.pieces) {
+      views.push(...decoder.feedAt(at, data.subarray(at, Math.min(at + followed.pieces, offset + length))));
+    }
+  }
+  expect(views.map(figures), `${name}, views of a plan`).toEqual(followed.views);
+  expect(decoder.complete).toBe(followed.complete);
+  const every = Math.max(1, Math.floor(views.length / 4));
+  const shown = views.filter((_, i) => i % every === 0).map((view) => digests(view.surface()));
+  expect(shown, `${name}, surfaces of a plan`).toEqual(followed.sha256);
+}
