@@ -11,10 +11,11 @@ import { fieldName, type Look, legendOf, mapFor, shownRange } from "./look";
 import { LookPanel } from "./look-panel";
 import { Probe } from "./probe";
 import { Session } from "./session";
+import { Sharing } from "./sharing";
 import type { Moment, Source, SurfaceInfo } from "./source";
 import { Stage } from "./stage";
 import { styles } from "./styles";
-import { parseView, type SharedView, withView } from "./url-state";
+import type { SharedView } from "./url-state";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -44,6 +45,7 @@ export class LodestreamView extends HTMLElement {
   private readonly focusPanel: FocusPanel;
   private readonly lookPanel: LookPanel;
   private readonly probe: Probe;
+  private readonly sharing = new Sharing(() => this.sharedView());
   private stage: Stage | null = null;
   private session: Session | null = null;
   private orbit: Orbit | null = null;
@@ -56,7 +58,6 @@ export class LodestreamView extends HTMLElement {
   private lastBytes = -1;
   private life: AbortController | null = null;
   private pending = 0;
-  private sharing: ReturnType<typeof setTimeout> | undefined;
   private secret: string | null = null;
 
   constructor() {
@@ -149,8 +150,8 @@ export class LodestreamView extends HTMLElement {
     const timer = setInterval(() => this.watchSilence(), 1000);
     signal.addEventListener("abort", () => clearInterval(timer));
     if (this.hasAttribute("share")) {
-      this.shared = parseView(location.hash.replace(/^#/, ""));
-      addEventListener("hashchange", () => this.takeShared(parseView(location.hash.slice(1))), { signal });
+      this.shared = this.sharing.given;
+      addEventListener("hashchange", () => this.takeShared(this.sharing.given), { signal });
     }
     this.open();
   }
@@ -315,7 +316,7 @@ export class LodestreamView extends HTMLElement {
       session?.viewChanged();
     }
     this.colour();
-    this.share();
+    this.sharing.later();
   }
 
   /** Colours and legend by the range that is chosen or found. */
@@ -333,7 +334,7 @@ export class LodestreamView extends HTMLElement {
     this.orbit = orbit;
     this.stage?.setOrbit(orbit);
     this.session?.viewChanged();
-    this.share();
+    this.sharing.later();
   }
 
   private drawScales(): void {
@@ -394,23 +395,13 @@ export class LodestreamView extends HTMLElement {
     return at === null || this.framing === null ? null : this.framing.drawn(at, this.look.exaggeration);
   }
 
-  /** Writes the view into the address, soon: browsers limit how often that may be done. */
-  private share(): void {
-    if (!this.hasAttribute("share") || this.framing === null) return;
-    this.sharing ??= setTimeout(() => {
-      this.sharing = undefined;
-      if (!this.isConnected || this.orbit === null || this.framing === null) return;
-      const { field, map, range, exaggeration, lines } = this.look;
-      const view: SharedView = {
-        camera: this.framing.toSurface(this.orbit, exaggeration),
-        field,
-        map,
-        exaggeration,
-        lines,
-      };
-      if (range !== null) view.range = range;
-      history.replaceState(history.state, "", withView(location.hash, view));
-    }, 400);
+  /** The view as it is shared. */
+  private sharedView(): SharedView | null {
+    const { framing, orbit, look } = this;
+    if (!this.isConnected || !this.hasAttribute("share") || orbit === null || framing === null) return null;
+    const { field, map, range, exaggeration, lines } = look;
+    const camera = framing.toSurface(orbit, exaggeration);
+    return { camera, field, map, exaggeration, lines, ...(range === null ? {} : { range }) };
   }
 
   /** Shows the view of an address that the user has entered. */
