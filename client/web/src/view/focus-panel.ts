@@ -226,7 +226,7 @@ function detailText({ progress, info, drawn, drawnLevel }: FocusState): string {
   if (progress.state === "receiving" && progress.rate > 0) parts.push(`${formatBytes(progress.rate)}/s`);
   if (drawn !== null && info !== null) {
     const level = `level ${drawn.level} of ${info.levels}`;
-    parts.push(drawnLevel < drawn.level ? `${level}, drawn at ${drawnLevel}` : level);
+    parts.push(drawnLevel < drawn.level ? `${level} (drawn ${drawnLevel})` : level);
   }
   return [parts.join(" · "), progress.detail].filter((text) => text !== "").join(". ");
 }

@@ -1,5 +1,6 @@
 /** Blocks of a decoded surface as grids to draw: float64 coordinates, also of heights whose x and y follow rules. */
 
+import type { CoordinateRule, Plane } from "../container/extras";
 import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
 import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../decoding/heights";
@@ -71,7 +72,15 @@ function placed(
 ): { placement: Placement; at: [Float64Array, Float64Array] } {
   const halvings = header.levels - level;
   if (halvings === 0) {
-    return { placement: placementOf(metadata), at: [Float64Array.from(block.rows), Float64Array.from(block.columns)] };
+    const at: [Float64Array, Float64Array] = [Float64Array.from(block.rows), Float64Array.from(block.columns)];
+    const whole = block.shape.every((length, axis) => length === header.shape[axis as 0 | 1]);
+    const placement = placementOf(metadata);
+    if (whole) return { placement, at };
+    const { swapped } = placement;
+    const rules = placement.rules.map((rule, channel) =>
+      anywhere(rule, header.shape[(channel === 1) !== swapped ? 0 : 1]),
+    );
+    return { placement: { rules: rules as unknown as Plane, swapped, nodes: [[...at[0]], [...at[1]]] }, at };
   }
   const coarse = levelPlacement(metadata, null, header.shape, block.shape, header.closed, halvings);
   const placement: Placement = { ...placementOf(coarse.metadata), nodes: coarse.nodes };
@@ -84,6 +93,13 @@ function placed(
     return Float64Array.from({ length: nodes }, (_, k) => place(k));
   }) as [Float64Array, Float64Array];
   return { placement, at };
+}
+
+/** A rule that does not depend on how many places it is asked for: the one that names the last value of its axis. */
+function anywhere(rule: CoordinateRule, length: number): CoordinateRule {
+  if (rule.at(-1) !== true) return rule;
+  const [first, last] = [Number(rule[0]), Number(rule[1])];
+  return [first, (last - first) / Math.max(length - 1, 1)];
 }
 
 function fill(points: Float64Array, channel: number, plane: RulePlane, rows: number, columns: number): void {

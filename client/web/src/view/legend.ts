@@ -10,7 +10,7 @@ export interface LegendData {
   readonly unit: string;
   readonly map: ColourMapName;
   readonly range: readonly [number, number];
-  /** What stands for points without a value or for all; empty: nothing. */
+  /** A sentence below; may be empty. */
   readonly note: string;
 }
 

@@ -1,6 +1,6 @@
 /** The source of containers: a surface of a server, or a container file of any host. Everything happens in a worker. */
 
-import type { Grid, NodeValues, Region, Source, SourceEvents, Target } from "./source";
+import type { DetailWindow, Grid, NodeValues, Region, Source, SourceEvents, Target } from "./source";
 import type { FromSource, Question, ToSource } from "./source-messages";
 import SourceWorker from "./source-worker?worker&inline";
 
@@ -43,8 +43,8 @@ export class LodeSource implements Source {
     this.post({ kind: "open", url: this.url, token: this.token });
   }
 
-  async grids(moment: number, level: number): Promise<Grid[]> {
-    const answer = await this.ask({ kind: "grids", moment, level });
+  async grids(moment: number, level: number, window: DetailWindow | null): Promise<Grid[]> {
+    const answer = await this.ask({ kind: "grids", moment, level, window });
     return answer.kind === "grids" ? answer.grids : [];
   }
 

@@ -1,21 +1,21 @@
 /** `<lodestream-view>`: a surface that comes into focus, with its controls. */
 
-import { fitted, type Orbit, positionOf, VIEW_ANGLE } from "./camera";
-import { type ColourMapName, rangeOf } from "./colour-maps";
+import { type Orbit, positionOf } from "./camera";
 import { html, setText } from "./dom";
-import { defaultExaggeration } from "./exaggeration";
 import { FocusPanel } from "./focus-panel";
+import { Framing } from "./framing";
 import type { FromGeometry } from "./geometry-messages";
 import { type Command, listen } from "./gestures";
-import type { Frame } from "./lattice";
 import { Legend, ScaleBar } from "./legend";
-import { fieldName, isCentred, type Look, LookPanel, mapFor } from "./look-panel";
+import { fieldName, type Look, legendOf, mapFor, shownRange } from "./look";
+import { LookPanel } from "./look-panel";
 import { Probe } from "./probe";
 import { Session } from "./session";
+import { Sharing } from "./sharing";
 import type { Moment, Source, SurfaceInfo } from "./source";
 import { Stage } from "./stage";
 import { styles } from "./styles";
-import { parseView, type SharedView, withView } from "./url-state";
+import type { SharedView } from "./url-state";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -45,11 +45,12 @@ export class LodestreamView extends HTMLElement {
   private readonly focusPanel: FocusPanel;
   private readonly lookPanel: LookPanel;
   private readonly probe: Probe;
+  private readonly sharing = new Sharing(() => this.sharedView());
   private stage: Stage | null = null;
   private session: Session | null = null;
   private orbit: Orbit | null = null;
   private home: Orbit | null = null;
-  private frame: Frame | null = null;
+  private framing: Framing | null = null;
   private latest: Patches | null = null;
   private look: Look = { field: { kind: "height" }, map: "viridis", range: null, exaggeration: 1, lines: false };
   private shared: SharedView = {};
@@ -57,7 +58,6 @@ export class LodestreamView extends HTMLElement {
   private lastBytes = -1;
   private life: AbortController | null = null;
   private pending = 0;
-  private sharing: ReturnType<typeof setTimeout> | undefined;
   private secret: string | null = null;
 
   constructor() {
@@ -150,8 +150,8 @@ export class LodestreamView extends HTMLElement {
     const timer = setInterval(() => this.watchSilence(), 1000);
     signal.addEventListener("abort", () => clearInterval(timer));
     if (this.hasAttribute("share")) {
-      this.shared = parseView(location.hash.replace(/^#/, ""));
-      addEventListener("hashchange", () => this.takeShared(parseView(location.hash.slice(1))), { signal });
+      this.shared = this.sharing.given;
+      addEventListener("hashchange", () => this.takeShared(this.sharing.given), { signal });
     }
     this.open();
   }
@@ -181,7 +181,7 @@ export class LodestreamView extends HTMLElement {
     this.session = null;
     this.orbit = null;
     this.home = null;
-    this.frame = null;
+    this.framing = null;
     this.latest = null;
     this.notice.textContent = "";
     const { src, stage } = this;
@@ -245,11 +245,10 @@ export class LodestreamView extends HTMLElement {
   private drawn(patches: Patches, moment: Moment): void {
     const { stage, session } = this;
     if (stage === null || session?.info == null) return;
-    const before = this.latest === null ? null : this.frame;
     this.latest = patches;
-    if (before === null || before.scale.some((scale, k) => scale !== patches.frame.scale[k]))
-      this.reframe(patches, session.info);
-    else this.frame = patches.frame;
+    if (this.framing === null || this.framing.differs(patches.frame)) {
+      this.reframe(new Framing(patches.frame, patches.box, session.info));
+    }
     this.colour();
     this.canvas.dataset.triangles = String(patches.triangles);
     this.refresh();
@@ -260,27 +259,17 @@ export class LodestreamView extends HTMLElement {
   }
 
   /** Places the camera: to see all, or where it was if it has been moved. */
-  private reframe({ frame, box }: Patches, info: SurfaceInfo): void {
-    const first = this.frame === null || this.home === null;
-    const kept = this.orbit !== null && this.orbit !== this.home && !first ? this.toSurface(this.orbit) : null;
-    this.frame = frame;
-    const half = ([0, 1, 2] as const).map((k) => ((box[1][k] - box[0][k]) / 2) * frame.scale[k]) as [
-      number,
-      number,
-      number,
-    ];
-    const even = frame.scale[0] === frame.scale[2];
-    const whole = info.heights || !even ? 0 : (info.extent / 2) * frame.scale[0];
-    this.stage?.setRadius(Math.max(Math.hypot(...half), whole) * 1.5);
-    const exaggeration = first
-      ? (this.shared.exaggeration ?? defaultExaggeration(half, info.heights))
-      : this.look.exaggeration;
-    const [width, height] = this.stage?.size ?? [1, 1];
-    this.home = fitted([half[0], half[1], half[2] * exaggeration], whole, width / height, info.heights);
-    this.setLook({ ...this.look, exaggeration });
-    const wanted = kept ?? (first ? this.shared.camera : undefined);
-    this.setOrbit(wanted === undefined ? this.home : this.toDrawn(wanted));
-    if (first) this.shared = {};
+  private reframe(framing: Framing): void {
+    const { orbit, home, framing: before, stage, shared } = this;
+    const { exaggeration } = this.look;
+    const kept = orbit !== null && orbit !== home ? before?.toSurface(orbit, exaggeration) : shared.camera;
+    this.framing = framing;
+    stage?.setRadius(framing.radius);
+    if (before === null) this.setLook({ ...this.look, exaggeration: shared.exaggeration ?? framing.exaggeration });
+    const [width, height] = stage?.size ?? [1, 1];
+    this.home = framing.home(this.look.exaggeration, width / height);
+    this.setOrbit(kept === undefined ? this.home : framing.toDrawn(kept, this.look.exaggeration));
+    this.shared = {};
   }
 
   private changed(kind: "info" | "moment" | "progress", detail: unknown): void {
@@ -322,51 +311,37 @@ export class LodestreamView extends HTMLElement {
       look = { ...look, map: mapFor(look.field, session?.info ?? null), range: null };
     }
     this.look = look;
-    if (stage !== null) {
-      stage.material.setMap(look.map);
-      stage.material.set("lines", look.lines ? 1 : 0);
-      stage.material.set("plain", look.field.kind === "none" ? 1 : 0);
-      if (look.exaggeration !== before.exaggeration) stage.setExaggeration(look.exaggeration);
-      if (look.exaggeration !== before.exaggeration) session?.viewChanged();
+    if (look.exaggeration !== before.exaggeration) {
+      stage?.setExaggeration(look.exaggeration);
+      session?.viewChanged();
     }
     this.colour();
-    this.share();
+    this.sharing.later();
   }
 
   /** Colours and legend by the range that is chosen or found. */
   private colour(): void {
     const { latest, look, session, stage } = this;
-    const found = latest?.colouring.range ?? [Number.NaN, Number.NaN];
-    const range = look.range ?? rangeOf(found[0], found[1], isCentred(look.field));
-    this.lookPanel.draw(look, latest === null ? [Number.NaN, Number.NaN] : range);
-    if (latest === null || stage === null) return;
+    const range = latest === null ? null : shownRange(look, latest.colouring);
+    this.lookPanel.draw(look, range ?? [Number.NaN, Number.NaN]);
+    if (latest === null || range === null || stage === null) return;
     const { low, span } = latest.colouring;
-    stage.material.setRange((range[0] - low) / span, (range[1] - low) / span);
-    stage.draw();
-    const unit =
-      look.field.kind === "slope" ? "degrees" : look.field.kind === "attribute" ? "" : (session?.info?.unit ?? "");
-    this.legend.draw(
-      look.field.kind === "none"
-        ? null
-        : { title: fieldName(look.field), unit, map: look.map as ColourMapName, range, note: "" },
-    );
+    stage.setLook(look, (range[0] - low) / span, (range[1] - low) / span);
+    this.legend.draw(legendOf(look, range, session?.info?.unit ?? ""));
   }
 
   private setOrbit(orbit: Orbit): void {
     this.orbit = orbit;
     this.stage?.setOrbit(orbit);
     this.session?.viewChanged();
-    this.share();
+    this.sharing.later();
   }
 
   private drawScales(): void {
-    const { orbit, frame, session, stage } = this;
-    if (orbit === null || frame === null || stage === null || session?.info == null) return;
-    const perUnit = stage.size[1] / (2 * orbit.distance * Math.tan((VIEW_ANGLE * Math.PI) / 360));
-    const { geographic, unit, georeferenced, heights } = session.info;
-    const scale = geographic ? frame.scale[1] / 111_320 : frame.scale[0];
-    const named = geographic ? "m" : unit || (heights && !georeferenced ? "cells" : "");
-    this.scales.draw(heights || unit !== "" ? perUnit * scale : 0, named, georeferenced ? orbit.azimuth : null);
+    const { orbit, framing, session, stage } = this;
+    if (orbit === null || framing === null || stage === null || session?.info == null) return;
+    const { pixels, unit } = framing.scale(orbit, stage.size[1]);
+    this.scales.draw(pixels, unit, session.info.georeferenced ? orbit.azimuth : null);
   }
 
   private command(name: Command): void {
@@ -416,49 +391,33 @@ export class LodestreamView extends HTMLElement {
 
   /** The last place under the pointer, as it is drawn. */
   private anchor(): [number, number, number] | null {
-    const { frame } = this;
-    const at = this.probe.at;
-    if (frame === null || at === null) return null;
-    const drawn = at.map((value, k) => (value - frame.origin[k as 0 | 1 | 2]) * frame.scale[k as 0 | 1 | 2]) as [
-      number,
-      number,
-      number,
-    ];
-    return [drawn[0], drawn[1], drawn[2] * this.look.exaggeration];
+    const { at } = this.probe;
+    return at === null || this.framing === null ? null : this.framing.drawn(at, this.look.exaggeration);
   }
 
-  /** Writes the view into the address, soon: browsers limit how often that may be done. */
-  private share(): void {
-    if (!this.hasAttribute("share") || this.orbit === null || this.frame === null) return;
-    this.sharing ??= setTimeout(() => {
-      this.sharing = undefined;
-      if (!this.isConnected || this.orbit === null || this.frame === null) return;
-      const { field, map, range, exaggeration, lines } = this.look;
-      const view: SharedView = { camera: this.toSurface(this.orbit), field, map, exaggeration, lines };
-      if (range !== null) view.range = range;
-      history.replaceState(history.state, "", withView(location.hash, view));
-    }, 400);
+  /** The view as it is shared. */
+  private sharedView(): SharedView | null {
+    const { framing, orbit, look } = this;
+    if (!this.isConnected || !this.hasAttribute("share") || orbit === null || framing === null) return null;
+    const { field, map, range, exaggeration, lines } = look;
+    const camera = framing.toSurface(orbit, exaggeration);
+    return { camera, field, map, exaggeration, lines, ...(range === null ? {} : { range }) };
   }
 
-  private takeShared(view: SharedView): void {
-    if (view.camera !== undefined && this.frame !== null) this.setOrbit(this.toDrawn(view.camera));
-  }
-
-  /** A camera in the surface's coordinates; its distance in units of x. */
-  private toSurface(orbit: Orbit): Orbit {
-    const { origin, scale } = this.frame!;
-    const target = orbit.target.map(
-      (value, k) => value / scale[k as 0 | 1 | 2] / (k === 2 ? this.look.exaggeration : 1) + origin[k as 0 | 1 | 2],
-    );
-    return { ...orbit, distance: orbit.distance / scale[0], target: target as unknown as Orbit["target"] };
-  }
-
-  private toDrawn(orbit: Orbit): Orbit {
-    const { origin, scale } = this.frame!;
-    const target = orbit.target.map(
-      (value, k) => (value - origin[k as 0 | 1 | 2]) * scale[k as 0 | 1 | 2] * (k === 2 ? this.look.exaggeration : 1),
-    );
-    return { ...orbit, distance: orbit.distance * scale[0], target: target as unknown as Orbit["target"] };
+  /** Shows the view of an address that the user has entered. */
+  private takeShared({ camera, field, map, range, exaggeration, lines }: SharedView): void {
+    if (this.framing === null) return;
+    const { look } = this;
+    if (field !== undefined && fieldName(field) !== fieldName(look.field)) this.setLook({ ...look, field });
+    const kept = this.look;
+    this.setLook({
+      ...kept,
+      map: map ?? kept.map,
+      range: range ?? null,
+      exaggeration: exaggeration ?? kept.exaggeration,
+      lines: lines ?? false,
+    });
+    if (camera !== undefined) this.setOrbit(this.framing.toDrawn(camera, this.look.exaggeration));
   }
 
   /** Where the camera is, in drawn coordinates; for tests. */

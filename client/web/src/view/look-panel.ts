@@ -1,20 +1,11 @@
 /** The part of the panel about looks: colours, range, exaggeration, lines. */
 
-import { COLOUR_MAPS, type ColourMapName, isColourMap } from "./colour-maps";
+import { COLOUR_MAPS, isColourMap } from "./colour-maps";
 import { html, setText } from "./dom";
 import { formatNumber } from "./format";
 import type { Field } from "./geometry-messages";
+import { fieldName, type Look } from "./look";
 import type { SurfaceInfo } from "./source";
-
-/** What can be chosen. */
-export interface Look {
-  readonly field: Field;
-  readonly map: ColourMapName;
-  /** null: that of the values. */
-  readonly range: readonly [number, number] | null;
-  readonly exaggeration: number;
-  readonly lines: boolean;
-}
 
 const KEYS: readonly (readonly [string, string])[] = [
   ["Arrows", "turn"],
@@ -28,34 +19,6 @@ const KEYS: readonly (readonly [string, string])[] = [
   ["L", "quad lines"],
   ["X and Z", "more, less exaggeration"],
 ];
-
-/** The map that suits a field. */
-export function mapFor(field: Field, info: SurfaceInfo | null): ColourMapName {
-  if (field.kind === "change") return "red-blue";
-  if (field.kind === "height" && info?.heights) return "terrain";
-  return "viridis";
-}
-
-/** Whether the colours of a field are centred at 0. */
-export function isCentred(field: Field): boolean {
-  return field.kind === "change";
-}
-
-/** How a field is called. */
-export function fieldName(field: Field): string {
-  switch (field.kind) {
-    case "none":
-      return "Shading only";
-    case "height":
-      return "Height";
-    case "slope":
-      return "Slope";
-    case "change":
-      return "Last change";
-    case "attribute":
-      return field.component === 0 ? field.name : `${field.name}, component ${field.component}`;
-  }
-}
 
 /** The section "Look", and the keys. */
 export class LookPanel {

@@ -57,6 +57,7 @@ void main() {
 /** The material of all patches. */
 export class SurfaceMaterial extends RawShaderMaterial {
   private map: DataTexture;
+  private mapName: ColourMapName = "viridis";
 
   constructor() {
     const map = lookup("viridis");
@@ -93,6 +94,8 @@ export class SurfaceMaterial extends RawShaderMaterial {
 
   /** Takes another colour map. */
   setMap(name: ColourMapName): void {
+    if (name === this.mapName) return;
+    this.mapName = name;
     this.map.dispose();
     this.map = lookup(name);
     this.uniforms.map!.value = this.map;

@@ -8,9 +8,10 @@ import { loadKernels } from "../kernels/instance";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
+import { composed, thinned } from "./compose";
 import { type Description, describe, infoOf, NO_DESCRIPTION } from "./description";
 import { areHeights, gridOf, placeOf } from "./grids";
-import type { Grid, NodeValues, Progress, Region, SourceEvents, Target } from "./source";
+import type { DetailWindow, Grid, NodeValues, Progress, Region, SourceEvents, Target } from "./source";
 
 /** Milliseconds over which the rate is measured. */
 const RATE_SPAN = 2000;
@@ -68,10 +69,15 @@ export class Receiver {
   }
 
   /** The grids of a moment, see `Source.grids`. */
-  grids(moment: number, level: number): Grid[] {
+  grids(moment: number, level: number, window: DetailWindow | null): Grid[] {
     const header = this.decoder!.header!;
-    const surface = this.views[moment]!.surface(level === header.levels ? undefined : level);
-    return surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
+    const view = this.views[moment]!;
+    const surface = view.surface(level === header.levels ? undefined : level);
+    const grids = surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
+    if (window === null) return grids;
+    const [part] = view.window(window.region).blocks;
+    const fine = gridOf(part!, 0, header, header.levels, this.metadata);
+    return [composed(grids[0]!, thinned(fine, window.stride))];
   }
 
   /** The values of a node, see `Source.valuesAt`. */

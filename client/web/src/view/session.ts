@@ -2,9 +2,10 @@
 
 import type { Field, FromGeometry, Hit, ToGeometry } from "./geometry-messages";
 import GeometryWorker from "./geometry-worker?worker&inline";
-import { belowPixel, finestDrawn, firstLevel } from "./levels";
-import type { Moment, Progress, Region, Source, SurfaceInfo, Target } from "./source";
+import { belowPixel, firstLevel } from "./levels";
+import type { DetailWindow, Moment, Progress, Region, Source, SurfaceInfo, Target } from "./source";
 import type { Stage } from "./stage";
+import { drawingFor } from "./windows";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -33,9 +34,10 @@ export class Session {
   private readonly worker = new GeometryWorker();
   private readonly picks = new Map<number, (hit: Hit | null) => void>();
   private chosen: number | null = null;
-  private shown: { moment: Moment; level: number } | null = null;
+  private shown: { moment: Moment; level: number; window: DetailWindow | null } | null = null;
   private awaited: ((patches: Patches) => void) | null = null;
   private wanted: number | null = null;
+  private region: Region | null = null;
   private pixels = 0;
   private asked = 0;
   private busy = false;
@@ -183,16 +185,15 @@ export class Session {
       this.chosen === null ? this.moments.at(-1) : this.moments.find(({ number }) => number === this.chosen);
     if (this.busy || this.closed || info === null || moment === undefined) return;
     const [width, height] = this.stage.size;
-    const level = Math.min(
-      this.wanted ?? firstLevel(info, width * height),
-      finestDrawn(info, this.triangles),
-      moment.level,
-    );
-    const { shown } = this;
-    if (shown?.moment.number === moment.number && shown.level >= level) return;
+    const { shown, region } = this;
+    const wanted = this.wanted ?? firstLevel(info, width * height);
+    const { level, window } = drawingFor(info, this.triangles, wanted, moment.level, region, shown?.window ?? null);
+    const finer = window === null ? level : Number.POSITIVE_INFINITY;
+    const had = shown === null ? -1 : shown.window === null ? shown.level : Number.POSITIVE_INFINITY;
+    if (shown?.moment.number === moment.number && had >= finer && (window === null || window === shown.window)) return;
     this.busy = true;
     try {
-      const grids = await this.source.grids(moment.number, level);
+      const grids = await this.source.grids(moment.number, level, window);
       if (this.closed) return;
       const came = new Promise<Patches>((resolve) => {
         this.awaited = resolve;
@@ -206,10 +207,11 @@ export class Session {
       const joined = info.joined || info.blocks.length > 1;
       const diagonal = heights ? 0 : info.extent;
       const options = { joined, geographic, heights, diagonal, fresh: shown === null };
-      this.post({ kind: "picture", picture: moment.number, level, grids, options }, [...new Set(buffers)]);
+      const drawn = window === null ? level : info.levels - Math.log2(window.stride);
+      this.post({ kind: "picture", picture: moment.number, level: drawn, grids, options }, [...new Set(buffers)]);
       const patches = await came;
       if (this.closed) return;
-      this.shown = { moment, level };
+      this.shown = { moment, level, window };
       const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
       const blended = !still && patches.patches.some(({ from }) => from !== null);
       await new Promise<void>((resolve) => {
@@ -241,6 +243,7 @@ export class Session {
         break;
       case "wants":
         this.wanted = message.level;
+        this.region = message.region;
         this.pixels = message.pixels;
         this.considerPixels();
         this.considerFocus(message.region);

@@ -1,10 +1,10 @@
 /** What `LodeSource` and its worker say to each other; arrays are transferred, not copied. */
 
-import type { Grid, Moment, NodeValues, Progress, Region, SurfaceInfo, Target } from "./source";
+import type { DetailWindow, Grid, Moment, NodeValues, Progress, Region, SurfaceInfo, Target } from "./source";
 
 /** A question that has an answer. */
 export type Question =
-  | { readonly kind: "grids"; readonly moment: number; readonly level: number }
+  | { readonly kind: "grids"; readonly moment: number; readonly level: number; readonly window: DetailWindow | null }
   | {
       readonly kind: "values";
       readonly moment: number;

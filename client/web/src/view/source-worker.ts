@@ -46,7 +46,7 @@ function answer({ id, question }: Extract<ToSource, { kind: "question" }>): void
       scope.postMessage({ kind: "values", id, values: receiver.valuesAt(moment, block, row, column) });
       return;
     }
-    const grids = receiver.grids(question.moment, question.level);
+    const grids = receiver.grids(question.moment, question.level, question.window);
     const buffers = grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
       [points, mask, rowsAt, columnsAt, ...attributes.map(({ values }) => values)].flatMap((array) =>
         array === null ? [] : [array.buffer as ArrayBuffer],

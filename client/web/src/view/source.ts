@@ -116,6 +116,13 @@ export interface NodeValues {
   readonly max: number;
 }
 
+/** A part of a surface that is drawn in more detail than the rest. */
+export interface DetailWindow {
+  readonly region: Region;
+  /** Every so many-th row and column of the full resolution. */
+  readonly stride: number;
+}
+
 /** How the transmission stands. */
 export interface Progress {
   readonly state: "connecting" | "receiving" | "waiting" | "resuming" | "stopped" | "target" | "complete" | "failed";
@@ -148,9 +155,10 @@ export interface Source {
    *
    * @param moment - Number of a moment.
    * @param level - 0 to `levels`.
+   * @param window - Of the only block, a part that the grid shows in more detail; null: none.
    * @throws Error if they cannot be computed, e.g. because the data are damaged.
    */
-  grids(moment: number, level: number): Promise<Grid[]>;
+  grids(moment: number, level: number, window: DetailWindow | null): Promise<Grid[]>;
   /** The values of a node at full resolution, as they are known at a moment, and the errors that hold there. */
   valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues>;
   /** Asks for a region before the rest; null: no longer. Without effect on surfaces of several blocks. */

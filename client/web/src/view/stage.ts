@@ -15,6 +15,7 @@ import {
 } from "three";
 import { clipping, type Orbit, positionOf, VIEW_ANGLE } from "./camera";
 import type { Eye, PatchBuffers } from "./geometry-messages";
+import type { Look } from "./look";
 import { SurfaceMaterial } from "./material";
 
 /** Milliseconds in which new detail is blended in. */
@@ -22,7 +23,7 @@ const BLEND = 350;
 
 /** What is drawn. Draws only when something has changed. */
 export class Stage {
-  readonly material = new SurfaceMaterial();
+  private readonly material = new SurfaceMaterial();
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly group = new Group();
@@ -95,6 +96,15 @@ export class Stage {
   /** Takes another place of the camera, in drawn coordinates with exaggeration. */
   setOrbit(orbit: Orbit): void {
     this.orbit = orbit;
+    this.draw();
+  }
+
+  /** Colours by a map over a range of the values in the buffers. */
+  setLook({ map, lines, field }: Look, low: number, high: number): void {
+    this.material.setMap(map);
+    this.material.setRange(low, high);
+    this.material.set("lines", lines ? 1 : 0);
+    this.material.set("plain", field.kind === "none" ? 1 : 0);
     this.draw();
   }
 

@@ -14,7 +14,7 @@ export interface PatchBounds {
   readonly edge: number;
 }
 
-/** Quads are drawn at least this large, in pixels. */
+/** Quads are drawn about this large, in pixels. */
 const QUAD_PIXELS = 1.5;
 /** Outside the view a patch may have quads so many times larger. */
 const OUTSIDE = 8;
@@ -57,7 +57,7 @@ export function chooseStrides(bounds: readonly PatchBounds[], eye: Eye, most: nu
     const wish = Math.log2((QUAD_PIXELS * distance) / (Math.max(of.edge, 1e-12) * eye.focal));
     if (visible) {
       nearest = Math.min(nearest, distance);
-      finer = Math.max(finer, -wish);
+      finer = Math.max(finer, -wish - 0.5);
     }
     return visible ? wish : wish + Math.log2(OUTSIDE);
   });
@@ -65,7 +65,7 @@ export function chooseStrides(bounds: readonly PatchBounds[], eye: Eye, most: nu
   for (let more = 0; ; more += 0.25) {
     let triangles = 0;
     const strides = Int32Array.from(wished, (wish, k) => {
-      const stride = 2 ** Math.min(Math.max(Math.floor(wish + more), 0), largest);
+      const stride = 2 ** Math.min(Math.max(Math.round(wish + more), 0), largest);
       triangles += trianglesOf(bounds[k]!.patch, stride);
       return stride;
     });

@@ -23,7 +23,9 @@ canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block
 canvas:active { cursor: grabbing }
 canvas:focus-visible { outline: 2px solid var(--accent); outline-offset: -3px }
 .corner { position: absolute; pointer-events: none }
-.scales { position: absolute; left: 14px; bottom: 12px; display: flex; align-items: flex-end; gap: 12px; pointer-events: none }
+.scales { position: absolute; left: 14px; bottom: 12px; display: flex; align-items: flex-end; gap: 12px; pointer-events: none;
+  padding: 6px 10px; border-radius: 6px; background: color-mix(in srgb, var(--sheet) 72%, transparent) }
+.scales:not(:has(> :not([hidden]))) { display: none }
 .compass { width: 36px; height: 36px } .scale { width: 130px; height: 24px; overflow: visible }
 .compass-ring { fill: none; stroke: var(--soft); stroke-opacity: .45 } .north { fill: var(--ink) }
 .scale-line { fill: none; stroke: var(--ink); stroke-width: 1.5 } .scale-text { fill: var(--ink); font-size: 11px }

@@ -1,0 +1,87 @@
+/** Between a surface's own coordinates and those in which it is drawn: cameras, scales, what fits into the view. */
+
+import { fitted, type Orbit, VIEW_ANGLE } from "./camera";
+import { defaultExaggeration } from "./exaggeration";
+import type { Box } from "./geometry-messages";
+import type { Frame } from "./lattice";
+import type { SurfaceInfo } from "./source";
+
+type Triple = readonly [number, number, number];
+
+/** Metres of a degree of latitude, which is what the scale bar of geographic coordinates shows. */
+const DEGREE = 111_320;
+
+function triple(of: (axis: 0 | 1 | 2) => number): [number, number, number] {
+  return [of(0), of(1), of(2)];
+}
+
+/** How one surface is framed. */
+export class Framing {
+  /** Half the drawn extent along each axis, before exaggeration. */
+  readonly half: Triple;
+  /** Half the drawn diagonal of the whole surface where what is drawn may still be smaller; else 0. */
+  readonly whole: number;
+
+  constructor(
+    readonly frame: Frame,
+    box: Box,
+    private readonly info: SurfaceInfo,
+  ) {
+    this.half = triple((k) => ((box[1][k] - box[0][k]) / 2) * frame.scale[k]);
+    // Where z has a scale of its own, the diagonal says nothing.
+    this.whole = info.heights || frame.scale[0] !== frame.scale[2] ? 0 : (info.extent / 2) * frame.scale[0];
+  }
+
+  /** How far from 0 anything is drawn, before exaggeration. */
+  get radius(): number {
+    return 1.5 * Math.max(Math.hypot(...this.half), this.whole);
+  }
+
+  /** By how much heights are exaggerated where nobody says it. */
+  get exaggeration(): number {
+    return defaultExaggeration(this.half, this.info.heights);
+  }
+
+  /** Whether another frame draws coordinates elsewhere. */
+  differs(frame: Frame): boolean {
+    return this.frame.scale.some((scale, k) => scale !== frame.scale[k]);
+  }
+
+  /** The camera that sees all. @param aspect - Width of the view by its height. */
+  home(exaggeration: number, aspect: number): Orbit {
+    const [x, y, z] = this.half;
+    return fitted([x, y, z * exaggeration], this.whole, aspect, this.info.heights);
+  }
+
+  /** A point as it is drawn. */
+  drawn(point: Triple, exaggeration: number): [number, number, number] {
+    const { origin, scale } = this.frame;
+    return triple((k) => (point[k] - origin[k]) * scale[k] * (k === 2 ? exaggeration : 1));
+  }
+
+  /** A drawn camera in the surface's coordinates; its distance in units of x. */
+  toSurface(orbit: Orbit, exaggeration: number): Orbit {
+    const { origin, scale } = this.frame;
+    const target = triple((k) => orbit.target[k] / scale[k] / (k === 2 ? exaggeration : 1) + origin[k]);
+    return { ...orbit, distance: orbit.distance / scale[0], target };
+  }
+
+  /** Undoes `toSurface`. */
+  toDrawn(orbit: Orbit, exaggeration: number): Orbit {
+    return { ...orbit, distance: orbit.distance * this.frame.scale[0], target: this.drawn(orbit.target, exaggeration) };
+  }
+
+  /**
+   * What the scale bar shows.
+   *
+   * @param height - Of the view, in pixels.
+   * @returns pixels of a length of 1 at the camera's target, 0 where a length means nothing, and the unit.
+   */
+  scale(orbit: Orbit, height: number): { pixels: number; unit: string } {
+    const { geographic, unit, georeferenced, heights } = this.info;
+    const drawn = height / (2 * orbit.distance * Math.tan((VIEW_ANGLE * Math.PI) / 360));
+    if (!heights && unit === "") return { pixels: 0, unit: "" };
+    if (geographic) return { pixels: (drawn * this.frame.scale[1]) / DEGREE, unit: "m" };
+    return { pixels: drawn * this.frame.scale[0], unit: unit || (georeferenced ? "" : "cells") };
+  }
+}
