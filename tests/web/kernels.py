@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lodestream.axis import axis_step
-from lodestream.exactness import encode_piece
-from lodestream.layout import Layout
-from lodestream.lifting import forward_step, inverse_step
-from lodestream.mask import encode_mask
-from tests.core.coding import decode_runs, encode_runs, passes_of
+from lodestream.entropy.mask import encode_mask
+from lodestream.grid.axis import axis_step
+from lodestream.grid.layout import Layout
+from lodestream.residual.chunk_coder import encode_piece
+from lodestream.transform.lifting import forward_step, inverse_step
+from tests.core.entropy.coding import decode_runs, encode_runs, passes_of
 
 
 def main(seed: int, count: int) -> None:
