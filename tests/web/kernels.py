@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lodestream.entropy.mask import encode_mask
 from lodestream.grid.axis import axis_step
 from lodestream.grid.layout import Layout
-from lodestream.residual.chunk_coder import encode_piece
+from lodestream.residual.chunk_coder import encode_chunk
 from lodestream.transform.lifting import forward_step, inverse_step
 from tests.core.entropy.coding import decode_runs, encode_runs, passes_of
 
@@ -132,7 +132,7 @@ def piece(chance: random.Random, rng: np.random.Generator) -> dict[str, Any]:
         original = (restored.astype(np.int64) + near).astype(dtype)
         if chance.random() < 0.2:
             original = rng.integers(limits.min, limits.max, count, dtype, endpoint=True)
-    data = encode_piece(original, restored, step)
+    data = encode_chunk(original, restored, step)
     return {
         "dtype": dtype.name,
         "restored": packed(restored),

@@ -7,7 +7,7 @@ static int64_t lode_spread(const int32_t *known, int64_t known_count, const int8
                            int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch, int64_t first_row,
                            int64_t first_column);
 
-#include "spreading.c"
+#include "dequantize.c"
 
 /* `size` numbers of known, sign and early, `bands_count` numbers in the table of bands. */
 EXPORTED(spread)
