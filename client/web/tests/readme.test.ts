@@ -8,7 +8,7 @@ import { ROOT } from "./golden";
 import { type Served, serve } from "./servers";
 
 const PAGE = readFileSync(join(ROOT, "client/web/README.md"), "utf8");
-const SECTION = PAGE.split("## Receiving a surface")[1]!;
+const SECTION = PAGE.split("## Receiving a surface")[1]!.split("\n## ")[0]!;
 const EXAMPLES = [...SECTION.matchAll(/```js\n(.*?)```/gs)].map((found) => found[1]!);
 
 let served: Served;
