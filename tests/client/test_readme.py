@@ -37,7 +37,7 @@ def test_its_links_lead_somewhere() -> None:
 
 def test_its_commands_are_understood() -> None:
     found = commands()
-    assert {command[0] for command in found} == {"encode", "info", "decode", "serve", "push", "pull", "token"}
+    assert {command[0] for command in found} == {"encode", "info", "decode", "serve", "push", "pull", "token", "view"}
     for command in found:
         build_parser().parse_args([it.replace("URL", "http://127.0.0.1:8000/v1/surfaces/ID") for it in command])
 

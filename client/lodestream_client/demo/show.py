@@ -106,6 +106,7 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
     if drawn is not None:
         paths.append(drawn)
     out.print(cell(f"Written: {', '.join(map(str, paths))}"))
+    out.print(cell(f"See it come into focus in a browser: lodestream view {file}"))
     if as_json:
         print_json(
             {
