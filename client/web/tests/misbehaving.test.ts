@@ -16,8 +16,9 @@ import {
 import { makeTarget } from "../src/planning/target";
 import { SUBPROTOCOL } from "../src/protocol/messages";
 import { serialize } from "../src/protocol/wire";
+import type { StreamOptions, StreamState } from "../src/transfer/options";
 import type { SocketClass } from "../src/transfer/socket";
-import { Stream, type StreamOptions, type StreamState } from "../src/transfer/stream";
+import { Stream } from "../src/transfer/stream";
 import { decoderFor } from "./decoders";
 import { containerOf, NAMES } from "./golden";
 import { Sender } from "./sender";

@@ -14,9 +14,10 @@ import {
 } from "../src/errors";
 import { loadKernels } from "../src/kernels/instance";
 import { makeTarget, type TargetOptions } from "../src/planning/target";
+import type { Progress, StreamOptions, StreamState } from "../src/transfer/options";
 import type { SocketClass } from "../src/transfer/socket";
 import { MemoryStore } from "../src/transfer/store";
-import { type Progress, Stream, type StreamOptions, type StreamState } from "../src/transfer/stream";
+import { Stream } from "../src/transfer/stream";
 import type { Region, Surface } from "../src/types";
 import { decoderFor } from "./decoders";
 import { type Fault, Faulty, type Served, serve } from "./servers";
