@@ -8,11 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-<<<<<<< HEAD
 .PHONY: help demo kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
-=======
-.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream test-web bench-web wheels clean
->>>>>>> w-webdecode
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -125,25 +121,7 @@ bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS
 bench-stream: kernels ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
 	@$(BIN)/python -m benchmarks.stream
 
-<<<<<<< HEAD
 wheels: page ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
-=======
-# The library and the page for browsers; Node 20 or newer is all that is not installed here.
-WEB := client/web
-
-test-web: kernels $(WEB)/node_modules/.installed ## check and test the TypeScript in Node; LODESTREAM_SURFACES=2000 for all surfaces
-	@cd $(WEB) && export PYTHON=$(CURDIR)/$(BIN)/python && npm run --silent check && npm test --silent -- $(ARGS)
-
-bench-web: kernels $(WEB)/node_modules/.installed ## how fast decoding is as WebAssembly in Node, beside this library
-	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent bench
-
-$(WEB)/node_modules/.installed: $(WEB)/package-lock.json $(STAMP)
-	@$(BIN)/python -P -c 'import ziglang' 2>/dev/null || $(BIN)/python -m pip install --quiet --group web
-	@cd $(WEB) && npm ci --silent
-	@touch $@
-
-wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
->>>>>>> w-webdecode
 	@$(BIN)/python -P -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@$(BIN)/python .ci/wheels.py dist
 
