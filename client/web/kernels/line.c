@@ -60,8 +60,8 @@ static int64_t decimal_place(double value, int32_t places) {
 
 /* Places and exponents of finite values, by a rule of section 9 (1: patterns, 2: decimals) and its argument. */
 EXPORTED(to_line)
-void to_line(int32_t rule, int32_t argument, const void *values, int32_t type, int32_t count,
-                           int64_t *line, int32_t *exponents) {
+void to_line(int32_t rule, int32_t argument, const void *values, int32_t type, int32_t count, int64_t *line,
+             int32_t *exponents) {
     for (int32_t i = 0; i < count; i++) {
         exponents[i] = 0;
         if (rule == DECIMALS) {
@@ -84,8 +84,8 @@ void to_line(int32_t rule, int32_t argument, const void *values, int32_t type, i
 
 /* Values at places and differences together. */
 EXPORTED(from_line)
-void from_line(int32_t rule, int32_t argument, const int64_t *line, const int64_t *differences,
-                             void *values, int32_t type, int32_t count) {
+void from_line(int32_t rule, int32_t argument, const int64_t *line, const int64_t *differences, void *values,
+               int32_t type, int32_t count) {
     for (int32_t i = 0; i < count; i++) {
         int64_t place = (int64_t)((uint64_t)line[i] + (uint64_t)differences[i]);
         if (rule == DECIMALS) {

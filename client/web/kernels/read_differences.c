@@ -15,6 +15,6 @@ int32_t read_differences(const int64_t *line, int64_t *differences, const int32_
                          int32_t count, int32_t most, int32_t specials, int32_t *model, int64_t *memory, uint8_t *data,
                          int32_t data_count, uint8_t *stored, int32_t stored_count, int64_t *used) {
     return answer(lode_differences(1, line, count, differences, count, exponents, count, marks, count, most, specials,
-                                   model, LODE_DIFFERENCES_MODEL, memory, 3 * LODE_DIFFERENCES_MEMORY, data,
-                                   data_count, stored, stored_count, used, 2));
+                                   model, LODE_DIFFERENCES_MODEL, memory, 3 * LODE_DIFFERENCES_MEMORY, data, data_count,
+                                   stored, stored_count, used, 2));
 }

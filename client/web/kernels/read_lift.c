@@ -11,6 +11,6 @@ EXPORTED(lift)
 int32_t inverse_lift(int32_t axis, int32_t *x, int32_t rows, int32_t columns, int32_t pitch, int32_t midpoints,
                      int32_t run, const int64_t *table, int32_t a, int32_t b, int32_t from, int32_t *work,
                      int32_t work_count) {
-    return answer(lode_lift(1, axis, x, rows, columns, pitch, midpoints, run, table, 4 * REACH, a, b, from, work,
-                            work_count));
+    return answer(
+        lode_lift(1, axis, x, rows, columns, pitch, midpoints, run, table, 4 * REACH, a, b, from, work, work_count));
 }

@@ -25,6 +25,6 @@ int32_t read_passes(int32_t trellis, const int64_t *bands, int32_t bands_count, 
                     int32_t *models, int32_t models_count, uint8_t *data, int32_t data_count, int64_t *state,
                     int32_t budget) {
     return answer(lode_passes(1, trellis, bands, bands_count, runs, runs_count, known, size, sign, size, flags,
-                              flags_count, early, size, 0, 0, models, models_count, data, data_count, 0, 0, 0, 0,
-                              state, LODE_PASSES_STATE, budget));
+                              flags_count, early, size, 0, 0, models, models_count, data, data_count, 0, 0, 0, 0, state,
+                              LODE_PASSES_STATE, budget));
 }

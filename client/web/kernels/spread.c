@@ -16,7 +16,7 @@ int32_t spread(const int32_t *known, const int8_t *sign, const uint8_t *early, i
                int32_t numbers_count, const int8_t *state, int32_t state_count, int32_t finer, int32_t *out,
                int32_t rows, int32_t columns, int32_t pitch, int32_t first_row, int32_t first_column) {
     int64_t bands_there = bands_count / BAND_FIELDS;
-    return answer(lode_spread(known, size, sign, size, early, size, bands, bands_count, windows, 3 * bands_there,
-                              steps, bands_there, numbers, numbers_count, state, state_count, finer, out, rows, columns,
-                              pitch, first_row, first_column));
+    return answer(lode_spread(known, size, sign, size, early, size, bands, bands_count, windows, 3 * bands_there, steps,
+                              bands_there, numbers, numbers_count, state, state_count, finer, out, rows, columns, pitch,
+                              first_row, first_column));
 }

@@ -1,9 +1,9 @@
 #include "reading.h"
 
-static int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int64_t columns, int64_t pitch,
-                                 void *points, int64_t points_count, int64_t points_type, int64_t channels,
-                                 int64_t channel, int64_t first, int64_t last, int64_t decimal, double origin,
-                                 double step, double scale);
+static int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int64_t columns, int64_t pitch, void *points,
+                                 int64_t points_count, int64_t points_type, int64_t channels, int64_t channel,
+                                 int64_t first, int64_t last, int64_t decimal, double origin, double step,
+                                 double scale);
 static int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type,
                                      const int32_t *coordinates, int64_t coordinates_count, const double *rules,
                                      int64_t rules_count, const uint8_t *counted, int64_t counted_count,

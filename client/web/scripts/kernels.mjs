@@ -92,7 +92,7 @@ function main() {
     if (bytes.length > MOST_BYTES) throw new Error(`expected at most ${MOST_BYTES} bytes, got ${bytes.length}`);
     const text = [
       `/** Made by scripts/kernels.mjs from sources with the hash ${made}; not to be edited. */`,
-      `export const KERNELS_BASE64 =\n  "${bytes.toString("base64")}";`,
+      `export const KERNELS_BASE64: string =\n  "${bytes.toString("base64")}";`,
     ];
     writeFileSync(TARGET, `${text.join("\n")}\n`);
     console.log(`compiled ${relative(process.cwd(), TARGET)}: ${bytes.length} bytes`);

@@ -5,10 +5,10 @@ import type { Ended } from "./planning/plans";
 import { makeTarget, type TargetOptions } from "./planning/target";
 import { sourceUrl } from "./transfer/addresses";
 import { type Channel, WorkerChannel, type WorkerLike } from "./transfer/channel";
+import type { PlainStreamOptions, Progress, StreamState } from "./transfer/options";
 import type { Price } from "./transfer/prices";
 import type { Description, Kept, Opening, Told } from "./transfer/questions";
 import type { SocketClass } from "./transfer/socket";
-import type { PlainStreamOptions, Progress, StreamState } from "./transfer/stream";
 import type { Region, Surface, ViewInfo } from "./types";
 
 /** Options of `connect`; times in seconds. */

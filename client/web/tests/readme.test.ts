@@ -35,7 +35,7 @@ it("has all options, and all that a stream can do", () => {
   for (const name of ["focus", "aim", "throttle", "prices", "kept", "close", "stop"])
     expect(PAGE).toContain(`\`${name}(`);
   const source = readFileSync(join(ROOT, "client/web/src/connect.ts"), "utf8");
-  const plain = readFileSync(join(ROOT, "client/web/src/transfer/stream.ts"), "utf8").split(
+  const plain = readFileSync(join(ROOT, "client/web/src/transfer/options.ts"), "utf8").split(
     "interface StreamOptions",
   )[0]!;
   const own = source.split("interface ConnectOptions")[1]!.split("\n}\n")[0]!;

@@ -14,9 +14,10 @@ import {
 } from "../src/errors";
 import { loadKernels } from "../src/kernels/instance";
 import { makeTarget, type TargetOptions } from "../src/planning/target";
+import type { Progress, StreamOptions, StreamState } from "../src/transfer/options";
 import type { SocketClass } from "../src/transfer/socket";
 import { MemoryStore } from "../src/transfer/store";
-import { type Progress, Stream, type StreamOptions, type StreamState } from "../src/transfer/stream";
+import { Stream } from "../src/transfer/stream";
 import type { Region, Surface } from "../src/types";
 import { decoderFor } from "./decoders";
 import { type Fault, Faulty, type Served, serve } from "./servers";
@@ -403,6 +404,25 @@ describe("a file", () => {
     const stream = streamOf(new Blob([damaged as Uint8Array<ArrayBuffer>]));
     await expect(all(stream)).rejects.toMatchObject({ name: "CorruptStreamError", offset: expect.any(Number) });
     expect(stream.reception.decoder.layers.length).toBeGreaterThan(0);
+  });
+});
+
+describe("a link that is far away", () => {
+  it.each(["ws", "http"] as const)("shows the first picture after two round trips: %s", async (transport) => {
+    const roundTrip = 1.2;
+    const source = transport === "ws" ? served.surface : served.static;
+    await faulty(
+      source,
+      () => ({ delay: roundTrip / 2 }),
+      async (link) => {
+        const stream = streamOf(link.url, {}, transport === "ws" ? { transport } : {});
+        const began = performance.now();
+        await stream.next();
+        // The proxy takes connections at once, where a far server takes a round trip.
+        expect((performance.now() - began) / 1000).toBeLessThan(2 * roundTrip);
+        await stream.close();
+      },
+    );
   });
 });
 

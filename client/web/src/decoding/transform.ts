@@ -64,7 +64,7 @@ export function inverseStep(arena: Arena, plane: Plane, axis: 0 | 1, step: AxisS
 }
 
 /** One forward step of a line of points; returns nodes, then details. */
-function forwardStep(arena: Arena, points: Int32Array, step: AxisStep, [a, b]: Predictor): Int32Array {
+export function forwardStep(arena: Arena, points: Int32Array, step: AxisStep, [a, b]: Predictor): Int32Array {
   const { midpoints, run } = step;
   return arena.scope(() => {
     const table = arena.putI64(extension(step));

@@ -20,10 +20,12 @@ export type Address = number;
 export class Arena {
   readonly kernels: KernelExports;
   #next: number;
+  #used: number; // beyond it nothing was ever given out: all is zero
 
   constructor(module: WebAssembly.Module) {
     this.kernels = new WebAssembly.Instance(module).exports as unknown as KernelExports;
     this.#next = align(this.kernels.__heap_base.value);
+    this.#used = this.#next;
   }
 
   /** Bytes that are given out or were, those of the stack included. */
@@ -47,13 +49,15 @@ export class Arena {
       }
     }
     this.#next = end;
+    this.#used = Math.max(this.#used, end);
     return address;
   }
 
   /** So many zero bytes. */
   zeros(bytes: number): Address {
+    const used = this.#used;
     const address = this.take(bytes);
-    this.u8(address, bytes).fill(0);
+    if (address < used) this.u8(address, Math.min(bytes, used - address)).fill(0);
     return address;
   }
 

@@ -5,9 +5,9 @@ import type { Plane } from "../container/extras";
 import type { Metadata } from "../container/sections";
 import type { TargetOptions } from "../planning/target";
 import type { AttributeKind, DType, Region, Surface, ViewInfo } from "../types";
+import type { PlainStreamOptions, Progress, StreamState } from "./options";
 import type { Price } from "./prices";
 import type { SocketClass } from "./socket";
-import type { PlainStreamOptions, Progress, StreamState } from "./stream";
 
 /** Bytes of a container that were received before, to go on with. */
 export interface Kept {

@@ -120,9 +120,9 @@ export class RangeDownload<View extends ViewInfo> {
     let place: Place | undefined;
     if (this.reception.plan === undefined) {
       place = this.first();
-      if (place === undefined && this.parts.size === 0) {
+      if (place === undefined && this.endsHeld()) {
         views.push(...this.readIndex());
-        place = this.needed;
+        place = this.first();
       }
     }
     if (this.reception.plan !== undefined) {
@@ -256,14 +256,25 @@ export class RangeDownload<View extends ViewInfo> {
 
   /** What to ask for before the index can be looked for. */
   private first(): Place | undefined {
-    const { size } = this.reception;
     // How long the file is, the first answer tells.
-    if (size === undefined) return this.parts.size === 0 ? [0, this.beginning()] : undefined;
-    const tail = Math.min(TAIL_LEAST + Math.floor(size / TAIL_SHARE), TAIL_MOST, size);
-    for (const [offset, length] of [[0, Math.min(HEAD, size)] as const, [size - tail, tail] as const]) {
-      for (const place of this.open(offset, length)) return place;
-    }
+    if (this.reception.size === undefined) return this.parts.size === 0 ? [0, this.beginning()] : undefined;
+    for (const place of this.ends(this.reception.size)) for (const gap of this.open(...place)) return gap;
     return undefined;
+  }
+
+  /** Where header and index of most containers are, and what was found to be missing beside them. */
+  private ends(size: number): Place[] {
+    const tail = Math.min(TAIL_LEAST + Math.floor(size / TAIL_SHARE), TAIL_MOST, size);
+    const places: Place[] = [
+      [0, Math.min(HEAD, size)],
+      [size - tail, tail],
+    ];
+    return this.needed === undefined ? places : [...places, this.needed];
+  }
+
+  private endsHeld(): boolean {
+    const { size, held } = this.reception;
+    return size !== undefined && this.ends(size).every((place) => held.covers(...place));
   }
 
   /** How many bytes to ask for first, of a file of which nothing is known. */
@@ -277,7 +288,7 @@ export class RangeDownload<View extends ViewInfo> {
 
   private readIndex(): View[] {
     const found = this.reception.find(this.reception.size ?? 0);
-    this.needed = "missing" in found ? found.missing : undefined;
+    if ("missing" in found) this.needed = found.missing;
     return "views" in found ? found.views : [];
   }
 

@@ -113,8 +113,12 @@ export class Socket {
 
   private async opened(url: string, seconds: number): Promise<void> {
     const until = performance.now() + 1000 * seconds;
-    this.socket.onopen = () => this.wake?.();
-    while (this.socket.readyState === CONNECTING && this.closing === undefined) {
+    let met = false;
+    this.socket.onopen = () => {
+      met = true;
+      this.wake?.();
+    };
+    while (!met && this.closing === undefined) {
       const rest = (until - performance.now()) / 1000;
       if (rest <= 0) {
         this.close();
@@ -123,10 +127,7 @@ export class Socket {
       await this.woken(rest);
     }
     // One that has been opened and closed again has something to tell.
-    if (this.socket.readyState !== OPEN && (this.closing === undefined || this.closing.code === undefined)) {
-      this.close();
-      throw new NoStreamError(`no WebSocket to ${bare(url)}`);
-    }
+    if (!met) throw new NoStreamError(`no WebSocket to ${bare(url)}`);
     if (this.socket.protocol !== SUBPROTOCOL) {
       this.close();
       throw new NoStreamError(
@@ -164,7 +165,6 @@ export class Socket {
 }
 
 // `WebSocket.OPEN` is not there where the class is a caller's own.
-const CONNECTING = 0;
 const OPEN = 1;
 
 /** An address without its query, which is long. */

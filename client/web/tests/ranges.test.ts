@@ -1,0 +1,193 @@
+import fc from "fast-check";
+import { describe, expect, it } from "vitest";
+import { OptionError } from "../src/errors";
+import { RangeSet } from "../src/planning/ranges";
+import { absolute, makeTarget, tolerance } from "../src/planning/target";
+import { MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
+import { Window } from "../src/protocol/window";
+import { Link, windowFor } from "../src/transfer/pacing";
+import { MemoryStore } from "../src/transfer/store";
+
+const place = fc.tuple(fc.nat(60), fc.nat(12));
+const bytesOf = (places: Iterable<readonly [number, number]>): Set<number> => {
+  const found = new Set<number>();
+  for (const [offset, length] of places) for (let byte = offset; byte < offset + length; byte++) found.add(byte);
+  return found;
+};
+const sorted = (bytes: Iterable<number>): number[] => [...bytes].sort((a, b) => a - b);
+
+describe("a set of ranges", () => {
+  it("is the set of its bytes, however it was made", () => {
+    fc.assert(
+      fc.property(fc.array(place), fc.array(place), place, (first, added, [offset, length]) => {
+        const made = new RangeSet(first);
+        for (const each of added) made.add(...each);
+        const bytes = bytesOf([...first, ...added]);
+        const ranges = [...made];
+        expect(sorted(bytesOf(ranges))).toEqual(sorted(bytes));
+        for (const [number, [start]] of ranges.entries()) {
+          if (number > 0) expect(start).toBeGreaterThan(ranges[number - 1]![0] + ranges[number - 1]![1]);
+        }
+        expect(made.total).toBe(bytes.size);
+        expect(made.size).toBe(ranges.length);
+        expect(made.end).toBe(bytes.size ? Math.max(...bytes) + 1 : 0);
+        const asked = bytesOf([[offset, length]]);
+        expect(sorted(bytesOf(made.missing(offset, length)))).toEqual(sorted([...asked].filter((b) => !bytes.has(b))));
+        expect(sorted(bytesOf(made.overlap(offset, length)))).toEqual(sorted([...asked].filter((b) => bytes.has(b))));
+        expect(made.covers(offset, length)).toBe([...asked].every((byte) => bytes.has(byte)));
+        const copy = made.copy();
+        copy.add(1000, 1);
+        expect([...made]).toEqual(ranges);
+      }),
+    );
+  });
+});
+
+describe("bytes in memory", () => {
+  it("are read as they were written, until they are used", () => {
+    fc.assert(
+      fc.property(fc.shuffledSubarray([...Array(20).keys()]), fc.boolean(), fc.nat(19), (order, keepAll, until) => {
+        const data = Uint8Array.from({ length: 60 }, (_, byte) => byte);
+        const store = new MemoryStore(keepAll);
+        for (const piece of order) store.write(3 * piece, data.slice(3 * piece, 3 * piece + 3));
+        for (const [offset, length] of store.ranges)
+          expect(store.read(offset, length)).toEqual(data.slice(offset, offset + length));
+        store.used(0, 3 * until);
+        const kept = order.filter((piece) => keepAll || piece >= until).sort((a, b) => a - b);
+        expect(store.all().map(([offset]) => offset)).toEqual(kept.map((piece) => 3 * piece));
+      }),
+    );
+  });
+});
+
+describe("targets", () => {
+  it("are checked", () => {
+    expect(makeTarget({ untilRms: "1e-3d", maxBytes: 7 })).toEqual({
+      ...{ untilRms: { value: 1e-3, relative: true }, maxBytes: 7, order: "quality" },
+    });
+    expect(absolute(tolerance("1e-3d"), 500)).toBe(0.5);
+    expect(absolute(tolerance(2), 500)).toBe(2);
+    for (const wrong of ["", "d", "much", "1e-3x", -1, Number.NaN, Number.POSITIVE_INFINITY, "Infinity"]) {
+      expect(() => tolerance(wrong)).toThrow(OptionError);
+    }
+    const outside = [
+      [3, 3],
+      [0, 1],
+    ] as never;
+    for (const wrong of [
+      { level: -1 },
+      { level: 1.5 },
+      { level: 1, seconds: 2 },
+      {
+        level: 1,
+        region: [
+          [0, 1],
+          [0, 1],
+        ] as never,
+      },
+      { maxBytes: 0 },
+      { seconds: 0 },
+      { order: "other" as never },
+      { region: outside },
+      { first: outside },
+    ]) {
+      expect(() => makeTarget(wrong), JSON.stringify(wrong)).toThrow(OptionError);
+    }
+  });
+});
+
+describe("the window", () => {
+  it.each([
+    [8e3, 0.1],
+    [125e3, 0.02],
+    [125e3, 0.3],
+    [1.25e6, 0.1],
+  ])("keeps a link of %d bytes/s and %d s busy by little more than it holds", (rate, roundTrip) => {
+    const { use, most } = transfer(rate, roundTrip, Math.round(rate * 60));
+    expect(most).toBeLessThanOrEqual(Math.max(MIN_WINDOW, 2.5 * rate * roundTrip));
+    expect(use).toBeGreaterThan(Math.min(0.9, (0.7 * MAX_CREDIT) / (rate * roundTrip)));
+  });
+
+  it("becomes the largest on a link without limits", () => {
+    expect(transfer(1e12, 0.05, 20_000_000).size).toBe(MAX_CREDIT);
+  });
+
+  it("stays within its bounds, or as it was set", () => {
+    fc.assert(
+      fc.property(
+        fc.array(fc.tuple(fc.integer({ min: 1, max: 70_000 }), fc.double({ min: 0, max: 3, noNaN: true }))),
+        (steps) => {
+          const [free, fixed] = [new Window(), new Window(500)];
+          let now = 0;
+          for (const [size, time] of steps) {
+            now += time;
+            for (const window of [free, fixed]) {
+              window.grant(size, now);
+              window.arrive(size, now + time / 2);
+            }
+          }
+          expect(free.size).toBeGreaterThanOrEqual(MIN_WINDOW);
+          expect(free.size).toBeLessThanOrEqual(MAX_CREDIT);
+          expect(fixed.size).toBe(500);
+        },
+      ),
+    );
+    expect(() => new Window(0)).toThrow(OptionError);
+    expect(() => new Window(MAX_CREDIT + 1)).toThrow(OptionError);
+  });
+});
+
+describe("a limited rate", () => {
+  it("lets bytes pass one after another", () => {
+    const link = new Link(100);
+    expect(link.delay(50, 0)).toBe(0.5);
+    expect(link.delay(50, 0.1)).toBeCloseTo(0.9);
+    expect(link.delay(50, 9)).toBe(0.5);
+    expect(windowFor(100)).toBe(1024);
+    expect(windowFor(1e9)).toBe(MAX_CREDIT);
+  });
+});
+
+/** Receive so many bytes over a link: the share of its rate that was used, the most outstanding, the window. */
+function transfer(rate: number, roundTrip: number, total: number): { use: number; most: number; size: number } {
+  const window = new Window();
+  let [outstanding, credit] = [window.size, window.size];
+  let [free, now, sent, most] = [0, 0, 0, 0];
+  window.grant(window.size, 0);
+  window.heard(roundTrip);
+  const events: { at: number; grant: boolean; size: number }[] = [];
+  const later = (at: number, grant: boolean, size: number): void => {
+    let place = events.length;
+    while (place > 0 && events[place - 1]!.at > at) place--;
+    events.splice(place, 0, { at, grant, size });
+  };
+  const send = (): void => {
+    while (credit > 0 && sent < total) {
+      const size = Math.min(credit, Math.max(Math.floor(credit / 4), 4096), MAX_DATA, total - sent);
+      free = Math.max(free, now) + size / rate;
+      later(free + roundTrip / 2, false, size);
+      credit -= size;
+      sent += size;
+    }
+  };
+  now = roundTrip / 2;
+  send();
+  for (let event = events.shift(); event !== undefined; event = events.shift()) {
+    now = event.at;
+    if (event.grant) {
+      credit += event.size;
+      send();
+      continue;
+    }
+    outstanding -= event.size;
+    window.arrive(event.size, now);
+    const grant = window.size - outstanding;
+    if (grant > 0 && grant * 4 >= window.size) {
+      window.grant(grant, now);
+      outstanding += grant;
+      later(now + roundTrip / 2, true, grant);
+    }
+    most = Math.max(most, outstanding);
+  }
+  return { use: total / now / rate, most, size: window.size };
+}
