@@ -58,6 +58,7 @@ export class LodestreamView extends HTMLElement {
   private silentSince = 0;
   private lastBytes = -1;
   private life: AbortController | null = null;
+  private failed = false;
   private pending = 0;
   private secret: string | null = null;
 
@@ -204,7 +205,9 @@ export class LodestreamView extends HTMLElement {
         progress: (progress) => {
           if (progress.bytes !== this.lastBytes) this.silentSince = performance.now();
           this.lastBytes = progress.bytes;
-          setText(this.notice, progress.state === "failed" ? progress.detail : "");
+          if (progress.state === "failed") setText(this.notice, progress.detail);
+          else if (this.failed) setText(this.notice, "");
+          this.failed = progress.state === "failed";
           this.changed("progress", progress);
         },
         drawn: (patches, moment) => this.drawn(patches, moment),
@@ -232,6 +235,9 @@ export class LodestreamView extends HTMLElement {
       `Surface ${name}. Arrow keys turn it, plus and minus zoom.`.replace("  ", " "),
     );
     this.lookPanel.offer(info);
+    if (info.blocks.every(({ shape }) => Math.min(...shape) < 2)) {
+      setText(this.notice, "This is a line of points: there is no surface to draw.");
+    }
     const { field } = this.look;
     if (field.kind === "attribute" && !info.attributes.includes(field.name))
       this.setLook({ ...this.look, field: { kind: "height" } });
