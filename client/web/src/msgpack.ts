@@ -2,7 +2,8 @@
 
 import { decode } from "@msgpack/msgpack";
 
-const DEEPEST = 64;
+// As deep as Python's library goes.
+const DEEPEST = 1024;
 
 /**
  * The value that MessagePack bytes stand for.
@@ -13,7 +14,7 @@ const DEEPEST = 64;
  * Integers that need 64 bits come as `bigint`.
  *
  * @throws Error if the bytes are not exactly one value, a map has a key that is not text, text is not UTF-8, or values
- * are nested more than 64 deep.
+ * are nested more than 1,024 deep.
  */
 export function unpack(data: Uint8Array): unknown {
   const end = new Walker(data).value(0, 0);

@@ -249,7 +249,7 @@ describe("messages", () => {
     for (let at = 0; at < deep.length; at += 5) deep.set([0xdd, 0xff, 0xff, 0xff, 0xff], at);
     expect(() => parse(deep)).toThrow(MessageError);
     const nested = new Uint8Array(60_000).fill(0x91);
-    expect(() => parse(nested)).toThrow(/nested more than 64 deep/);
+    expect(() => parse(nested)).toThrow(/nested more than 1024 deep/);
     expect(() => parse(Uint8Array.of(0x81, 0xa4, 0x74, 0x79, 0x70, 0x65, 0xa2, 0xff, 0xfe))).toThrow(MessageError);
   });
 });
@@ -297,6 +297,9 @@ describe("unpack", () => {
   it("takes what MessagePack can hold", () => {
     const value = { text: "höhe", deep: [[1, -5, 2.5], null, true, 2n ** 60n], bytes: new Uint8Array([1, 2]) };
     expect(unpack(encode(value, { useBigInt64: true }))).toEqual(value);
+    const nested = (depth: number) => Uint8Array.from({ length: depth + 1 }, (_, at) => (at < depth ? 0x91 : 0xc0));
+    expect(JSON.stringify(unpack(nested(1024)))).toBe(`${"[".repeat(1024)}null${"]".repeat(1024)}`);
+    expect(() => unpack(nested(1025))).toThrow(/nested more than 1024 deep/);
   });
 });
 

@@ -1,7 +1,7 @@
 /** What each error costs: the price list of a surface, from its index or from what its server says of it. */
 
 import type { Index } from "../container/model";
-import { RemoteProtocolError } from "../errors";
+import { LodestreamError, RemoteProtocolError, SilenceError, UnreachableError } from "../errors";
 import { sameOrigin } from "./addresses";
 import { fromResponse } from "./problems";
 
@@ -48,7 +48,20 @@ export async function fetchPrices(
   fetch: typeof globalThis.fetch,
 ): Promise<Price[]> {
   const headers = token === undefined ? {} : { Authorization: `Bearer ${token}` };
-  const response = await fetch(url, { headers, cache: "no-store", signal: AbortSignal.timeout(1000 * patience) });
+  const options: RequestInit = { headers, cache: "no-store", signal: AbortSignal.timeout(1000 * patience) };
+  try {
+    return await askedFor(url, () => fetch(url, options));
+  } catch (error) {
+    if (error instanceof LodestreamError) throw error;
+    const { name, message } = error as Error;
+    if (name === "TimeoutError")
+      throw new SilenceError(`expected the layers of ${url} in ${patience} seconds, got none`);
+    throw new UnreachableError(`no connection to ${url}, or it broke: ${message}`);
+  }
+}
+
+async function askedFor(url: string, ask: () => Promise<Response>): Promise<Price[]> {
+  const response = await ask();
   if (response.url !== "" && !sameOrigin(response.url, url)) {
     throw new RemoteProtocolError(`expected what ${url} says itself, got a redirect to another server`);
   }
