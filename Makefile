@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo kernels test test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream test-web bench-web wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -39,13 +39,14 @@ kernels: $(STAMP)
 	@$(BIN)/python core/kernels/build.py
 
 C := $(wildcard core/kernels/*.[ch] tests/kernels/*.[ch])
+LAID_OUT := $(C) $(wildcard client/web/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
 C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
 
 lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and the warnings of gcc and clang
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
-	$(CLANG_FORMAT) --dry-run -Werror $(C) || status=1; \
+	$(CLANG_FORMAT) --dry-run -Werror $(LAID_OUT) || status=1; \
 	for compiler in gcc clang; do \
 		if command -v $$compiler > /dev/null; then \
 			for file in $(filter %.c,$(C)); do $$compiler $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
@@ -58,7 +59,7 @@ lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-for
 format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C
 	@$(BIN)/ruff check --quiet --select I --fix
 	@$(BIN)/ruff format --quiet
-	@$(CLANG_FORMAT) -i $(C)
+	@$(CLANG_FORMAT) -i $(LAID_OUT)
 
 bench: kernels ## measure speed, memory and bytes on this machine; ARGS="transform solver" for some of them
 	@$(BIN)/python -m benchmarks $(ARGS)
@@ -72,6 +73,20 @@ bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS
 
 bench-stream: kernels ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
 	@$(BIN)/python -m benchmarks.stream
+
+# The library and the page for browsers; Node 20 or newer is all that is not installed here.
+WEB := client/web
+
+test-web: kernels $(WEB)/node_modules/.installed ## check and test the TypeScript in Node; LODESTREAM_SURFACES=2000 for all surfaces
+	@cd $(WEB) && export PYTHON=$(CURDIR)/$(BIN)/python && npm run --silent check && npm test --silent -- $(ARGS)
+
+bench-web: kernels $(WEB)/node_modules/.installed ## how fast decoding is as WebAssembly in Node, beside this library
+	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent bench
+
+$(WEB)/node_modules/.installed: $(WEB)/package-lock.json $(STAMP)
+	@$(BIN)/python -P -c 'import ziglang' 2>/dev/null || $(BIN)/python -m pip install --quiet --group web
+	@cd $(WEB) && npm ci --silent
+	@touch $@
 
 wheels: $(STAMP) ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
 	@$(BIN)/python -P -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import InputError
 from lodestream.plan import plan
+from lodestream.target import Order
 from tests.core.surfaces import all_large, follow, index_of, terrain, torus
 from tests.golden.generate import digests, expectations
 
@@ -99,7 +100,8 @@ def heights(chance: Random, rng: np.random.Generator, shape: tuple[int, int], nu
     scaled = (
         (values - values.min()) / max(float(np.ptp(values)), 1e-9) * min(room, chance.choice([50.0, 3e4, 1e18])) / 2
     )
-    return np.clip(np.rint(scaled + limits.min / 4), limits.min, limits.max / 2).astype(dtype)
+    inside: _Points = np.clip(np.rint(scaled + limits.min / 4), limits.min, limits.max / 2)
+    return inside.astype(dtype)
 
 
 def plane(chance: Random, rng: np.random.Generator, shape: tuple[int, int], number: int) -> _Points:
@@ -191,7 +193,8 @@ def window(chance: Random, container: bytes) -> dict[str, Any] | None:
 def followed(chance: Random, container: bytes) -> dict[str, Any]:
     """Slices of a random plan, and the views that they give."""
     index = index_of(container)
-    order = chance.choice(["quality", "level"])
+    orders: list[Order] = ["quality", "level"]
+    order = chance.choice(orders)
     target = ls.Target(order=order)
     if chance.random() < 0.3:
         target = ls.Target(order=order, level=chance.randrange(index.header.levels + 1))

@@ -81,9 +81,10 @@ export class FieldReader {
     return Number(this.#view.getBigUint64(this.#taken(8), true));
   }
 
-  /** A signed number of 8 bits. */
-  i8(): number {
-    return this.#view.getInt8(this.#taken(1));
+  /** Two signed numbers of 8 bits. */
+  i8Pair(): [number, number] {
+    const place = this.#taken(2);
+    return [this.#view.getInt8(place), this.#view.getInt8(place + 1)];
   }
 
   /** A signed number of 64 bits. */

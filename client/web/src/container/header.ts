@@ -343,7 +343,7 @@ function parsePredictors(
       throw new CorruptStreamError(`expected predictors of ${own.length} steps, got ${count}`, start);
     }
     for (const step of own) {
-      const [a, b] = [fields.i8(), fields.i8()];
+      const [a, b] = fields.i8Pair();
       wrong ||= a === -128 || b === -128;
       predictors.set(step, a, b);
     }

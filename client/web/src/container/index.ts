@@ -11,3 +11,4 @@ export { countWindows, type PieceWindow, pieceWindows } from "./pieces";
 export { INDEX_GROWTH, indexFrom, type Read, readIndex, readMetadata } from "./reader";
 export { FOOTER_LENGTH, isContainer, KIND, type Metadata, SIGNATURE_LENGTH } from "./sections";
 export { checkWish, restoredRegion, type Selection, select, type Wish, wishedChannels, wishedTiles } from "./selection";
+export { readWindowErrors, type WindowErrors } from "./window-errors";
