@@ -38,7 +38,7 @@ export function positionOf({ azimuth, elevation, distance, target }: Orbit): [nu
 export function fitted(half: Triple, whole: number, aspect: number, flat: boolean): Orbit {
   const radius = Math.max(Math.hypot(...half), whole) || 1;
   const narrow = Math.min(1, aspect);
-  const distance = (radius / Math.sin((VIEW_ANGLE / 2) * RADIANS) / narrow) * (flat ? 0.8 : 0.95);
+  const distance = (radius / Math.sin((VIEW_ANGLE / 2) * RADIANS) / narrow) * (flat ? 0.8 : 0.82);
   return { azimuth: flat ? -90 : -60, elevation: flat ? 42 : 25, distance, target: [0, 0, 0] };
 }
 

@@ -152,9 +152,8 @@ export class FocusPanel {
     const at = moments.find(({ number }) => number === Number(this.slider.value));
     setText(this.shown, at === undefined ? "" : formatBytes(at.bytes));
     this.slider.setAttribute("aria-valuetext", at === undefined ? "nothing yet" : momentText(at, unit));
-    setText(this.button, this.canStop ? "Stop" : "Continue");
-    this.button.disabled = progress.state === "complete" || progress.state === "failed";
-    this.button.hidden = this.button.disabled;
+    setText(this.button, this.canStop ? "Stop" : progress.state === "failed" ? "Try again" : "Continue");
+    this.button.hidden = progress.state === "complete";
   }
 
   private slide(to: number): void {

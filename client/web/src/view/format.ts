@@ -30,6 +30,14 @@ export function formatAt(value: number, step: number): string {
   return value.toFixed(places);
 }
 
+/** A number with the digits that matter in a range: about three of the range's length. */
+export function formatWithin(value: number, [low, high]: readonly [number, number]): string {
+  const length = high - low;
+  if (!(length > 0) || length >= 1e7 || length < 1e-6) return formatNumber(value, 4);
+  const places = Math.min(Math.max(2 - Math.floor(Math.log10(length)), 0), 12);
+  return String(Number(value.toFixed(places))).replace(/^-0$/, "0");
+}
+
 /** Seconds as text: 0.42 s, 12 s, 3 min 20 s. */
 export function formatSeconds(seconds: number): string {
   if (seconds < 10) return `${seconds.toFixed(2)} s`;

@@ -2,7 +2,7 @@
 
 import { type ColourMapName, stopsOf } from "./colour-maps";
 import { html, setText, svg } from "./dom";
-import { formatNumber, roundBelow } from "./format";
+import { formatNumber, formatWithin, roundBelow } from "./format";
 
 /** What the legend says. */
 export interface LegendData {
@@ -54,14 +54,9 @@ export class Legend {
         svg("stop", { offset: k / (stops.length - 1), "stop-color": `rgb(${colour.join(",")})` }),
       ),
     );
-    const step = Math.max(range[1] - range[0], 1e-300);
-    const digits = Math.min(
-      Math.max(Math.ceil(Math.log10(Math.max(Math.abs(range[0]), Math.abs(range[1]), step) / step)) + 3, 3),
-      12,
-    );
     const values = [range[0], (range[0] + range[1]) / 2, range[1]];
     this.ticks.forEach((tick, k) => {
-      setText(tick, formatNumber(values[k]!, digits));
+      setText(tick, formatWithin(values[k]!, range));
     });
   }
 }

@@ -40,6 +40,7 @@ export class LodestreamView extends HTMLElement {
   private readonly canvas = html("canvas", { tabindex: 0, role: "application", "aria-describedby": "values status" });
   private readonly notice = html("div", { class: "notice", role: "alert" });
   private readonly values = html("p", { class: "values", id: "values", "aria-live": "polite", "aria-label": "Values" });
+  private readonly mark = html("div", { class: "mark", "aria-hidden": "true", hidden: true });
   private readonly legend = new Legend();
   private readonly scales = new ScaleBar();
   private readonly focusPanel: FocusPanel;
@@ -57,6 +58,7 @@ export class LodestreamView extends HTMLElement {
   private silentSince = 0;
   private lastBytes = -1;
   private life: AbortController | null = null;
+  private failed = false;
   private pending = 0;
   private secret: string | null = null;
 
@@ -76,12 +78,12 @@ export class LodestreamView extends HTMLElement {
       (look) => this.setLook(look),
       (which) => this.command(which),
     );
-    this.probe = new Probe(this.values);
+    this.probe = new Probe(this.values, () => this.stage?.draw());
     root.append(
       html(
         "div",
         { class: "frame" },
-        html("div", { class: "stage" }, this.canvas, this.scales.element, this.legend.element, this.notice),
+        html("div", { class: "stage" }, this.canvas, this.mark, this.scales.element, this.legend.element, this.notice),
         this.values,
         html(
           "div",
@@ -125,7 +127,7 @@ export class LodestreamView extends HTMLElement {
     this.life = new AbortController();
     const { signal } = this.life;
     try {
-      this.stage = new Stage(this.canvas, () => this.drawScales());
+      this.stage = new Stage(this.canvas, () => this.drawOver());
     } catch {
       setText(this.notice, "This browser does not offer WebGL2, which drawing needs.");
       return;
@@ -203,7 +205,9 @@ export class LodestreamView extends HTMLElement {
         progress: (progress) => {
           if (progress.bytes !== this.lastBytes) this.silentSince = performance.now();
           this.lastBytes = progress.bytes;
-          setText(this.notice, progress.state === "failed" ? progress.detail : "");
+          if (progress.state === "failed") setText(this.notice, progress.detail);
+          else if (this.failed) setText(this.notice, "");
+          this.failed = progress.state === "failed";
           this.changed("progress", progress);
         },
         drawn: (patches, moment) => this.drawn(patches, moment),
@@ -231,6 +235,9 @@ export class LodestreamView extends HTMLElement {
       `Surface ${name}. Arrow keys turn it, plus and minus zoom.`.replace("  ", " "),
     );
     this.lookPanel.offer(info);
+    if (info.blocks.every(({ shape }) => Math.min(...shape) < 2)) {
+      setText(this.notice, "This is a line of points: there is no surface to draw.");
+    }
     const { field } = this.look;
     if (field.kind === "attribute" && !info.attributes.includes(field.name))
       this.setLook({ ...this.look, field: { kind: "height" } });
@@ -337,11 +344,17 @@ export class LodestreamView extends HTMLElement {
     this.sharing.later();
   }
 
-  private drawScales(): void {
+  /** Draws what lies over the picture: scale, north, and the place whose values are shown. */
+  private drawOver(): void {
     const { orbit, framing, session, stage } = this;
     if (orbit === null || framing === null || stage === null || session?.info == null) return;
     const { pixels, unit } = framing.scale(orbit, stage.size[1]);
     this.scales.draw(pixels, unit, session.info.georeferenced ? orbit.azimuth : null);
+    const { at } = this.probe;
+    this.mark.hidden = at === null;
+    if (at === null) return;
+    const [x, y] = stage.project(framing.drawn(at, 1));
+    this.mark.style.translate = `${x.toFixed(1)}px ${y.toFixed(1)}px`;
   }
 
   private command(name: Command): void {

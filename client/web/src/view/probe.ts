@@ -15,11 +15,19 @@ export class Probe {
   private waiting: Ray | null = null;
   private busy = false;
 
-  constructor(private readonly element: HTMLElement) {}
+  /**
+   * @param element - Where the values are shown.
+   * @param changed - Called when `at` is another place.
+   */
+  constructor(
+    private readonly element: HTMLElement,
+    private readonly changed: () => void,
+  ) {}
 
   /** Shows that nothing is under the pointer. */
   clear(): void {
     this.at = null;
+    this.changed();
     this.element.replaceChildren(
       html("span", { class: "dim" }, "Point at the surface, or press P in the picture, to read its values."),
     );
@@ -28,8 +36,10 @@ export class Probe {
   /** Shows what a ray meets; null: nothing. */
   point(session: Session, ray: Ray | null): void {
     this.waiting = ray;
-    if (ray === null) this.at = null;
-    else if (!this.busy) void this.ask(session);
+    if (ray !== null && !this.busy) void this.ask(session);
+    if (ray !== null) return;
+    this.at = null;
+    this.changed();
   }
 
   private async ask(session: Session): Promise<void> {
@@ -45,6 +55,7 @@ export class Probe {
           continue;
         }
         this.at = hit.at;
+        this.changed();
         const [row, column] = [Math.round(hit.row), Math.round(hit.column)];
         const { shape } = info.blocks[hit.block]!;
         const values = await session.source

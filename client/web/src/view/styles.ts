@@ -22,7 +22,7 @@ const CSS = `
 canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block; touch-action: none; cursor: grab }
 canvas:active { cursor: grabbing }
 canvas:focus-visible { outline: 2px solid var(--accent); outline-offset: -3px }
-.corner { position: absolute; pointer-events: none }
+.mark { position: absolute; left: -5px; top: -5px; width: 10px; height: 10px; border-radius: 50%; border: 2px solid #fff; box-shadow: 0 0 0 1.5px #0009; pointer-events: none }
 .scales { position: absolute; left: 14px; bottom: 12px; display: flex; align-items: flex-end; gap: 12px; pointer-events: none;
   padding: 6px 10px; border-radius: 6px; background: color-mix(in srgb, var(--sheet) 72%, transparent) }
 .scales:not(:has(> :not([hidden]))) { display: none }

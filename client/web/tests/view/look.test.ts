@@ -4,7 +4,7 @@ import { COLOUR_MAPS, colourAt, rangeOf, stopsOf, textureOf } from "../../src/vi
 import { logScale } from "../../src/view/error-curve";
 import { defaultExaggeration } from "../../src/view/exaggeration";
 import { extremes } from "../../src/view/fields";
-import { formatAt, formatBytes, formatNumber, formatSeconds, roundBelow } from "../../src/view/format";
+import { formatAt, formatBytes, formatNumber, formatSeconds, formatWithin, roundBelow } from "../../src/view/format";
 import { belowPixel, finestDrawn, firstLevel, pointsAt } from "../../src/view/levels";
 import type { Moment, SurfaceInfo } from "../../src/view/source";
 import { formatView, parseView, type SharedView, withView } from "../../src/view/url-state";
@@ -194,6 +194,14 @@ describe("numbers", () => {
     expect(formatAt(Number.NaN, 1)).toBe("none");
     expect([0.424, 12.4, 200].map(formatSeconds)).toEqual(["0.42 s", "12 s", "3 min 20 s"]);
     expect([0.7, 1, 3, 77].map(roundBelow)).toEqual([0.5, 1, 2, 50]);
+  });
+
+  it("within a range", () => {
+    expect(formatWithin(2.8e-17, [-0.4, 0.4])).toBe("0");
+    expect(formatWithin(-1e-9, [-1, 1])).toBe("0");
+    expect(formatWithin(1304.6789, [314, 2295])).toBe("1305");
+    expect(formatWithin(500_000.1234, [500_000, 500_001])).toBe("500000.12");
+    expect(formatWithin(5, [5, 5])).toBe("5");
   });
 
   it("on a logarithmic axis, 0 at its end", () => {
