@@ -12,19 +12,15 @@ import sys
 import warnings
 from contextlib import nullcontext
 from random import Random
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import InputError
-<<<<<<< HEAD
-from lodestream.planning.planner import plan
-=======
 from lodestream.planning.planner import plan
 from lodestream.target import Order
->>>>>>> w-webdecode
 from tests.core.surfaces import all_large, follow, index_of, terrain, torus
 from tests.golden.generate import digests, expectations
 
@@ -104,13 +100,8 @@ def heights(chance: Random, rng: np.random.Generator, shape: tuple[int, int], nu
     scaled = (
         (values - values.min()) / max(float(np.ptp(values)), 1e-9) * min(room, chance.choice([50.0, 3e4, 1e18])) / 2
     )
-<<<<<<< HEAD
-    clipped: NDArray[Any] = np.clip(np.rint(scaled + limits.min / 4), limits.min, limits.max / 2).astype(dtype)
-    return clipped
-=======
     inside: _Points = np.clip(np.rint(scaled + limits.min / 4), limits.min, limits.max / 2)
     return inside.astype(dtype)
->>>>>>> w-webdecode
 
 
 def plane(chance: Random, rng: np.random.Generator, shape: tuple[int, int], number: int) -> _Points:
@@ -202,11 +193,7 @@ def window(chance: Random, container: bytes) -> dict[str, Any] | None:
 def followed(chance: Random, container: bytes) -> dict[str, Any]:
     """Slices of a random plan, and the views that they give."""
     index = index_of(container)
-<<<<<<< HEAD
-    orders: tuple[Literal["quality", "level"], ...] = ("quality", "level")
-=======
     orders: list[Order] = ["quality", "level"]
->>>>>>> w-webdecode
     order = chance.choice(orders)
     target = ls.Target(order=order)
     if chance.random() < 0.3:
