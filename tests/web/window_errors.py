@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import random
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,11 @@ from tests.core.surfaces import index_of, terrain
 _SHAPE = (300, 530)
 
 
+def read(container: bytes, offset: int, length: int) -> bytes:
+    """A slice of a container."""
+    return container[offset : offset + length]
+
+
 def main() -> None:
     """Of heights, and of heights with holes."""
     heights = (terrain(_SHAPE, 3) / 3).astype(np.float32)
@@ -24,7 +30,7 @@ def main() -> None:
     for mask in (None, holes):
         container = ls.encode(ls.Surface(heights, mask=mask))
         index = index_of(container)
-        errors = read_window_errors(index, lambda offset, length, data=container: data[offset : offset + length])
+        errors = read_window_errors(index, partial(read, container))
         assert errors is not None
         cases: list[dict[str, Any]] = []
         for _ in range(60):

@@ -52,6 +52,13 @@ async def asset(request: Request, name: str) -> Response:
     return answer
 
 
+@readable(router, "/view.json", include_in_schema=False)
+@needs(None)
+async def view() -> Response:
+    """What the page is to show: nothing in particular, so it lists the surfaces of this server."""
+    return JSONResponse({}, headers={"cache-control": "no-cache"})
+
+
 @readable(router, "/docs", include_in_schema=False)
 @needs(None)
 async def docs(request: Request) -> Response:

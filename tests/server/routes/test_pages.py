@@ -79,6 +79,7 @@ def test_the_page_of_the_browser_is_served_with_a_policy(tmp_path: Path, monkeyp
     assert "immutable" in script.headers["cache-control"]
     assert home.headers["cache-control"] == "no-cache"
     assert [answer.status_code for answer in others] == [404, 404]
+    assert asked("/view.json")["/view.json"].json() == {}  # it is this server's surfaces that the page shows
     again = asked("/", headers={"if-none-match": home.headers["etag"]})["/"]
     assert (again.status_code, again.content) == (304, b"")
     assert again.headers["content-security-policy"] == page.HEADERS["content-security-policy"]
