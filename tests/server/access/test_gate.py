@@ -23,6 +23,8 @@ from tests.server.helpers import Keys, problem
 ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/"): None,
     ("GET", "/docs"): None,
+    ("GET", "/assets/{name}"): None,
+    ("GET", "/view.json"): None,
     ("GET", "/openapi.json"): None,
     ("GET", "/healthz"): None,
     ("GET", "/readyz"): None,
