@@ -9,6 +9,7 @@ All of them take some time. With ``--journal FILE`` each run goes on where the l
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -33,6 +34,7 @@ def main() -> int:
     parser.add_argument("--sessions", type=int, help="how many are tried at the same time (default: processors + 1)")
     args = parser.parse_args()
     scenarios = args.scenario or SCENARIOS
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nothing stays in memory
     if args.list:
         with tempfile.TemporaryDirectory(dir=in_memory()) as folder, Session(Path(folder)) as session:
             names = [str(case) for case in session.everything(scenarios)]

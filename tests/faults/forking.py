@@ -27,6 +27,7 @@ from typing import Any
 
 from lodestream_client import program
 from lodestream_server.builds import fork_control, forkserver, jobs, worker
+from lodestream_server.maintenance import repair
 from lodestream_server.storage import records
 
 __all__ = ["DIED", "main"]
@@ -50,9 +51,6 @@ _MODULES = (
     "uvicorn.protocols.websockets.websockets_sansio_impl",
 )
 _EACH = 0.005
-
-# A command that has one of these words among its arguments may build.
-_BUILDING = {"serve", "--adopt", "--repair", "--retry"}
 
 _PR_SET_PDEATHSIG = 1
 
@@ -174,12 +172,24 @@ def _be(arguments: list[str], log: str) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for theirs, ours in ((nothing, 0), (said, 1), (said, 2)):
         os.dup2(theirs, ours)
-    if _BUILDING.intersection(arguments):
-        # Forked while this process has one thread.
-        forked = _Forked()
-        names: Any = jobs
-        names.ForkServer = lambda preload: _ForkServer(preload, forked)
+    # A fork server is forked while this process has one thread; for fsck only where it builds, at last.
+    if "serve" in arguments:
+        _fork_server()
+    names: Any = repair
+    rebuild = names.rebuild
+
+    def fork_and_rebuild(*args: Any, **options: Any) -> Any:
+        _fork_server()
+        return rebuild(*args, **options)
+
+    names.rebuild = fork_and_rebuild
     return main(arguments)
+
+
+def _fork_server() -> None:
+    forked = _Forked()
+    names: Any = jobs
+    names.ForkServer = lambda preload: _ForkServer(preload, forked)
 
 
 def _wait(process: int, seconds: float) -> dict[str, Any]:

@@ -141,11 +141,11 @@ class Session:
             cases += self.repair(*self.rest.steps())
         return cases
 
-    def run(self, cases: Iterable[Case], until: float | None = None) -> None:
+    def run(self, cases: Iterable[Case], until: float | None = None, over: threading.Event | None = None) -> None:
         """Try cases, in this order, until a moment of `time.monotonic`; those in operation together with others."""
         waiting: list[Case] = []
         for case in cases:
-            if until is not None and time.monotonic() > until:
+            if (until is not None and time.monotonic() > until) or (over is not None and over.is_set()):
                 break
             if case.scenario == "operation":
                 waiting.append(case)
@@ -273,14 +273,18 @@ def run(
             random.Random(seed).shuffle(cases)
             cases = kept.take(cases[: round(part * len(cases))], report)
             batches = _batches(cases, random.Random(seed))
-        count = sessions or (os.cpu_count() or 1) + 1
+        count, over = sessions or (os.cpu_count() or 1) + 1, threading.Event()
         with ThreadPoolExecutor(count) as pool:
             working = [
-                pool.submit(_work, Path(folder) / f"session{number}", batches, until, kept, report)
+                pool.submit(_work, Path(folder) / f"session{number}", batches, until, over, kept, report)
                 for number in range(min(count, batches.qsize()))
             ]
-            for one in working:
-                one.result()
+            try:
+                for one in working:
+                    one.result()
+            except BaseException:
+                over.set()
+                raise
     report.problems = sorted(set(report.problems))  # some are seen twice, before and after a restart
     report.seconds = time.monotonic() - started
     return report
@@ -310,15 +314,22 @@ def _batches(cases: Sequence[Case], draw: random.Random) -> queue.SimpleQueue[li
 
 
 def _work(
-    folder: Path, batches: queue.SimpleQueue[list[Case]], until: float | None, journal: Journal, report: Report
+    folder: Path,
+    batches: queue.SimpleQueue[list[Case]],
+    until: float | None,
+    over: threading.Event,
+    journal: Journal,
+    report: Report,
 ) -> None:
     with Session(folder) as session:
-        while until is None or time.monotonic() < until:
+        while not over.is_set() and (until is None or time.monotonic() < until):
             try:
                 batch = batches.get_nowait()
             except queue.Empty:
                 return
-            session.run(batch, until)
+            session.run(batch, until, over)
+            if over.is_set():
+                return  # what ends with this program shows nothing
             outcomes, problems = session.report.outcomes, session.report.problems
             journal.add(outcomes, problems)
             report.outcomes += outcomes

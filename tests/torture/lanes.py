@@ -112,10 +112,11 @@ class Lanes:
                     command, stdout=output, stderr=subprocess.STDOUT, env=environment, process_group=0
                 )
             self._await(process)
-            if file.exists():
-                return self._keep(Result.of_json(file.read_text()))
-            if self._over.is_set():
-                return None
+            result = Result.of_json(file.read_text()) if file.exists() else None
+            if self._over.is_set() and (result is None or result.failure is not None):
+                return None  # what fails because it was ended has not failed
+            if result is not None:
+                return self._keep(result)
             words = f"the process ended with {process.returncode}\n{said.read_text(errors='replace')[-4000:]}"
             return Result(wish.part, wish.count, 0, (), time.monotonic() - started, words)
 

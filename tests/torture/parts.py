@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import math
+import signal
 import sys
 import tempfile
 import threading
@@ -302,6 +303,8 @@ PARTS = {
 
 def main() -> None:
     """Do one part."""
+    # In the background of a shell it would be ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     name, count, seconds, file, kept = sys.argv[1:]
     result = PARTS[name].run(
         int(count), None if seconds == "-" else float(seconds), None if kept == "-" else Path(kept)

@@ -63,7 +63,9 @@ def test_a_result_comes_whole_from_another_process() -> None:
 
 def torture(page: Path, *arguments: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-m", "tests.torture", *arguments, "--page", str(page)]
+    # Without SIGINT, as in the background of a shell.
+    command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]
+    command += [sys.executable, "-m", "tests.torture", *arguments, "--page", str(page)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
@@ -92,6 +94,17 @@ def test_a_run_that_is_interrupted_leaves_what_there_is(tmp_path: Path) -> None:
     assert "**Interrupted, or not yet at its end**" in text
     assert "`history` had not ended" in text
     assert re.search(r"`disk` \(requests\): 0 in \d+ s, \*\*of 100\*\*\.", text)
+
+
+def test_what_fails_because_it_was_ended_has_not_failed(tmp_path: Path) -> None:
+    page, kept = tmp_path / "page.md", tmp_path / "kept"
+    with torture(page, "fuzz", "--resume", str(kept)) as process:
+        eventually((kept / "fuzz" / "messages" / "state.json").exists, "the fuzzer to begin")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 130
+        assert process.stdout is not None
+        assert "failed" not in process.stdout.read()
+    assert not page.exists()
 
 
 def test_a_part_that_dies_is_a_result() -> None:
