@@ -15,7 +15,7 @@ import numpy as np
 import lodestream as ls
 from lodestream_client.sync import upload
 from lodestream_server import running_server
-from lodestream_server.tokens import TokenFile
+from lodestream_server.access.tokens import TokenFile
 from tests.client.files import plain, ranged
 from tests.core.surfaces import terrain
 

@@ -52,6 +52,16 @@ async def asset(request: Request, name: str) -> Response:
     return answer
 
 
+@readable(router, "/view.json", include_in_schema=False)
+@needs(None)
+async def configuration() -> Response:
+    """What the page is to show: no files of a static host, but what this server has.
+
+    An answer 404 says the same to the page, but browsers report it to people as an error.
+    """
+    return JSONResponse({}, headers={"cache-control": "no-store"})
+
+
 @readable(router, "/docs", include_in_schema=False)
 @needs(None)
 async def docs(request: Request) -> Response:
