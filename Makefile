@@ -69,7 +69,7 @@ WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -no
 page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
 
 test-web: page ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
-	@cd $(WEB) && npm run --silent check && PYTHON=../../$(BIN)/python npm test --silent
+	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
 
 bench-web: page ## speed of the browser's decoder, times to the first picture, and the size of the bundle

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import mimetypes
 import re
 import shutil
 import socket
@@ -83,6 +84,9 @@ class _RangedHandler(BaseHTTPRequestHandler):
             self.send_response(200)
         if self.server.tags:
             self.send_header("ETag", tag)
+        # Browsers run no module whose type they are not told.
+        if (kind := mimetypes.guess_type(path.name)[0]) is not None:
+            self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         if body:

@@ -54,9 +54,12 @@ async def asset(request: Request, name: str) -> Response:
 
 @readable(router, "/view.json", include_in_schema=False)
 @needs(None)
-async def view() -> Response:
-    """What the page is to show: nothing in particular, so it lists the surfaces of this server."""
-    return JSONResponse({}, headers={"cache-control": "no-cache"})
+async def configuration() -> Response:
+    """What the page is to show: no files of a static host, but what this server has.
+
+    An answer 404 says the same to the page, but browsers report it to people as an error.
+    """
+    return JSONResponse({}, headers={"cache-control": "no-store"})
 
 
 @readable(router, "/docs", include_in_schema=False)

@@ -60,6 +60,11 @@ def test_a_page_that_is_not_built_says_how(pages: dict[str, httpx.Response]) -> 
     assert page.HOW_TO_BUILD in Reader(pages["/"].text).text
 
 
+def test_the_page_is_told_that_it_is_the_page_of_a_server() -> None:
+    (answer,) = asked("/view.json").values()
+    assert (answer.status_code, answer.json()) == (200, {})
+
+
 def test_the_page_of_the_browser_is_served_with_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "assets").mkdir()
     (tmp_path / page.INDEX).write_text("<!doctype html><title>page</title>")

@@ -153,7 +153,7 @@ export class FocusPanel {
     setText(this.shown, at === undefined ? "" : formatBytes(at.bytes));
     this.slider.setAttribute("aria-valuetext", at === undefined ? "nothing yet" : momentText(at, unit));
     setText(this.button, this.canStop ? "Stop" : progress.state === "failed" ? "Try again" : "Continue");
-    this.button.hidden = progress.state === "complete";
+    this.button.hidden = isWhole(state);
   }
 
   private slide(to: number): void {
@@ -197,7 +197,15 @@ function momentText(moment: Moment, unit: string): string {
   return `${formatBytes(moment.bytes)} after ${formatSeconds(moment.seconds)}, RMS error ${errorText(moment.rms, unit)}`;
 }
 
-function statusText({ progress, belowPixel, silent, info, moments }: FocusState): string {
+/** Whether nothing is missing: also when the last bytes came after the transmission was stopped. */
+function isWhole({ progress, moments }: FocusState): boolean {
+  return progress.state === "complete" || moments.at(-1)?.complete === true;
+}
+
+function statusText(state: FocusState): string {
+  const { progress, belowPixel, silent, info, moments } = state;
+  if (isWhole(state) && progress.state !== "failed")
+    return info?.exact === false || moments.at(-1)?.rms !== 0 ? "Complete" : "Complete: exact";
   if (belowPixel) return "Below a pixel: paused";
   switch (progress.state) {
     case "connecting":
@@ -213,7 +221,7 @@ function statusText({ progress, belowPixel, silent, info, moments }: FocusState)
     case "target":
       return "Target met";
     case "complete":
-      return info?.exact === false || moments.at(-1)?.rms !== 0 ? "Complete" : "Complete: exact";
+      return "Complete";
     case "failed":
       return "Failed";
   }

@@ -1,0 +1,99 @@
+"""A browser, servers, and an ear for errors, for the tests of the page.
+
+They take minutes and need Chromium and the built page, so a plain run of pytest leaves them out; `make test-web` sets
+LODESTREAM_WEB, and then what is missing is a failure.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.server.programs import server as program
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+    from .browser import Heard, Tab
+    from .shown import Shelf
+
+if not os.environ.get("LODESTREAM_WEB"):
+    collect_ignore_glob = ["test_page_*.py"]
+
+# (name, see `tests.web.browser.tab`) -> page
+Tabs = Callable[..., "Tab"]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    from . import browser as browsers
+
+    if lacks := browsers.missing():
+        pytest.fail(lacks)
+    with browsers.chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def heard() -> Iterator[Heard]:
+    """What is heard of the pages of a test, which has no error in the end."""
+    from .browser import Heard
+
+    told = Heard()
+    yield told
+    told.check()
+
+
+@pytest.fixture
+def tabs(browser: Browser, heard: Heard) -> Iterator[Tabs]:
+    """Opens pages, closed after the test."""
+    from .browser import tab
+
+    with ExitStack() as stack:
+
+        def opened(url: str, **options: Any) -> Tab:
+            return stack.enter_context(tab(browser, heard, **options)).go(url)
+
+        yield opened
+
+
+@pytest.fixture(scope="session")
+def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shelf]:
+    """A server in a process of its own, and surfaces on it."""
+    from .shown import Shelf
+
+    with program(tmp_path_factory.mktemp("server") / "data", formats="all") as started:
+        yield Shelf(started.url)
+
+
+@pytest.fixture(scope="session")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """A server that wants a token, and a token."""
+    from lodestream_server.access.tokens import TokenFile
+
+    folder = tmp_path_factory.mktemp("closed") / "data"
+    token, _ = TokenFile(folder / "tokens.json").create("tests", ("read", "write"))
+    with program(folder) as started:
+        yield started.url, token
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Path:
+    """A folder for the files of a static host."""
+    folder = tmp_path / "host"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """Programs that are started heed them, also where these tests run in the background and ignore them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

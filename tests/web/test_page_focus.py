@@ -1,0 +1,208 @@
+"""A surface comes into focus: its error falls to what the server promised, it stops, and it goes on after a loss."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import msgpack
+import numpy as np
+import pytest
+
+from tests.links import Fault, Link, linked
+
+from .browser import Tab
+from .conftest import Tabs
+from .shown import Shelf, surface
+
+TERRAIN = surface("terrain")
+HEIGHTS = TERRAIN.points[..., 0] if TERRAIN.points.ndim == 3 else TERRAIN.points
+
+
+class Frames:
+    """The messages of all WebSockets of a page."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.credit = self.data = 0
+        self.stops: list[tuple[int, int]] = []
+        tab.page.on("websocket", self._listen)
+
+    def _listen(self, socket: Any) -> None:
+        # What a connection was given before counts no more, nor what has come of it.
+        first = parse_qs(urlsplit(socket.url).query)["open"][0]
+        self.credit = msgpack.unpackb(base64.urlsafe_b64decode(first + "=="))["credit"]
+        self.data = 0
+        socket.on("framesent", self._sent)
+        socket.on("framereceived", self._received)
+
+    def _sent(self, frame: bytes) -> None:
+        message = msgpack.unpackb(frame)
+        if message["type"] == "credit":
+            self.credit += message["bytes"]
+        elif message["type"] == "stop":
+            self.stops.append((self.credit, self.data))
+
+    def _received(self, frame: bytes) -> None:
+        message = msgpack.unpackb(frame)
+        if message["type"] == "segments":
+            self.data += len(message["data"])
+
+
+class Weather:
+    """What is wrong with connections from now on: the page itself comes over good ones."""
+
+    def __init__(self) -> None:
+        self._faults: list[Fault] = []
+
+    def __call__(self, _: int) -> Fault:
+        if len(self._faults) > 1:
+            return self._faults.pop(0)
+        return self._faults[0] if self._faults else Fault()
+
+    def now(self, *faults: Fault) -> None:
+        """One for each connection in turn; the last holds for all after it."""
+        self._faults = list(faults)
+
+
+@contextmanager
+def over_a_link(
+    tabs: Tabs, shelf: Shelf, *faults: Fault, watch: Callable[[Tab], None] = lambda _: None
+) -> Iterator[tuple[Tab, Link]]:
+    """The terrain, over connections with these faults."""
+    shelf.description("terrain")
+    weather = Weather()
+    with linked(shelf.server, weather) as link:
+        tab = tabs(link.url)
+        listed = tab.page.get_by_role("link", name="terrain")
+        listed.wait_for()
+        watch(tab)
+        weather.now(*faults)
+        tab.page.goto(shelf.address("terrain", server=link.url))
+        yield tab, link
+
+
+def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain"))
+    prices = httpx.get(shelf.description("terrain").url, trust_env=False).json()["layers"]
+    seen = []
+    tab.view.get_by_label("Stop when below a pixel").uncheck()
+
+    def exact() -> bool:
+        seen.append((tab.rms.inner_text(), tab.max.inner_text()))
+        return seen[-1] == ("0 m", "0 m")
+
+    tab.until(exact)
+    tab.shown("Complete: exact")
+    promised = {price["bytes"]: (price["rms"], price["max"]) for price in prices}
+    moments = tab.moments
+    told = {moment["bytes"]: (moment["rms"], moment["max"]) for moment in moments}
+    assert {size: told[size] for size in promised} == promised
+    assert len(moments) > 8
+    assert moments[-1]["complete"]
+    for figures in zip(*seen, strict=True):
+        known = [float(figure.removesuffix(" m")) for figure in figures if figure[0].isdigit()]
+        assert known == sorted(known, reverse=True)
+    for x, y in ((0.5, 0.5), (0.35, 0.55), (0.65, 0.6)):
+        values = tab.point(x, y)
+        assert values["error at most"] == "0: exact"
+        value = HEIGHTS[int(values["row"]), int(values["column"])]
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(value), rel=1e-8)
+
+
+def test_a_target_is_met_and_the_values_are_within_its_error(tabs: Tabs, shelf: Shelf) -> None:
+    with over_a_link(tabs, shelf, Fault(rate=15_000.0)) as (tab, _):
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.until(lambda: tab.moments)
+        tab.choose("Target", "RMS error")
+        tab.view.get_by_label("Target value").fill("2")
+        tab.view.get_by_label("Target value").press("Enter")
+        tab.shown("Target met")
+        reached = tab.moments[-1]
+        assert 0.2 < reached["rms"] <= 2
+        tab.until(lambda: tab.rms.inner_text()[0].isdigit() and float(tab.rms.inner_text().split()[0]) <= 2)
+        errors = []
+        for x in np.linspace(0.3, 0.7, 5):
+            values = tab.point(float(x), 0.55)
+            value = HEIGHTS[int(values["row"]), int(values["column"])]
+            errors.append(abs(float(values["height"].removesuffix(" m")) - float(value)))
+        # The panel gives as many digits as the error leaves.
+        assert max(errors) <= reached["max"] * 1.1
+        assert any(errors)
+
+
+def test_the_slider_goes_back_to_earlier_moments(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain"))
+    tab.everything("m")
+    tab.press("End")  # which also draws what shows where the focus is
+    last = tab.picture()
+    first = tab.moments[0]
+    for _ in range(len(tab.moments)):
+        tab.press("[")
+    tab.until(lambda: tab.rms.inner_text() != "0 m")
+    tab.until(lambda: float(tab.rms.inner_text().split()[0]) == pytest.approx(first["rms"], rel=0.01))
+    assert np.abs(tab.picture() - last).mean() > 2
+    assert tab.status.inner_text() == "Complete: exact"
+    tab.press("End")
+    tab.until(lambda: tab.rms.inner_text() == "0 m")
+    assert np.abs(tab.picture() - last).mean() < 0.1
+
+
+def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> None:
+    frames: list[Frames] = []
+    slow = Fault(delay=0.05, rate=20_000.0)
+    with over_a_link(tabs, shelf, slow, watch=lambda tab: frames.append(Frames(tab))) as (tab, _):
+        (messages,) = frames
+        tab.until(lambda: messages.data > 20_000)
+        tab.button("Stop").click()
+        tab.shown("Stopped")
+        ((credit, before),) = messages.stops
+        tab.page.wait_for_timeout(1000)
+        ended = messages.data
+        assert 0 < credit - before <= 262_144
+        assert ended - before <= credit - before
+        size = int(shelf.description("terrain").details["bytes"])
+        assert ended < size
+        held = tab.moments[-1]["bytes"]
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.button("Continue").click()
+        tab.shown("Complete: exact")
+        # What was there is not sent again.
+        assert held + messages.data <= size + 10_000
+        assert messages.data < size
+
+
+def test_a_lost_link_is_told_and_the_surface_goes_on(tabs: Tabs, shelf: Shelf, heard: Any) -> None:
+    heard.allow("WebSocket connection to .* failed")
+    size = int(shelf.description("terrain").details["bytes"])
+    broken = Fault(cut_down=45_000, reset=True, rate=60_000.0)
+    with over_a_link(tabs, shelf, broken, broken, Fault(cut_down=300, reset=True), Fault()) as (tab, link):
+        before = link.down
+        tab.everything("m")
+        assert "Link lost: resuming" in tab.statuses
+        assert tab.statuses[-1] == "Complete: exact"
+        numbers = [moment["number"] for moment in tab.moments]
+        assert numbers == list(range(len(numbers)))
+        # Once more at most than what a client has: one window of each broken connection.
+        assert link.down - before < 1.6 * size + 900_000
+
+
+def test_a_link_without_a_word_is_told(tabs: Tabs, shelf: Shelf) -> None:
+    with over_a_link(tabs, shelf, Fault(cut_down=30_000, vanish=True)) as (tab, _):
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.shown("Waiting: no data for")
+        assert tab.moments
+        assert tab.rms.inner_text().endswith(" m")
+
+
+def test_below_a_pixel_it_pauses_and_goes_on_when_one_looks_closer(tabs: Tabs, shelf: Shelf) -> None:
+    with over_a_link(tabs, shelf, Fault(rate=30_000.0)) as (tab, _):
+        tab.shown("Below a pixel: paused")
+        paused = tab.moments[-1]
+        assert not paused["complete"]
+        tab.press(*["+"] * 16)
+        tab.until(lambda: tab.moments[-1]["number"] > paused["number"])
+        assert tab.moments[-1]["max"] < paused["max"]

@@ -1,0 +1,123 @@
+"""The page of a server: list, search, upload, delete, and tokens."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from lodestream_client.sync import upload
+
+from .browser import Heard, Tab
+from .conftest import Tabs
+from .shown import Shelf, surface
+
+HEIGHTS = surface("terrain").points
+
+
+@pytest.fixture
+def file(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A surface of its own for each test: what is on the server already is not built again."""
+    number = int.from_bytes(request.node.name.encode()) % 1000
+    path = tmp_path / f"hills-{number}.npy"
+    np.save(path, (HEIGHTS[:60, :80] + np.float32(number)).astype(np.float32))
+    return path
+
+
+def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path) -> None:
+    tab = tabs(shelf.server)
+    tab.page.get_by_label("Files to upload").set_input_files(file)
+    tab.page.get_by_role("link", name=file.name).click()
+    tab.everything()
+    values = tab.point(0.5, 0.55)
+    heights = np.load(file)
+    assert float(values["height"]) == pytest.approx(float(heights[int(values["row"]), int(values["column"])]), rel=1e-8)
+    expect(tab.page.locator("header .facts")).to_contain_text("60 × 80 points")
+
+
+def drop(tab: Tab, name: str, data: bytes) -> None:
+    """Let go of a file above the page's place for files."""
+    tab.page.evaluate(
+        """([name, text]) => {
+          const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+          const dataTransfer = new DataTransfer();
+          dataTransfer.items.add(new File([bytes], name));
+          for (const kind of ["dragenter", "dragover", "drop"])
+            document.querySelector(".drop").dispatchEvent(
+              new DragEvent(kind, { dataTransfer, bubbles: true, cancelable: true }));
+        }""",
+        [name, base64.b64encode(data).decode()],
+    )
+
+
+def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Path) -> None:
+    tab = tabs(shelf.server)
+    page = tab.page
+    drop(tab, file.name, file.read_bytes())
+    link = page.get_by_role("link", name=file.name)
+    link.wait_for()
+    expect(page.get_by_role("list", name="Uploads").get_by_role("listitem")).to_have_count(0)
+    page.get_by_label("Search surfaces").fill("nowhere")
+    expect(page.get_by_text("No surface has that in its name.")).to_be_visible()
+    page.get_by_label("Search surfaces").fill(file.stem.upper())
+    expect(page.locator("tbody tr")).to_have_count(1)
+    page.get_by_role("button", name=f"Delete {file.name}").click()
+    page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+    expect(link).to_be_visible()
+    page.get_by_role("button", name=f"Delete {file.name}").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(link).to_have_count(0)
+    page.reload()
+    expect(page.get_by_role("heading", name="Surfaces")).to_be_visible()
+    expect(link).to_have_count(0)
+
+
+def test_a_file_that_is_no_surface_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
+    heard.allow(r"status of 4\d\d")
+    tab = tabs(shelf.server)
+    drop(tab, "letter.txt", b"Dear reader, this is no surface.")
+    reason = tab.page.locator(".uploads .reason")
+    reason.wait_for()
+    assert len(reason.inner_text()) > 10
+    tab.page.get_by_role("button", name="Dismiss").click()
+    expect(reason).to_have_count(0)
+
+
+def test_an_address_of_nothing_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
+    heard.allow("status of 404")
+    tab = tabs(f"{shelf.server}/#s=11111111111111111111")
+    expect(tab.page.get_by_role("alert")).to_be_visible()
+    tab.page.get_by_role("link", name="Lodestream").click()
+    expect(tab.page.get_by_role("heading", name="Surfaces")).to_be_visible()
+
+
+def test_a_token_is_asked_for_and_kept_to_oneself(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
+    heard.allow("status of 401")
+    server, token = closed
+    upload(server, surface("torus"), token=token)
+    tab = tabs(server)
+    dialog = tab.page.get_by_role("dialog")
+    dialog.get_by_label("Token").fill("lode_wrong")
+    dialog.get_by_role("button", name="Continue").click()
+    # The server says that this is none; the dialog is there again, and empty.
+    expect(dialog.get_by_label("Token")).to_have_value("")
+    expect(dialog).not_to_contain_text("This server gives its surfaces")
+    dialog.get_by_label("Token").fill(token)
+    dialog.get_by_label("Token").press("Enter")
+    tab.page.get_by_role("link", name="torus").click()
+    tab.everything()
+    assert heard.tokens == {"Bearer lode_wrong", f"Bearer {token}"}
+    assert not [url for url in [*heard.requests, tab.page.url] if token in url or "lode_wrong" in url]
+    kept = tab.page.evaluate("[localStorage.length, sessionStorage.length, document.cookie]")
+    assert kept == [0, 0, ""]
+
+
+def test_without_a_token_nothing_is_shown(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
+    heard.allow("status of 401")
+    tab = tabs(closed[0])
+    tab.page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+    expect(tab.page.locator(".message.error")).to_be_visible()
+    expect(tab.page.locator("tbody tr")).to_have_count(0)

@@ -1,0 +1,177 @@
+"""Containers without a server of Lodestream: a host of files, ten lines of HTML, `lodestream view`, and damaged files."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+import lodestream as ls
+from lodestream_client.program import main
+from lodestream_client.sync import upload
+from tests.client.files import ranged
+
+from .browser import Heard
+from .conftest import Tabs
+from .shown import Shelf, surface
+
+WEB = Path(__file__).parents[2] / "client" / "web"
+HEIGHTS = surface("terrain").points
+
+
+@pytest.fixture(scope="module")
+def container(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("container") / "terrain.lode"
+    path.write_bytes(ls.encode(surface("terrain")))
+    return path
+
+
+@pytest.fixture
+def host(outside: Path, container: Path) -> Path:
+    """The page and a container, as `lodestream view --static` writes them."""
+    assert main(["view", str(container), "--static", str(outside)]) == 0
+    return outside
+
+
+def test_a_host_of_files_is_enough(tabs: Tabs, host: Path) -> None:
+    with ranged(host) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.everything("m")
+        values = tab.point(0.5, 0.55)
+        height = HEIGHTS[int(values["row"]), int(values["column"])]
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-8)
+        assert len(tab.moments) > 8
+        assert sum(asked is not None for _, asked in server.requests) > 1
+
+
+def test_of_several_containers_one_is_chosen(tabs: Tabs, host: Path) -> None:
+    (host / "torus.lode").write_bytes(ls.encode(surface("torus")))
+    both = [{"name": "hills", "src": "surface.lode", "bytes": 7}, {"name": "a torus", "src": "torus.lode"}]
+    (host / "view.json").write_text(json.dumps({"surfaces": both}))
+    with ranged(host) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.page.get_by_role("link", name="a torus").click()
+        tab.everything()
+        expect(tab.page.get_by_role("heading", name="a torus")).to_be_visible()
+        tab.page.go_back()
+        tab.page.get_by_role("link", name="hills").click()
+        tab.everything("m")
+
+
+@pytest.mark.parametrize("where", [0.02, 0.3, 0.9])
+def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, host: Path, where: float) -> None:
+    path = host / "surface.lode"
+    data = bytearray(path.read_bytes())
+    place = int(where * len(data))
+    data[place : place + 4] = bytes(byte ^ 0xFF for byte in data[place : place + 4])
+    path.write_bytes(data)
+    with pytest.raises(ls.LodestreamError):
+        ls.decode(bytes(data))
+    with ranged(host) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.shown("Failed")
+        expect(tab.notice).not_to_be_empty()
+        assert not any(moment["complete"] for moment in tab.moments)
+        if where > 0.5:
+            assert tab.moments
+            assert all(moment["bytes"] <= place for moment in tab.moments)
+            assert tab.rms.inner_text().endswith(" m")
+            assert tab.point(0.5, 0.55)["row"]
+
+
+def test_a_container_cut_short_is_told(tabs: Tabs, host: Path) -> None:
+    path = host / "surface.lode"
+    path.write_bytes(path.read_bytes()[:-5000])
+    with ranged(host) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.shown("Failed")
+        expect(tab.notice).not_to_be_empty()
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the npm package, built as they are for its registry."""
+    folder = tmp_path_factory.mktemp("library")
+    vite = [str(WEB / "node_modules" / ".bin" / "vite"), "build", "--config", "vite.library.config.ts"]
+    subprocess.run([*vite, "--outDir", str(folder), "--logLevel", "error"], cwd=WEB, check=True, timeout=300)
+    return folder
+
+
+def test_ten_lines_of_html_show_a_container(tabs: Tabs, outside: Path, library: Path, container: Path) -> None:
+    example = WEB / "examples" / "static.html"
+    assert len(example.read_text().splitlines()) <= 10
+    for path in (example, *library.glob("*.js"), *(WEB / "node_modules/three/build").glob("three.*.js")):
+        shutil.copy(path, outside)
+    shutil.copy(container, outside / "surface.lode")
+    icon = outside / "favicon.ico"  # which browsers ask every host for
+    icon.write_bytes(b"")
+    with ranged(outside) as server:
+        tab = tabs(f"{server.url}/static.html")
+        tab.everything("m")
+        values = tab.point(0.5, 0.55)
+        height = HEIGHTS[int(values["row"]), int(values["column"])]
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-8)
+        tab.until(lambda: "#v=" in tab.page.url)
+
+
+@contextmanager
+def viewing(*arguments: object, **environment: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """`lodestream view`, and the address that it prints."""
+    command = [sys.executable, "-m", "lodestream_client", "view", "--no-browser", *map(str, arguments)]
+    paths = os.pathsep.join(filter(None, sys.path))
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths, **environment}
+    )
+    try:
+        assert process.stdout is not None
+        with process.stdout:
+            yield process.stdout.readline().strip(), process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_view_encodes_a_file_and_shows_it(tabs: Tabs, tmp_path: Path) -> None:
+    np.save(tmp_path / "hills.npy", HEIGHTS)
+    with viewing(tmp_path / "hills.npy", "--name", "my hills") as (url, process):
+        assert url.startswith("http://127.0.0.1:")
+        tab = tabs(url)
+        tab.everything()
+        expect(tab.page.get_by_role("heading", name="my hills")).to_be_visible()
+        values = tab.point(0.5, 0.55)
+        height = HEIGHTS[int(values["row"]), int(values["column"])]
+        assert float(values["height"]) == pytest.approx(float(height), rel=1e-8)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_view_keeps_a_token_to_itself(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
+    server, token = closed
+    url = upload(server, surface("torus"), token=token).url
+    with viewing(url, LODESTREAM_TOKEN=token) as (address, _):
+        tab = tabs(address)
+        tab.everything()
+        assert all(asked.startswith((address, f"blob:{address[: address.index('/', 8)]}")) for asked in heard.requests)
+        assert heard.tokens == set()
+        assert token not in tab.page.content()
+
+
+def test_view_passes_on_a_surface_of_a_server(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
+    with viewing(shelf.description("holes").url) as (address, _):
+        tab = tabs(address)
+        tab.everything("m")
+        assert not [asked for asked in heard.requests if asked.startswith(shelf.server)]

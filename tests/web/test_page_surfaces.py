@@ -1,0 +1,149 @@
+"""Surfaces of all kinds: holes, closed axes, poles, several blocks, attributes; regions of the picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from .browser import ABOVE, Tab
+from .conftest import Tabs
+from .shown import Shelf, surface
+
+# No colour of this map is as light as the background; its ends are violet and yellow.
+VIRIDIS = "m=viridis"
+
+
+def drawn(picture: NDArray[np.int16]) -> NDArray[np.bool_]:
+    """[row, column]: where a surface covers the light background; scale, compass and legend at the bottom left out."""
+    covered: NDArray[np.bool_] = picture.min(axis=2) < 0xD8
+    covered[int(0.72 * len(covered)) :] = False
+    return covered
+
+
+def at(picture: NDArray[np.int16], x: float, y: float) -> NDArray[np.int16]:
+    """Mean colour around a place."""
+    row, column = int(y * picture.shape[0]), int(x * picture.shape[1])
+    mean: NDArray[np.int16] = picture[row - 3 : row + 4, column - 3 : column + 4].mean(axis=(0, 1))
+    return mean
+
+
+def has_no_gap(covered: NDArray[np.bool_]) -> bool:
+    """Whether nothing is left out between the first and the last pixel of each row: convex surfaces without cracks."""
+    for row in covered:
+        (found,) = np.nonzero(row)
+        if len(found) and not row[found[0] : found[-1] + 1].all():
+            return False
+    return bool(covered.any())
+
+
+def from_above(tab: Tab) -> NDArray[np.int16]:
+    tab.press("Home", ABOVE)
+    tab.page.mouse.move(5, 5)
+    return tab.picture()
+
+
+def test_holes_are_not_drawn_and_have_no_values(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("holes", VIRIDIS))
+    tab.everything("m")
+    picture = from_above(tab)
+    assert at(picture, 0.5, 0.5).min() > 0xD8
+    heights, mask = surface("holes").points, surface("holes").blocks[0].mask
+    assert mask is not None
+    for x, y in ((0.32, 0.5), (0.68, 0.5), (0.5, 0.22)):
+        assert at(picture, x, y).min() < 0xC0
+        values = tab.point(x, y)
+        row, column = int(values["row"]), int(values["column"])
+        assert mask[row, column]
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(heights[row, column]), rel=1e-8)
+    tab.point_at_nothing(0.5, 0.5)
+
+
+def test_a_torus_is_closed_both_ways(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("torus", VIRIDIS))
+    tab.everything()
+    picture = from_above(tab)
+    covered = picture.min(axis=2) < 0xD8
+    rows, columns = np.nonzero(covered[: int(0.72 * len(covered))])
+    middle = picture.shape[0] / 2, picture.shape[1] / 2
+    distance = np.hypot(rows - middle[0], columns - middle[1])
+    inner, outer = distance.min(), distance.max()
+    assert inner / outer == pytest.approx(0.5, abs=0.06)  # radii of 2 and 4
+    # Around the ring, but for the bottom of the picture, where legend and scale are, no seam is open.
+    ring = (inner + outer) / 2
+    for angle in np.radians(np.arange(-40, 221, 1.0)):
+        row, column = middle[0] - ring * np.sin(angle), middle[1] + ring * np.cos(angle)
+        assert covered[int(row), int(column)], np.degrees(angle)
+    tab.point_at_nothing(0.5, 0.5)
+    box = tab.canvas.bounding_box()
+    assert box is not None
+    values = tab.point(0.5, (middle[0] - ring) / box["height"])
+    row, column = int(values["row"]), int(values["column"])
+    assert float(values["z"]) == pytest.approx(float(surface("torus").points[row, column, 2]), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["cube-sphere", "sphere-closed", "sphere-halves", "sphere-seam"])
+def test_spheres_of_any_make_have_no_cracks(tabs: Tabs, shelf: Shelf, name: str) -> None:
+    tab = tabs(shelf.address(name, VIRIDIS))
+    tab.everything()
+    for keys in ((), ("ArrowLeft",) * 9, (ABOVE,)):
+        tab.press(*keys)
+        assert has_no_gap(drawn(tab.picture()))
+
+
+def test_values_name_the_block(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("cube-sphere"))
+    tab.everything()
+    blocks = set()
+    for x in (0.4, 0.5, 0.6):
+        for y in (0.35, 0.5, 0.65):
+            values = tab.point(x, y)
+            number = int(values["block"])
+            blocks.add(number)
+            position = [float(values[name].split()[0]) for name in "xyz"]
+            block = shelf.decoded("cube-sphere").blocks[number]
+            expected = block.points[int(values["row"]), int(values["column"])]
+            assert position == pytest.approx([float(value) for value in expected], rel=1e-6, abs=1e-9)
+    assert len(blocks) >= 2
+    assert tab.page.locator("header .facts").inner_text().startswith("6 blocks")
+
+
+def test_an_attribute_colours_the_surface(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("attribute"))
+    tab.everything("m")
+    tab.choose("Coloured by", "temperature")
+    legend = tab.view.locator(".legend")
+    tab.until(lambda: legend.locator(".legend-title").inner_text() == "temperature")
+    tab.until(lambda: legend.locator(".legend-ticks span").all_inner_texts() == ["0", "124.5", "249"])
+    picture = from_above(tab)
+    left, right = at(picture, 0.3, 0.5), at(picture, 0.7, 0.5)
+    assert left[2] > left[1]  # violet
+    assert right[1] > right[2] + 20  # green to yellow
+    values = tab.point(0.45, 0.5)
+    assert float(values["temperature"]) == float(values["column"])
+    tab.view.get_by_label("Colours begin at").fill("240")
+    tab.view.get_by_label("Colours begin at").press("Enter")
+    tab.until(lambda: legend.locator(".legend-ticks span").first.inner_text() == "240")
+    again = at(from_above(tab), 0.7, 0.5)
+    assert again[2] > again[1]  # all of it but the last columns is at the low end
+
+
+def test_slope_change_lines_and_no_colours_are_drawn(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain", VIRIDIS))
+    tab.everything("m")
+    pictures = [from_above(tab)]
+    for name, title in (("Slope", "Slope (degrees)"), ("Last change", "Last change (m)"), ("Shading only", None)):
+        tab.choose("Coloured by", name)
+        legend = tab.view.locator(".legend-title")
+        if title is None:
+            legend.wait_for(state="hidden")
+        else:
+            tab.until(lambda title=title: legend.inner_text() == title)  # type: ignore[misc]
+        pictures.append(from_above(tab))
+    tab.view.get_by_label("Quad lines").check()
+    tab.press(*["+"] * 9)
+    pictures += [tab.picture()]
+    tab.press("l")
+    pictures += [tab.picture()]
+    for before, after in zip(pictures, pictures[1:], strict=False):
+        assert np.abs(before - after).mean() > 1
