@@ -2,7 +2,8 @@
 
 Points are numbered over all blocks of the whole surface at full resolution, block after block, each in row order.
 Two of them may lie at one place, and then also be one vertex: at one place with the same attributes. Of a surface that
-comes out of a container both are known from its header, so that a rough picture of it hangs together as the exact one.
+comes out of a container both are known from its header, so that a coarse reconstruction of it
+hangs together as the exact one.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
  * writes it as src/kernels/module.ts unless that was made from the same sources.
  *
  * The compiler is zig: `ZIG` names it, else it is the `ziglang` wheel of `PYTHON`, of the project's .venv or of python3,
- * else what `make web` has unpacked into build/ziglang.
+ * else what was unpacked into build/ziglang.
  */
 import { execFileSync, spawnSync } from "node:child_process";
 import { createHash } from "node:crypto";

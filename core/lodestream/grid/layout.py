@@ -3,8 +3,8 @@
 A surface is coded as one or more *grids*: the patches of its blocks, and the interfaces along which patches meet. The
 coefficients of one channel of a grid fill an array of the grid's own shape. Level l occupies the first rows and
 columns of it, as many as its grid has; a step splits that corner into the nodes of level l - 1 and up to three *bands*
-of details around it, as is usual for wavelets. A *tile* is a piece of all bands of one level over the same patch of a
-grid, or all bands of a level of several small grids; level 0 of all grids is one tile.
+of details around it, as is usual for wavelets. A *tile* is a rectangle of all bands of one level over the same place in
+a grid, or all bands of a level of several small grids; level 0 of all grids is one tile.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The messages of a stream, one frozen dataclass each, and the error codes.
 
 An event that one side sends is received as the same event by the other side. `wire` has the bytes of messages,
-`protocol` their order; `docs/protocol.md` is the specification.
+`connection` their order; `docs/protocol.md` is the specification.
 """
 
 from __future__ import annotations
@@ -167,14 +167,14 @@ class Opened:
     size : int
         Bytes of the whole container.
     planned : int
-        Bytes of the surface (header, layers, residual) that the target needs, including held ones; index and metadata
+        Bytes of the surface (header, layers, residual) that the target needs, including cached ones; index and metadata
         are not counted.
     extent : float
         Unit of relative tolerances: the range of the heights, or the diagonal of the bounding box.
     index, metadata : (offset, length)
         Places of these two sections.
     prefix : bool
-        True if the file is sent from its first byte on (held parts left out), then the metadata. False if the index
+        True if the file is sent from its first byte on (cached slices left out), then the metadata. False if the index
         comes first, then slices.
     """
 
@@ -204,7 +204,7 @@ class Layer:
     ``number`` counts layers or levels from 0. ``bytes``, ``rms`` and ``max`` are those recorded in the container. If a
     region comes first, the message is sent when the layer is complete in the region, and again when it is complete
     everywhere. While the client has been sent more than belongs to the layer, ``rms`` and ``max`` are NaN, and
-    ``bytes`` counts all that is held.
+    ``bytes`` counts all that is cached.
     """
 
     type: ClassVar[str] = "layer"
