@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -30,6 +31,8 @@ from .storage.containers import Containers
 from .storage.storage import Storage
 
 __all__ = ["create_app"]
+
+_log = logging.getLogger(__name__)
 
 _DESCRIPTION = """Structured surfaces, coarsest level first.
 
@@ -122,5 +125,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 def _level_files(settings: Settings, storage: Storage, limits: Limits) -> LevelFiles:
     most = settings.level_disk
     if most is None:
-        most = max(min(_LEVEL_DISK, shutil.disk_usage(storage.root).total // 20), _LEAST_LEVEL_DISK)
+        try:
+            size = shutil.disk_usage(storage.root).total
+        except OSError as error:  # level files can be made again: no reason not to start
+            _log.warning("the size of the disk is unknown, so that few level files are kept: %s", error)
+            size = 0
+        most = max(min(_LEVEL_DISK, size // 20), _LEAST_LEVEL_DISK)
     return LevelFiles(storage.levels, most, limits.room)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
+import shutil
 import socket
 import stat
 import subprocess
@@ -278,3 +280,19 @@ def test_a_token_file_that_cannot_be_replaced_leaves_nothing_behind(
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
     assert [token["name"] for token in json.loads(before)["tokens"]] == ["one"]
+
+
+def test_a_server_starts_on_a_disk_whose_size_cannot_be_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told = shutil.disk_usage
+
+    def stale(folder: Path) -> object:
+        monkeypatch.setattr(shutil, "disk_usage", told)
+        raise OSError(errno.ESTALE, "Stale file handle", str(folder))
+
+    monkeypatch.setattr(shutil, "disk_usage", stale)
+    with running_server(tmp_path / "data", workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+        surface = push(http, npy(hills()))
+        assert http.get(f"{surface['url']}/levels/0", params={"format": "npy"}).status_code == 200
+    assert "the size of the disk is unknown, so that few level files are kept: [Errno 116]" in caplog.text
