@@ -1,8 +1,8 @@
 """Received data of incomplete containers, cached on disk, so that a later program can continue from there.
 
 There is one log file for each container: a head, then a record for each received range, with its offset, its length and
-a checksum over all three. Records are appended at once and never changed. So a program that is killed loses nothing,
-and a machine that loses power loses at most records whose checksum does not match.
+a checksum over all three. Records are appended at once and never changed. So a program that is killed loses at most the
+record that it was writing, and a machine that loses power at most records whose checksum does not match.
 
 The name of a file comes from a server. So only names of 64 hexadecimal digits are accepted, symbolic links are not
 followed, and no file is written or removed that does not begin like a file of this module.

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError
+from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError, TruncatedStreamError
 
 from . import over_http, over_websocket
-from .effects import Effect, Flow, HangUp, Send, Wait
+from .effects import Dial, Effect, Flow, Get, HangUp, Hear, Read, Send, Wait
 from .session import Session
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ class Core:
         self._flow = self._travel()
         self._effect: Effect | None = None
         self._begun = False
+        self._viewed: float | None = None  # since when somebody looks at a view
 
     @property
     def met(self) -> bool:
@@ -54,6 +55,16 @@ class Core:
         if not self._begun:
             self._begun = True
             self.done(None)
+        session, effect = self.session, self._effect
+        if isinstance(effect, Hear):
+            # It begins when it is asked for: that somebody looks at a view for long is no silence of the server's.
+            until = effect.until if self._viewed is None else effect.until + session.clock() - self._viewed
+            until = until if session.close_by is None else min(until, session.close_by)
+            self._effect = effect if until == effect.until else Hear(until)
+        elif session.stopped and isinstance(effect, Dial | Get | Read):
+            # The other side need not be told, so nobody waits for what it says.
+            self.failed(TruncatedStreamError(f"expected more of {session.url}, but was stopped"))
+        self._viewed = None
         return self._effect
 
     def next_view(self) -> View | None:
@@ -61,7 +72,10 @@ class Core:
 
         So the server has its credit, and the link is busy, while somebody looks at the view.
         """
-        return None if isinstance(self._effect, Send) else self.session.next_view()
+        view = None if isinstance(self._effect, Send) else self.session.next_view()
+        if view is not None and self._viewed is None:
+            self._viewed = self.session.clock()
+        return view
 
     def done(self, result: object) -> None:
         """Declare that the effect has been carried out.

@@ -66,6 +66,8 @@ class Session:
         How often the region that comes first has changed.
     stopped : bool
         Whether this side wants no more.
+    close_by : float or None
+        When the connection is to be closed, by `clock`; None while nobody closes it.
     withheld : str
         What to say of a token that a redirect did not take along.
     lock : RLock
@@ -101,10 +103,10 @@ class Session:
         self.connections = 0
         self.turns = 0
         self.stopped = False
+        self.close_by: float | None = None
         self.withheld = ""
         self.lock = threading.RLock()
         self._views: deque[View] = deque()
-        self._close_by: float | None = None
         self._abandoned = False
         self._truncated = False
 
@@ -174,7 +176,7 @@ class Session:
         """Want no more, and have the connection closed within the time that is allowed for this."""
         if self.ended is None:
             self.stop()
-        self._close_by = self.clock() + self.options.close_timeout
+        self.close_by = self.clock() + self.options.close_timeout
 
     def abandon(self) -> None:
         """Declare that nobody receives any more."""
@@ -196,8 +198,8 @@ class Session:
     def patience(self, left: float | None = None) -> float:
         """Seconds to wait for the other side; no longer than `left`."""
         seconds = self.silence
-        if self._close_by is not None:
-            seconds = max(min(seconds, self._close_by - self.clock()), _LEAST_PATIENCE)
+        if self.close_by is not None:
+            seconds = max(min(seconds, self.close_by - self.clock()), _LEAST_PATIENCE)
         return seconds if left is None else min(seconds, left)
 
     def take(self, receive: Callable[[], list[DownloadEvent]]) -> None:
@@ -233,7 +235,7 @@ class Session:
     def over(self) -> bool:
         """Whether a connection that broke is not to be replaced, since nothing more is wanted."""
         reception = self.reception
-        if not self.stopped and self._close_by is None and reception.stopped_for is None:
+        if not self.stopped and self.close_by is None and reception.stopped_for is None:
             if reception.tick(self.clock()) != 0:
                 return False
             reception.stopped_for = "seconds"

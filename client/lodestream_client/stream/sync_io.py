@@ -93,10 +93,11 @@ class SyncIO:
         from websockets.exceptions import ConnectionClosed
 
         with self._session.lock:
+            connection = self._socket  # which whoever iterates may close meanwhile
             for message in self._session.messages():
                 with suppress(ConnectionClosed):
-                    if self._socket is not None:
-                        self._socket.send(message)
+                    if connection is not None:
+                        connection.send(message)
 
     def _get(self, get: Get) -> Head:
         import httpx

@@ -322,6 +322,33 @@ def test_closing_waits_no_longer_than_allowed() -> None:
     assert world.now < 4.0
 
 
+@pytest.mark.parametrize("transport", ["ws", "http"])
+@pytest.mark.parametrize("number", range(1, 25))
+def test_closing_does_not_wait_for_what_was_to_come_next(number: int, transport: Any) -> None:
+    """The effect that is due when somebody closes was decided on when there was more time."""
+    world = World(transport=transport, window=500, close_timeout=3.0)
+    for _ in range(number):
+        if (effect := next_effect(world.core)) is not None:
+            world.step(effect)
+    ended, began, world.acts = world.session.ended, world.now, dict.fromkeys(range(number, 5000), "silence")
+    world.session.close()
+    world.run()
+    assert world.session.ended == (ended or "stopped")
+    assert world.now - began < 3.0 + 10 * STEP
+
+
+def test_while_somebody_looks_at_a_view_the_server_is_not_silent() -> None:
+    world = World(transport="ws", window=500, silence=2.0)
+    while world.core.next_view() is None:
+        world.step(world.core.effect or pytest.fail("the stream is over"))
+    world.now += 60.0
+    effect = next_effect(world.core)
+    assert isinstance(effect, Hear)
+    assert effect.until > world.now + 1.9
+    world.now += 1.0
+    assert next_effect(world.core) is effect, "a wait that has begun goes on"
+
+
 def test_the_keywords_of_connect_are_its_options() -> None:
     assert list(ConnectKeywords.__annotations__) == [field.name for field in fields(ConnectOptions)]
     assert len(fields(ConnectOptions)) == 14

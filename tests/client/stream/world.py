@@ -86,9 +86,10 @@ class World:
         self.stopped_at: int | None = None
         self.session = Session(url, ConnectOptions(**options), lambda: self.now)
         self.core = Core(self.session)
-        self._acts = acts or {}
+        self.acts = acts or {}
         self._server: Sender | None = None
         self._body: Iterator[bytes] | None = None
+        self._seconds = 0.0  # of the last request, also for each step of its answer
 
     def run(self) -> World:
         """Follow the stream to its end."""
@@ -102,7 +103,7 @@ class World:
         return self
 
     def step(self, effect: Effect) -> None:
-        act = self._acts.get(len(self.effects))
+        act = self.acts.get(len(self.effects))
         self.effects.append(effect)
         assert len(self.effects) < 20_000, "the stream does not end"
         if act == "cancel":
@@ -137,8 +138,12 @@ class World:
 
     def silent(self, effect: Effect) -> Any:
         """The same effect where nothing comes in time."""
-        if isinstance(effect, Dial | Get):
+        if isinstance(effect, Get):
+            self._seconds = effect.seconds
+        if isinstance(effect, Dial):
             self.now += effect.seconds
+        if isinstance(effect, Get | Read):
+            self.now += self._seconds
         if isinstance(effect, Hear):
             self.now = max(self.now, effect.until)
         if isinstance(effect, Dial):
@@ -166,7 +171,8 @@ class World:
                     if self._server is not None:
                         self.sent.append(self._server.receive(message))
                 return None
-            case Get(_, headers):
+            case Get(_, headers, seconds):
+                self._seconds = seconds
                 return self._answer(headers)
             case Read():
                 assert self._body is not None, "only an answer is read"
