@@ -175,6 +175,19 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
         assert messages.data < size
 
 
+def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
+    with over_a_link(tabs, shelf, Fault(rate=20_000.0)) as (tab, _):
+        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.until(lambda: tab.moments)
+        tab.press("s")
+        tab.shown("Stopped")
+        stopped = tab.moments[-1]
+        assert not stopped["complete"]
+        tab.press("s")
+        tab.shown("Complete: exact")
+        assert tab.moments[-1]["bytes"] > stopped["bytes"]
+
+
 def test_a_lost_link_is_told_and_the_surface_goes_on(tabs: Tabs, shelf: Shelf, heard: Any) -> None:
     heard.allow("WebSocket connection to .* failed")
     size = int(shelf.description("terrain").details["bytes"])

@@ -15,10 +15,13 @@ function ask(dialog: HTMLDialogElement): Promise<string> {
 }
 
 function buttons(answer: string, kind: string): HTMLElement {
+  // Not one that submits: Enter in a field presses the first of those.
+  const cancel = html("button", { type: "button" }, "Cancel");
+  cancel.addEventListener("click", () => cancel.closest("dialog")?.close(""));
   return html(
     "div",
     { class: "actions" },
-    html("button", { value: "", formnovalidate: true }, "Cancel"),
+    cancel,
     html("button", { value: "yes", class: kind }, answer),
   );
 }
