@@ -181,13 +181,19 @@ class Tab:
         self.view.get_by_label(label, exact=True).select_option(label=value)
 
     def picture(self) -> NDArray[np.int16]:
-        """What is drawn, [row, column, red green blue], once it rests: two pictures in a row are the same."""
+        """What is drawn, [row, column, red green blue], once it rests: two pictures in a row are the same.
+
+        Its edge, which shows whether it has the focus, is white.
+        """
         last = b""
         for _ in range(100):
             now = self.canvas.screenshot()
             if now == last:
                 with Image.open(io.BytesIO(now)) as image:
-                    return np.asarray(image.convert("RGB")).astype(np.int16)
+                    picture = np.asarray(image.convert("RGB")).astype(np.int16)
+                edge = np.pad(np.zeros(np.subtract(picture.shape[:2], 12), bool), 6, constant_values=True)
+                picture[edge] = 255
+                return picture
             last = now
             self.page.wait_for_timeout(400)
         raise AssertionError("the picture does not come to rest")

@@ -40,6 +40,7 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
 
 def drop(tab: Tab, name: str, data: bytes) -> None:
     """Let go of a file above the page's place for files."""
+    tab.page.locator(".drop").wait_for()
     tab.page.evaluate(
         """([name, text]) => {
           const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

@@ -18,12 +18,7 @@ function buttons(answer: string, kind: string): HTMLElement {
   // Not one that submits: Enter in a field presses the first of those.
   const cancel = html("button", { type: "button" }, "Cancel");
   cancel.addEventListener("click", () => cancel.closest("dialog")?.close(""));
-  return html(
-    "div",
-    { class: "actions" },
-    cancel,
-    html("button", { value: "yes", class: kind }, answer),
-  );
+  return html("div", { class: "actions" }, cancel, html("button", { value: "yes", class: kind }, answer));
 }
 
 /** Asks for a token. @param problem - Why; may be empty. @returns null if none was given. */
