@@ -89,21 +89,6 @@ def test_the_keyboard_alone_is_enough(tabs: Tabs, shelf: Shelf) -> None:
     tab.until(lambda: abs(tab.camera[0]) < 0.02 and abs(tab.camera[1]) < 0.02)
 
 
-def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
-    tab = tabs(shelf.address("terrain"))
-    tab.view.get_by_label("Stop when below a pixel").uncheck()
-    tab.choose("Link", "56 kbit/s")
-    tab.until(lambda: tab.moments)
-    tab.press("s")
-    tab.shown("Stopped")
-    stopped = tab.moments[-1]
-    assert not stopped["complete"]
-    tab.choose("Link", "As it comes")
-    tab.press("s")
-    tab.shown("Complete: exact")
-    assert tab.moments[-1]["bytes"] > stopped["bytes"]
-
-
 def test_a_shared_address_shows_the_same(tabs: Tabs, shelf: Shelf) -> None:
     first = tabs(shelf.address("terrain"))
     first.everything("m")

@@ -15,12 +15,10 @@ function ask(dialog: HTMLDialogElement): Promise<string> {
 }
 
 function buttons(answer: string, kind: string): HTMLElement {
-  return html(
-    "div",
-    { class: "actions" },
-    html("button", { value: "", formnovalidate: true }, "Cancel"),
-    html("button", { value: "yes", class: kind }, answer),
-  );
+  // Not one that submits: Enter in a field presses the first of those.
+  const cancel = html("button", { type: "button" }, "Cancel");
+  cancel.addEventListener("click", () => cancel.closest("dialog")?.close(""));
+  return html("div", { class: "actions" }, cancel, html("button", { value: "yes", class: kind }, answer));
 }
 
 /** Asks for a token. @param problem - Why; may be empty. @returns null if none was given. */

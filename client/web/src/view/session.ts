@@ -157,6 +157,8 @@ export class Session {
   /** Stops below a pixel, or goes on above it. */
   considerPixels(): void {
     const last = this.moments.at(-1);
+    // The last bytes may have come after it was stopped.
+    if (last?.complete) this.stoppedBelowPixel = false;
     if (last === undefined || last.complete || this.userStopped) return;
     const below = this.stopsBelowPixel && belowPixel(last, this.pixels);
     if (below && this.progress.state === "receiving") {

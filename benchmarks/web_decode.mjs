@@ -1,0 +1,58 @@
+/** Decodes a container in a worker of Node once for each line of standard input; prints what that took as JSON. */
+import { readFileSync } from "node:fs";
+import { createInterface } from "node:readline";
+import { pathToFileURL } from "node:url";
+import { isMainThread, parentPort, Worker, workerData } from "node:worker_threads";
+
+const [library, container] = isMainThread ? process.argv.slice(2) : workerData;
+
+/** Seconds within each kernel: every export is timed. */
+const spent = {};
+
+function timed() {
+  const Instance = WebAssembly.Instance;
+  WebAssembly.Instance = function (module, imports) {
+    const { exports } = new Instance(module, imports);
+    const own = {};
+    for (const [name, value] of Object.entries(exports)) {
+      own[name] =
+        typeof value !== "function"
+          ? value
+          : (...given) => {
+              const began = performance.now();
+              const result = value(...given);
+              spent[name] = (spent[name] ?? 0) + (performance.now() - began) / 1000;
+              return result;
+            };
+    }
+    return { exports: own };
+  };
+}
+
+async function work() {
+  const { Decoder, loadKernels } = await import(pathToFileURL(library).href);
+  const data = new Uint8Array(readFileSync(container));
+  const usual = WebAssembly.Instance;
+  parentPort.on("message", async (inside) => {
+    for (const name of Object.keys(spent)) delete spent[name];
+    WebAssembly.Instance = usual;
+    if (inside) timed();
+    const before = process.cpuUsage();
+    const decoder = new Decoder(await loadKernels());
+    decoder.feed(data);
+    decoder.finish();
+    const { points } = decoder.layers.at(-1).surface().blocks[0];
+    const { user, system } = process.cpuUsage(before);
+    parentPort.postMessage({ seconds: (user + system) / 1e6, points: points.values.length, kernels: { ...spent } });
+  });
+}
+
+if (isMainThread) {
+  const worker = new Worker(new URL(import.meta.url), { workerData: [library, container] });
+  worker.on("message", (told) => console.log(JSON.stringify(told)));
+  const lines = createInterface({ input: process.stdin });
+  lines.on("line", (line) => worker.postMessage(line === "kernels"));
+  lines.on("close", () => worker.terminate());
+} else {
+  await work();
+}
