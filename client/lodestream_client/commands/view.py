@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -176,6 +177,7 @@ def _serve(options: ViewOptions) -> None:
     server = PageServer(assets(), options.name, options.port)
     with serving(server):
         say(server.url)
+        sys.stdout.flush()  # whoever reads it from a pipe waits for it
         if options.browser:
             import webbrowser
 

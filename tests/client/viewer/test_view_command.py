@@ -160,7 +160,7 @@ def viewing(built: Path, container: Path) -> Iterator[subprocess.Popen[str]]:
         "from lodestream_client.commands import view; view.assets = lambda: made\n"
         "from lodestream_client.program import main; sys.exit(main(sys.argv[1:]))"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUNBUFFERED": ""}
     command = [sys.executable, "-c", code, "view", str(container), "--no-browser"]
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -171,6 +171,7 @@ def viewing(built: Path, container: Path) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+@pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_page_is_there_until_it_is_told_to_end(
     viewing: subprocess.Popen[str], container: Path, number: signal.Signals, code: int
