@@ -25,7 +25,6 @@ from .forkserver import Allowed
 __all__ = ["Call", "Pool"]
 
 # A process may die between the last look at it and the call; one that dies again and again has another reason.
-# A process may die between the last look at it and the call; one that dies again and again has another reason.
 _STARTS: Final = 3
 
 
