@@ -179,4 +179,3 @@ def test_view_passes_on_a_surface_of_a_server(tabs: Tabs, shelf: Shelf, heard: H
         tab = tabs(address)
         tab.everything("m")
         assert not [asked for asked in heard.requests if asked.startswith(shelf.server)]
-

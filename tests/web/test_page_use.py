@@ -122,9 +122,7 @@ def violations(tab: Tab) -> list[str]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(900, 700), (360, 640)], ids=["wide", "narrow"])
-def test_axe_finds_nothing_wrong_with_a_surface(
-    tabs: Tabs, shelf: Shelf, scheme: str, size: tuple[int, int]
-) -> None:
+def test_axe_finds_nothing_wrong_with_a_surface(tabs: Tabs, shelf: Shelf, scheme: str, size: tuple[int, int]) -> None:
     tab = tabs(shelf.address("attribute"), color_scheme=scheme, size=size)
     tab.everything("m")
     tab.press("p")
