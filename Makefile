@@ -63,22 +63,27 @@ kernels: $(STAMP)
 # The page of the browser, of which server and client serve the built files: see client/web/README.md.
 WEB := client/web
 PAGE := core/lodestream/page/static
+WEB_TOOLS := $(VENV)/.web
 WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -not -name module.ts 2>/dev/null) \
 	$(wildcard $(WEB)/*.json $(WEB)/*.ts core/kernels/*.[ch])
 
 page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
 
-test-web: page ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
+test-web: page $(WEB_TOOLS) ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
 	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
+	@LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
 
-bench-web: page ## speed of the browser's decoder, times to the first picture, and the size of the bundle
-	@PYTHON=$(BIN)/python $(BIN)/python -m benchmarks.web
+bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the first picture, and the size of the bundle
+	@$(BIN)/python -m benchmarks.web $(ARGS)
 
-$(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES)
-	@$(BIN)/python -c 'import ziglang' 2>/dev/null || $(BIN)/python -m pip install --quiet --group web
+$(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES) | $(WEB_TOOLS)
 	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page -- --logLevel warn
 	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
+
+# The compiler of the kernels, and what drives Chromium.
+$(WEB_TOOLS): $(STAMP)
+	@$(BIN)/python -m pip install --quiet --group web
+	@touch $@
 
 # Not `npm ci`: that refuses where a registry lacks what a package has for another platform. The versions are the lock file's.
 $(WEB)/node_modules/.package-lock.json: $(WEB)/package-lock.json | $(STAMP)

@@ -30,7 +30,7 @@ function timed() {
 }
 
 async function work() {
-  const { Decoder, loadKernels } = await import(pathToFileURL(library).href);
+  const { decode, loadKernels } = await import(pathToFileURL(library).href);
   const data = new Uint8Array(readFileSync(container));
   const usual = WebAssembly.Instance;
   parentPort.on("message", async (inside) => {
@@ -38,10 +38,7 @@ async function work() {
     WebAssembly.Instance = usual;
     if (inside) timed();
     const before = process.cpuUsage();
-    const decoder = new Decoder(await loadKernels());
-    decoder.feed(data);
-    decoder.finish();
-    const { points } = decoder.layers.at(-1).surface().blocks[0];
+    const { points } = decode(await loadKernels(), data).blocks[0];
     const { user, system } = process.cpuUsage(before);
     parentPort.postMessage({ seconds: (user + system) / 1e6, points: points.values.length, kernels: { ...spent } });
   });

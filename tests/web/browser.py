@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, expect, sync_playwright
 
 from lodestream import page as built
 
@@ -100,7 +100,12 @@ class Heard:
 
     def listen(self, context: BrowserContext) -> None:
         """Hear of all pages of a context."""
-        context.on("console", lambda told: told.type == "error" and self.errors.append(f"{told.text} {told.location}"))
+
+        def console(told: ConsoleMessage) -> None:
+            if told.type == "error":
+                self.errors.append(f"{told.text} {told.location}")
+
+        context.on("console", console)
         context.on("weberror", lambda told: self.errors.append(str(told.error)))
         context.on("request", lambda request: self._ask(request.url, request.headers))
         context.on("page", lambda page: page.on("websocket", lambda socket: self._ask(socket.url, {})))
@@ -242,7 +247,7 @@ class Tab:
 
 @contextmanager
 def tab(browser: Browser, heard: Heard, size: tuple[int, int] = SIZE, **options: Any) -> Iterator[Tab]:
-    """A page with nothing of other pages: no cookies, no files kept. New detail is shown at once, unless told otherwise."""
+    """A page with nothing of other pages: no cookies, no files. New detail is shown at once, unless told otherwise."""
     chosen = {"viewport": {"width": size[0], "height": size[1]}, "reduced_motion": "reduce", **options}
     context = browser.new_context(**chosen)
     context.set_default_timeout(WAIT)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 import lodestream as ls
-from lodestream_client.sync import Description, upload
+from lodestream_client import Description
+from lodestream_client.sync import upload
 from tests.core.surfaces import terrain, torus
 
 __all__ = ["GOLDEN", "Shelf", "surface"]

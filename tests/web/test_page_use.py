@@ -57,7 +57,8 @@ def test_the_keyboard_alone_is_enough(tabs: Tabs, shelf: Shelf) -> None:
         before = np.array(tab.camera)
         for key in pressed:
             keys.press(key)
-        return np.array(tab.camera) - before
+        moved: np.ndarray[Any, np.dtype[np.float64]] = np.array(tab.camera) - before
+        return moved
 
     tab.until(lambda: tab.rms.inner_text() == "0 m")
     home = tab.camera
