@@ -1,7 +1,7 @@
 /** Receiving a surface: the public API. */
 
 import { OptionError } from "./errors";
-import type { Ended } from "./planning/plans";
+import type { Ended } from "./planning/plan";
 import { makeTarget, type TargetOptions } from "./planning/target";
 import { sourceUrl } from "./transfer/addresses";
 import { type Channel, WorkerChannel, type WorkerLike } from "./transfer/channel";

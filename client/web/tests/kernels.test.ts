@@ -1,14 +1,14 @@
 import { beforeAll, describe, expect, it } from "vitest";
-import { decodePiece } from "../src/decoding/exactness";
-import { decodeMask } from "../src/decoding/masks";
-import { TileTable } from "../src/decoding/tile-table";
-import { type Plane, Tiles } from "../src/decoding/tiles";
-import { allocatePlane, forwardStep, inverseStep } from "../src/decoding/transform";
+import { decodeMask } from "../src/entropy/mask";
+import { TileTable } from "../src/entropy/tile-table";
+import { type Plane, Tiles } from "../src/entropy/tiles";
 import { axisStep } from "../src/grid/axis";
 import { Layout, plainGrid } from "../src/grid/layout";
 import { Arena } from "../src/kernels/arena";
 import { loadKernels } from "../src/kernels/instance";
 import { sha256 } from "../src/kernels/sha256";
+import { decodePiece } from "../src/residual/chunk-coder";
+import { allocatePlane, forwardStep, inverseStep } from "../src/transform/pyramid";
 import type { DType, Shape } from "../src/types";
 import { run } from "./python";
 

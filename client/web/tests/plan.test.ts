@@ -1,8 +1,8 @@
 import { describe, expect, it } from "vitest";
 import { readIndex } from "../src/container";
-import { plan } from "../src/planning/plan";
-import { endOf, type Plan } from "../src/planning/plans";
-import { RangeSet } from "../src/planning/ranges";
+import { RangeSet } from "../src/planning/byte-ranges";
+import { endOf, type Plan } from "../src/planning/plan";
+import { plan } from "../src/planning/planner";
 import { makeTarget, type TargetOptions } from "../src/planning/target";
 import { run } from "./python";
 

@@ -8,6 +8,7 @@ import { LocalProtocolError, RemoteProtocolError, UnsupportedVersionError } from
 import { unpack } from "../src/msgpack";
 import { makeTarget } from "../src/planning/target";
 import { Connection, TRANSITIONS } from "../src/protocol/connection";
+import { MAX_OPENING, toAddress } from "../src/protocol/handshake";
 import {
   CODES,
   type Event,
@@ -19,7 +20,6 @@ import {
   MIN_WINDOW,
   VERSION,
 } from "../src/protocol/messages";
-import { MAX_OPENING, toAddress } from "../src/protocol/opening";
 import { parse, serialize } from "../src/protocol/wire";
 import { ROOT } from "./golden";
 import { run } from "./python";

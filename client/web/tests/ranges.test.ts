@@ -1,10 +1,10 @@
 import fc from "fast-check";
 import { describe, expect, it } from "vitest";
 import { OptionError } from "../src/errors";
-import { RangeSet } from "../src/planning/ranges";
+import { RangeSet } from "../src/planning/byte-ranges";
 import { absolute, makeTarget, tolerance } from "../src/planning/target";
+import { Window } from "../src/protocol/flow-control";
 import { MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
-import { Window } from "../src/protocol/window";
 import { Link, windowFor } from "../src/transfer/pacing";
 import { MemoryStore } from "../src/transfer/store";
 

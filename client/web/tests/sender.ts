@@ -1,9 +1,9 @@
 /** A server's end of a stream without I/O, as `lodestream.transfer.sender` is, for tests of the client's end. */
 import { createHash } from "node:crypto";
 import type { Index } from "../src/container";
-import { plan } from "../src/planning/plan";
-import { endOf, type Mark, slicesOf } from "../src/planning/plans";
-import { type Place, RangeSet } from "../src/planning/ranges";
+import { type Place, RangeSet } from "../src/planning/byte-ranges";
+import { endOf, type Mark, slicesOf } from "../src/planning/plan";
+import { plan } from "../src/planning/planner";
 import { Connection } from "../src/protocol/connection";
 import { type Event, MAX_DATA, type Open } from "../src/protocol/messages";
 

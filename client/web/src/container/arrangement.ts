@@ -1,6 +1,6 @@
 /** The part of a header that says how blocks are cut into parts and curves (docs/format.md, section 3.1). */
 import { CorruptStreamError } from "../errors";
-import { type Arrangement, type Curve, covers, type Part, type Side } from "../grid/arrangement";
+import { type Arrangement, type Curve, covers, type Part, type Side } from "../grid/multiblock";
 import type { Closed, Shape, Span } from "../types";
 import { type FieldReader, LARGEST } from "./fields";
 

@@ -1,9 +1,9 @@
 /** The header section, and the masks that may follow it (docs/format.md, sections 3 and 3.3). */
 import { CorruptStreamError, TooLargeError } from "../errors";
-import { type Arrangement, gridsOf, type Part, wholePart } from "../grid/arrangement";
 import { Layout, plainGrid } from "../grid/layout";
-import { levelShapes } from "../grid/parts";
-import { CURVES, fittedSteps, Predictors } from "../grid/predictors";
+import { type Arrangement, gridsOf, type Part, wholePart } from "../grid/multiblock";
+import { levelShapes } from "../grid/patches";
+import { CURVES, fittedSteps, Predictors } from "../transform/predictors";
 import { type AttributeKind, type Closed, DTYPES, type DType, type Lattice, type Shape } from "../types";
 import { type BlockShape, parseArrangement } from "./arrangement";
 import { parseCodecs } from "./codecs";

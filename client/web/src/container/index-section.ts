@@ -5,14 +5,14 @@
  * A page tells of a run of tiles, or of windows of exactness, and needs no other to be understood.
  */
 import { CorruptStreamError } from "../errors";
-import { COEFFICIENT_BITS } from "../grid/predictors";
+import { COEFFICIENT_BITS } from "../transform/predictors";
 import type { ByteRange, Errors, LayerRecord, OptionalSection, Piece, Segment } from "../types";
+import { countWindows } from "./chunks";
 import { crc32 } from "./crc";
 import { FieldReader } from "./fields";
 import type { Frame } from "./frames";
 import type { Header } from "./header";
 import { Index } from "./model";
-import { countWindows } from "./pieces";
 import { checkMetadataLength, FOOTER_LENGTH, OPTIONAL, sectionStart } from "./sections";
 
 /** Tiles, or windows of exactness, that a page tells of. */

@@ -1,10 +1,10 @@
 /** The payloads of layers and of the exactness section (docs/format.md, sections 6 and 9). */
 import { CorruptStreamError } from "../errors";
-import { COEFFICIENT_BITS } from "../grid/predictors";
+import { COEFFICIENT_BITS } from "../transform/predictors";
 import type { Errors } from "../types";
+import { countWindows } from "./chunks";
 import { FieldReader } from "./fields";
 import type { Header } from "./header";
-import { countWindows } from "./pieces";
 
 // In the first byte of an entry: passes - 1 and skipped units from which on more bytes tell the rest.
 const [MOST_PASSES, MOST_SKIP] = [7, 15];

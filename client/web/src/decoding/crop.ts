@@ -6,12 +6,12 @@
  * surface, what lies beyond would be extended wrongly, but nothing that is wanted looks there.
  */
 import type { Header } from "../container/header";
+import { type Plane, type Tiles, UNANNOUNCED } from "../entropy/tiles";
 import { type AxisStep, hasTail } from "../grid/axis";
-import { coefficientsNeeded } from "../grid/reach";
+import { coefficientsNeeded } from "../grid/support";
 import type { Arena } from "../kernels/arena";
+import { allocatePlane, corner, FRACTION_BITS, inverseStep, toEighths } from "../transform/pyramid";
 import type { Region, Span } from "../types";
-import { type Plane, type Tiles, UNANNOUNCED } from "./tiles";
-import { allocatePlane, corner, FRACTION_BITS, inverseStep, toEighths } from "./transform";
 
 /** Nodes that the third step wants of a run. */
 const LEAST_NODES = 4;

@@ -9,13 +9,13 @@ import { parseLayer, parsePieces } from "../container/layers";
 import type { Index } from "../container/model";
 import { INDEX_GROWTH, indexFrom, readMetadata, takeDigest } from "../container/reader";
 import { FOOTER_LENGTH, KIND, type Metadata, parseFooter, parseMetadata } from "../container/sections";
-import { checkSize, checkWish, select, type Wish, wishedTiles } from "../container/selection";
+import { Slices, type State } from "../container/slices";
+import { UNANNOUNCED } from "../entropy/tiles";
 import { CorruptStreamError, TruncatedStreamError } from "../errors";
+import { checkSize, checkWish, select, type Wish, wishedTiles } from "../planning/selection";
 import type { Region, Surface } from "../types";
 import { Progress } from "./progress";
 import { type Coded, Reconstruction } from "./reconstruction";
-import { Slices, type State } from "./slices";
-import { UNANNOUNCED } from "./tiles";
 import { type Shared, View } from "./view";
 
 // What an entry of a layer's table becomes until its segment has been decoded.

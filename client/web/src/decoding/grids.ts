@@ -1,6 +1,6 @@
 /** Grids of blocks: values of one array, and how they are put together from the grids of parts. */
 import type { Header } from "../container/header";
-import { isWhole, levelPositions, type NumberedPart, partPositions } from "../grid/parts";
+import { isWhole, levelPositions, type NumberedPart, partPositions } from "../grid/patches";
 import { ARRAYS } from "../kernels/arena";
 import type { DType, Shape, Values } from "../types";
 import { holePattern, patternsOf, wordsOf } from "./bits";

@@ -1,7 +1,8 @@
 /** Slices of a container in, states of the surface out. */
+
+export type { RulePlane } from "../coordinates/coordinate-rules";
+export { coordinatesOf, type Placement, placementOf } from "../coordinates/height-fields";
 export { Decoder, type DecoderOptions, decode } from "./decoder";
-export { coordinatesOf, type Placement, placementOf } from "./heights";
-export type { RulePlane } from "./rules";
 export { View } from "./view";
 export { serveDecoder } from "./worker/host";
 export type { Port } from "./worker/messages";

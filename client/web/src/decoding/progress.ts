@@ -1,8 +1,8 @@
 /** Which coding passes of each tile and channel are still to come. */
 import type { Header } from "../container/header";
+import { UNANNOUNCED } from "../entropy/tiles";
 import { CorruptStreamError } from "../errors";
-import { COEFFICIENT_BITS } from "../grid/predictors";
-import { UNANNOUNCED } from "./tiles";
+import { COEFFICIENT_BITS } from "../transform/predictors";
 
 /**
  * Which passes of each tile have been announced so far, and whether a segment continues them.

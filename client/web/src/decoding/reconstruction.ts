@@ -1,18 +1,19 @@
 /** Segments into points: the state of a surface that is being refined, and pictures of any state that it passed. */
+
+import { type PieceWindow, pieceWindows } from "../container/chunks";
 import type { Header } from "../container/header";
-import { type PieceWindow, pieceWindows } from "../container/pieces";
-import { partsByBlock } from "../grid/parts";
+import { type BlockMasks, decodeKept, decodeMasks } from "../entropy/mask";
+import { TileTable } from "../entropy/tile-table";
+import { type Plane, Tiles } from "../entropy/tiles";
+import { partsByBlock } from "../grid/patches";
 import { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
 import { sha256 } from "../kernels/sha256";
+import { decodePiece } from "../residual/chunk-coder";
+import { allocatePlane, FRACTION_BITS, inverse } from "../transform/pyramid";
 import { DTYPE_BYTES, DTYPES, type DType, type Region, type Span } from "../types";
 import { windowPicture } from "./crop";
-import { decodePiece } from "./exactness";
 import { assemble, clearGrid, type Grid, newGrid, putPoints, takePoints } from "./grids";
-import { type BlockMasks, decodeKept, decodeMasks } from "./masks";
-import { TileTable } from "./tile-table";
-import { type Plane, Tiles } from "./tiles";
-import { allocatePlane, FRACTION_BITS, inverse } from "./transform";
 
 /** A segment with its bytes: `passes` passes of a unit down from `first`. */
 export interface Coded {

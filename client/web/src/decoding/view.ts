@@ -2,15 +2,15 @@
 import type { Plane } from "../container/extras";
 import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
-import { checkWish, restoredRegion, type Wish, wishedChannels, wishedTiles } from "../container/selection";
+import type { State } from "../container/slices";
+import { rint } from "../coordinates/coordinate-rules";
+import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane } from "../coordinates/height-fields";
 import { CorruptStreamError, InputError, OptionError } from "../errors";
-import { levelPositions, type Positions, partsByBlock } from "../grid/parts";
+import { levelPositions, type Positions, partsByBlock } from "../grid/patches";
+import { checkWish, restoredRegion, type Wish, wishedChannels, wishedTiles } from "../planning/selection";
 import type { Block, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
 import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
-import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane } from "./heights";
 import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
-import { rint } from "./rules";
-import type { State } from "./slices";
 
 /** What all views of a surface have in common; metadata and digest are filled when they come. */
 export interface Shared {

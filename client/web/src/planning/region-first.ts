@@ -1,10 +1,10 @@
 /** Reordering a plan: what a region needs comes first, the rest after it. */
 
 import type { Index } from "../container/model";
-import { checkWish, wishedTiles } from "../container/selection";
 import type { ByteRange, Region } from "../types";
-import type { Mark, Plan } from "./plans";
-import { RangeSet } from "./ranges";
+import { RangeSet } from "./byte-ranges";
+import type { Mark, Plan } from "./plan";
+import { checkWish, wishedTiles } from "./selection";
 
 /** A mark, and of the bytes before it in the plan's order those that now come ahead and behind. */
 interface Step {

@@ -6,7 +6,7 @@
  */
 
 import { RemoteProtocolError } from "../errors";
-import type { Place } from "../planning/ranges";
+import type { Place } from "../planning/byte-ranges";
 import type { Target } from "../types";
 
 /** The version that an `open` names; a server answers another one with `unsupported-version`. */

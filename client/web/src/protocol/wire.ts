@@ -8,7 +8,7 @@
 import { encode } from "@msgpack/msgpack";
 import { OptionError, UnsupportedVersionError } from "../errors";
 import { unpack } from "../msgpack";
-import type { Place } from "../planning/ranges";
+import type { Place } from "../planning/byte-ranges";
 import { makeTarget } from "../planning/target";
 import type { Region, Span, Target, Tolerance } from "../types";
 import { type Event, type EventType, MAX_DATA, MAX_HELD, MAX_MESSAGE, MessageError, VERSION } from "./messages";

@@ -1,7 +1,7 @@
 /** Receiving over a WebSocket: the loop around a `Download` that moves bytes. */
 
 import { RemoteError, SilenceError } from "../errors";
-import { toAddress } from "../protocol/opening";
+import { toAddress } from "../protocol/handshake";
 import type { Region, Target, ViewInfo } from "../types";
 import { streamUrl } from "./addresses";
 import { Download, type DownloadOptions } from "./download";

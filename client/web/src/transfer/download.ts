@@ -1,13 +1,13 @@
 /** The client's end of a stream, without I/O: messages in; views, credit and the last message out. */
 
 import { RemoteError, TruncatedStreamError } from "../errors";
-import type { Place } from "../planning/ranges";
+import type { Place } from "../planning/byte-ranges";
 import { sameRegion } from "../planning/target";
 import { Connection } from "../protocol/connection";
+import { Window } from "../protocol/flow-control";
 import { CODES, type Header, type Layer, MAX_HELD, type Segments } from "../protocol/messages";
-import { Window } from "../protocol/window";
 import type { Region, Target, ViewInfo } from "../types";
-import type { Reception } from "./reception";
+import type { Reception } from "./receiver-state";
 
 /** What may be given to a download beside its reception. */
 export interface DownloadOptions {

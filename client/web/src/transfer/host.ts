@@ -5,11 +5,11 @@
  */
 
 import { Capacity } from "../container/capacity";
-import { checkSize } from "../container/selection";
 import { Decoder } from "../decoding/decoder";
 import type { View } from "../decoding/view";
 import { InputError } from "../errors";
 import { loadKernels } from "../kernels/instance";
+import { checkSize } from "../planning/selection";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Surface, ViewInfo } from "../types";
 import { isSurface } from "./addresses";

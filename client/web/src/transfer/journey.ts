@@ -1,7 +1,7 @@
 /** What the roads to a surface, a WebSocket and HTTP Range, need of the stream that takes them. */
 
 import type { ViewInfo } from "../types";
-import type { Reception } from "./reception";
+import type { Reception } from "./receiver-state";
 import type { Waiting } from "./waiting";
 
 /** A stream as its road sees it. */

@@ -1,10 +1,10 @@
 /** What a stream may be told, and what it tells. */
 
-import type { Ended } from "../planning/plans";
-import type { Sink } from "./reception";
-import type { Pauses, Road, Transport } from "./roads";
+import type { Ended } from "../planning/plan";
+import type { Sink } from "./receiver-state";
 import type { SocketClass } from "./socket";
 import type { Store } from "./store";
+import type { Pauses, Road, Transport } from "./transports";
 
 /** What a stream is doing. */
 export type Phase = "idle" | "connecting" | "streaming" | "reconnecting" | "ended";

@@ -7,11 +7,11 @@
  */
 
 import { RemoteError, RemoteProtocolError, TruncatedStreamError } from "../errors";
-import { type Place, RangeSet } from "../planning/ranges";
+import { type Place, RangeSet } from "../planning/byte-ranges";
 import { MAX_CREDIT, MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
-import { inFileOrder } from "./beginning";
-import type { Reception } from "./reception";
+import type { Reception } from "./receiver-state";
+import { inFileOrder } from "./safe-prefix";
 
 // The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
 // pictures come with them, and more where it is known that more is wanted. The last ones, some and a share of the file,

@@ -1,6 +1,6 @@
 /** Bytes of one container that have come and are not decoded yet, or are kept by the caller. */
 
-import { bisectLeft, bisectRight, RangeSet } from "../planning/ranges";
+import { bisectLeft, bisectRight, RangeSet } from "../planning/byte-ranges";
 
 /** Storage for the bytes of one container. */
 export interface Store {

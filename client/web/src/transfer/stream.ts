@@ -5,21 +5,21 @@
  */
 
 import { LodestreamError, OptionError, RemoteError } from "../errors";
-import type { Ended } from "../planning/plans";
+import type { Ended } from "../planning/plan";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Target, ViewInfo } from "../types";
 import { containerUrl } from "./addresses";
-import { PartsRoad } from "./by-parts";
+import { PartsRoad } from "./by-ranges";
 import { SocketRoad } from "./by-socket";
 import type { StreamDecoder } from "./decoding";
 import type { Journey } from "./journey";
 import type { Progress, StreamOptions, StreamState } from "./options";
 import { Link, windowFor } from "./pacing";
-import { BlobParts, HttpParts } from "./parts";
 import { fromCode } from "./problems";
-import { Reception } from "./reception";
-import { type Road, Roads } from "./roads";
+import { BlobParts, HttpParts } from "./range-sources";
+import { Reception } from "./receiver-state";
 import { platformSocket } from "./socket";
+import { type Road, Roads } from "./transports";
 import { seconds, Waiting } from "./waiting";
 
 /**

@@ -3,8 +3,8 @@
 import type { CoordinateRule, Plane } from "../container/extras";
 import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
-import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../decoding/heights";
-import { evaluate, type RulePlane } from "../decoding/rules";
+import { evaluate, type RulePlane } from "../coordinates/coordinate-rules";
+import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../coordinates/height-fields";
 import type { Block, PointArray } from "../types";
 import type { AttributeGrid, Grid } from "./source";
 

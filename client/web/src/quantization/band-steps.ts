@@ -1,6 +1,7 @@
 /** Steps of quantised coordinates: a coefficient is its index times its band's step (docs/format.md, section 8.1). */
+
+import type { TileTable } from "../entropy/tile-table";
 import type { Band, Layout } from "../grid/layout";
-import type { TileTable } from "./tile-table";
 
 const NODES = [65536, 53303, 39201, 27993, 19842, 14039];
 const DETAILS = [65536, 77936, 69201, 52586, 37885, 26915];

@@ -1,11 +1,12 @@
 /** Slices of a container whose index is known: which segments they complete, and which states those make. */
-import { ByteBuffer } from "../container/buffer";
-import { type Frame, wholeSection } from "../container/frames";
-import type { Index } from "../container/model";
-import { KIND } from "../container/sections";
-import type { Selection } from "../container/selection";
+
 import { CorruptStreamError } from "../errors";
+import type { Selection } from "../planning/selection";
 import type { Piece, Segment } from "../types";
+import { ByteBuffer } from "./buffer";
+import { type Frame, wholeSection } from "./frames";
+import type { Index } from "./model";
+import { KIND } from "./sections";
 
 /** What a view is made of. */
 export interface State {

@@ -1,6 +1,6 @@
 /** The third step of the lifting as the format sees it (docs/format.md, section 4, "Fitted steps"). */
-import type { AxisStep } from "./axis";
-import type { Grid, Layout } from "./layout";
+import type { AxisStep } from "../grid/axis";
+import type { Grid, Layout } from "../grid/layout";
 
 /** A coefficient has at most so many magnitude bits. */
 export const COEFFICIENT_BITS = 28;

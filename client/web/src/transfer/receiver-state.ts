@@ -11,14 +11,14 @@ import type { Index } from "../container/model";
 import { headerSteps, INDEX_GROWTH, indexFrom, indexSteps } from "../container/reader";
 import { checkMetadataLength } from "../container/sections";
 import { OptionError, RemoteError, RemoteProtocolError, TooLargeError, TruncatedStreamError } from "../errors";
-import { plan } from "../planning/plan";
-import { type Ended, endOf, type Plan } from "../planning/plans";
-import { type Place, RangeSet } from "../planning/ranges";
+import { type Place, RangeSet } from "../planning/byte-ranges";
+import { type Ended, endOf, type Plan } from "../planning/plan";
+import { plan } from "../planning/planner";
 import { sameRegion } from "../planning/target";
 import { MAX_DATA } from "../protocol/messages";
 import type { ByteRange, Region, Target, ViewInfo } from "../types";
-import { inFileOrder, sure } from "./beginning";
 import type { StreamDecoder } from "./decoding";
+import { inFileOrder, sure } from "./safe-prefix";
 import { MemoryStore, type Store } from "./store";
 
 /** Called with bytes of the container that had not come before, as they come; by then it is known which container. */

@@ -3,8 +3,8 @@
 import { MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
 import type { Journey } from "./journey";
-import type { PartAnswer, PartSource } from "./parts";
 import { type Part, RangeDownload } from "./range-download";
+import type { PartAnswer, PartSource } from "./range-sources";
 import { seconds } from "./waiting";
 
 /** A request under way: its answer once there is one, and what comes next of it. */

@@ -1,11 +1,12 @@
 /** Which segments and pieces of a container are needed for a window or for some attributes. */
+
+import type { Capacity } from "../container/capacity";
+import { pieceWindows } from "../container/chunks";
+import type { Header } from "../container/header";
+import type { Index } from "../container/model";
 import { OptionError } from "../errors";
-import { checkRegion, neededTiles } from "../grid/reach";
+import { checkRegion, neededTiles } from "../grid/support";
 import { DTYPE_BYTES, type Piece, type Region, type Segment, type Shape, type Span } from "../types";
-import type { Capacity } from "./capacity";
-import type { Header } from "./header";
-import type { Index } from "./model";
-import { pieceWindows } from "./pieces";
 
 /** The requested part of a surface: a window of its points, and attributes by name; without them all. */
 export interface Wish {

@@ -1,11 +1,12 @@
 /** The inverse transform of one channel in integers: all levels, in place (docs/format.md, section 8). */
+
+import type { Plane } from "../entropy/tiles";
 import { type AxisStep, extension, REACH } from "../grid/axis";
 import type { Layout, Source } from "../grid/layout";
-import type { Predictor, Predictors } from "../grid/predictors";
 import type { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
 import type { Shape } from "../types";
-import type { Plane } from "./tiles";
+import type { Predictor, Predictors } from "./predictors";
 
 /** Binary places between lattice steps in which reconstructions of incomplete levels are computed. */
 export const FRACTION_BITS = 3;

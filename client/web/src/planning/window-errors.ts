@@ -2,15 +2,16 @@
  * Errors of windows: for each cell of a surface and each layer a bound of its errors, in an optional section
  * (docs/format.md, section 11). So one can tell how good a state is at some place, and how many layers suffice there.
  */
+
+import { checkOf } from "../container/crc";
+import { FieldReader } from "../container/fields";
+import { wholeSection } from "../container/frames";
+import type { Exponents, Header } from "../container/header";
+import type { Index } from "../container/model";
+import type { Read } from "../container/reader";
 import { CorruptStreamError, OptionError } from "../errors";
-import { checkRegion } from "../grid/reach";
+import { checkRegion } from "../grid/support";
 import type { Region } from "../types";
-import { checkOf } from "./crc";
-import { FieldReader } from "./fields";
-import { wholeSection } from "./frames";
-import type { Exponents, Header } from "./header";
-import type { Index } from "./model";
-import type { Read } from "./reader";
 
 /** Kind of the section. */
 const WINDOW_ERRORS = 128;

@@ -1,8 +1,8 @@
 /** Blocks cut into parts: where the nodes of parts stand in their blocks, at any level (docs/format.md, section 4). */
 import type { Shape } from "../types";
-import type { Part } from "./arrangement";
 import { hasTail } from "./axis";
 import type { Layout } from "./layout";
+import type { Part } from "./multiblock";
 
 /** A part with its number among those of all blocks. */
 export interface NumberedPart {

@@ -7,7 +7,7 @@ import { isMap, type Metadata } from "../container/sections";
 import { InputError } from "../errors";
 import { axisLengths, axisStep, extension, hasTail } from "../grid/axis";
 import type { Closed, Region, Shape } from "../types";
-import { evaluate, interpolated, type RulePlane } from "./rules";
+import { evaluate, interpolated, type RulePlane } from "./coordinate-rules";
 
 /** h_j of the update step, as many as matter in float64. */
 const UPDATE = Array.from({ length: 24 }, (_, j) => (1 - 1 / Math.sqrt(2)) * (2 * Math.sqrt(2) - 3) ** j);

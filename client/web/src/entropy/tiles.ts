@@ -1,7 +1,7 @@
 /** The coefficients of one channel as far as they are decoded, and their coder (docs/format.md, section 7). */
 import type { Address, Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
-import { bandSteps } from "./quantiser";
+import { bandSteps } from "../quantization/band-steps";
 import type { TileTable } from "./tile-table";
 
 /** Passes that remain of a tile that was not announced: more than any tile has. */
