@@ -1,7 +1,7 @@
 """The browser's side: its decoder beside Python's, first pictures over a slow link, `lodestream view`, the bundle.
 
-Times of decoding are processor times of Node's process, with one worker in it, and of this one. First pictures are seen in
-Chromium, which draws with the processor here; needs ``make page`` and Chromium.
+Times of decoding are processor times of Node's process, with one worker in it, and of this one. First pictures are seen
+in Chromium, which draws with the processor here; needs ``make page`` and Chromium.
 """
 
 from __future__ import annotations
@@ -115,7 +115,8 @@ def decode_tables(folder: Path) -> None:
     arrays = {array.name: array.points for array in load()}
     surfaces: dict[str, NDArray[Any]] = {name: arrays[name] for name in ("bigtujunga", "jacksboro") if name in arrays}
     surfaces["rough, float32"] = rough()
-    rows, inner = [], []
+    rows: list[list[str]] = []
+    inner: list[list[str]] = []
     missed = []
     for name, points in surfaces.items():
         data = ls.encode(points)
