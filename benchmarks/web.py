@@ -1,7 +1,7 @@
 """The browser's side: its decoder beside Python's, first pictures over a slow link, `lodestream view`, and the bundle.
 
-Times of decoding are processor times of Node's process, with one worker in it, and of this one. First pictures are seen in
-Chromium, which draws with the processor here; needs ``make page`` and Chromium.
+Times of decoding are processor times of Node's process, with one worker in it, and of this one. First pictures are seen
+in Chromium, which draws with the processor here; needs ``make page`` and Chromium.
 """
 
 from __future__ import annotations

@@ -12,8 +12,6 @@ from random import Random
 from typing import Any
 
 import msgpack
-
-from lodestream.errors import UnsupportedVersionError
 from lodestream.messages import (
     Bye,
     Credit,
@@ -27,8 +25,10 @@ from lodestream.messages import (
     Segments,
     Stop,
 )
-from lodestream.target import Target, Tolerance
 from lodestream.wire import parse, serialize
+
+from lodestream.errors import UnsupportedVersionError
+from lodestream.target import Target, Tolerance
 
 _DIGEST = "0123456789abcdef" * 4
 _EVENTS: list[Event] = [

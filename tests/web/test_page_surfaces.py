@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from playwright.sync_api import expect
 
 from .browser import ABOVE, Tab
 from .conftest import Tabs
@@ -132,18 +135,18 @@ def test_slope_change_lines_and_no_colours_are_drawn(tabs: Tabs, shelf: Shelf) -
     tab = tabs(shelf.address("terrain", VIRIDIS))
     tab.everything("m")
     pictures = [from_above(tab)]
+    legend = tab.view.locator(".legend-title")
     for name, title in (("Slope", "Slope (degrees)"), ("Last change", "Last change (m)"), ("Shading only", None)):
         tab.choose("Coloured by", name)
-        legend = tab.view.locator(".legend-title")
         if title is None:
             legend.wait_for(state="hidden")
         else:
-            tab.until(lambda title=title: legend.inner_text() == title)  # type: ignore[misc]
+            expect(legend).to_have_text(title)
         pictures.append(from_above(tab))
     tab.view.get_by_label("Quad lines").check()
     tab.press(*["+"] * 9)
     pictures += [tab.picture()]
     tab.press("l")
     pictures += [tab.picture()]
-    for before, after in zip(pictures, pictures[1:], strict=False):
+    for before, after in pairwise(pictures):
         assert np.abs(before - after).mean() > 1
