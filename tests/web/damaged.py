@@ -15,8 +15,8 @@ from typing import Any
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
-from tests.core.mutants import mutant
-from tests.core.test_hostile_containers import MOST, containers
+from tests.core.container.mutants import mutant
+from tests.core.container.test_hostile_containers import MOST, containers
 from tests.golden.generate import FOLDER, digests
 
 

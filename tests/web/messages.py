@@ -12,22 +12,22 @@ from random import Random
 from typing import Any
 
 import msgpack
-from lodestream.messages import (
+
+from lodestream.errors import UnsupportedVersionError
+from lodestream.protocol.messages import (
     Bye,
     Credit,
     End,
     Error,
     Event,
-    Header,
     Layer,
     MessageError,
     Open,
+    Opened,
     Segments,
     Stop,
 )
-from lodestream.wire import parse, serialize
-
-from lodestream.errors import UnsupportedVersionError
+from lodestream.protocol.wire import parse, serialize
 from lodestream.target import Target, Tolerance
 
 _DIGEST = "0123456789abcdef" * 4
@@ -37,7 +37,7 @@ _EVENTS: list[Event] = [
     Credit(5),
     Stop(),
     Bye(),
-    Header(_DIGEST, 2**40, 12345, 1.5, (2**39, 500), (13000, 1), True),
+    Opened(_DIGEST, 2**40, 12345, 1.5, (2**39, 500), (13000, 1), True),
     Segments(7, bytes(range(40))),
     Layer(0, 2, 96, 0.125, 3.5),
     End("complete"),

@@ -13,13 +13,13 @@ from random import Random
 from typing import Any
 
 import numpy as np
-from lodestream.plan import plan
-from lodestream.plans import Plan
-from lodestream.ranges import RangeSet
 
 import lodestream as ls
 from lodestream.container.model import ByteRange, Index
 from lodestream.errors import OptionError
+from lodestream.planning.byte_ranges import RangeSet
+from lodestream.planning.plan import Plan
+from lodestream.planning.planner import plan
 from lodestream.target import Region, Target, Tolerance
 from tests.core.surfaces import index_of, terrain
 

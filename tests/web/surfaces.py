@@ -15,11 +15,11 @@ from random import Random
 from typing import Any
 
 import numpy as np
-from lodestream.plan import plan
 from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import InputError
+from lodestream.planning.planner import plan
 from tests.core.surfaces import all_large, follow, index_of, terrain, torus
 from tests.golden.generate import digests, expectations
 
