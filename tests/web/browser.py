@@ -247,7 +247,7 @@ class Tab:
 
 @contextmanager
 def tab(browser: Browser, heard: Heard, size: tuple[int, int] = SIZE, **options: Any) -> Iterator[Tab]:
-    """A page with nothing of other pages: no cookies, no files. New detail is shown at once, unless told otherwise."""
+    """A page with nothing of others: no cookies, no files. New detail is shown at once, unless told not to."""
     chosen = {"viewport": {"width": size[0], "height": size[1]}, "reduced_motion": "reduce", **options}
     context = browser.new_context(**chosen)
     context.set_default_timeout(WAIT)

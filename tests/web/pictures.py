@@ -1,4 +1,4 @@
-"""The pictures of README.md and docs/viewer.md, of generated terrain: ``python -m tests.web.pictures`` writes them."""
+"""Pictures for README.md and docs/viewer.md, from generated terrain: ``python -m tests.web.pictures``."""
 
 from __future__ import annotations
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import lodestream as ls
-from lodestream_client import Description
 from lodestream_client.sync import upload
 from tests.core.surfaces import terrain, torus
 
@@ -44,9 +44,9 @@ class Shelf:
 
     def __init__(self, server: str) -> None:
         self.server = server
-        self._uploaded: dict[str, Description] = {}
+        self._uploaded: dict[str, Any] = {}
 
-    def description(self, name: str) -> Description:
+    def description(self, name: str) -> Any:
         """What the server says of a surface, see `surface`, or of a container of tests/golden."""
         if name not in self._uploaded:
             golden = GOLDEN / f"{name}.lode"

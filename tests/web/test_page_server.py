@@ -35,7 +35,7 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
     values = tab.point(0.5, 0.55)
     heights = np.load(file)
     assert float(values["height"]) == pytest.approx(float(heights[int(values["row"]), int(values["column"])]), rel=1e-8)
-    expect(tab.page.locator("header .facts")).to_contain_text("60 × 80 points")  # noqa: RUF001 - as the page has it
+    expect(tab.page.locator("header .facts")).to_contain_text("60 \N{MULTIPLICATION SIGN} 80 points")
 
 
 def drop(tab: Tab, name: str, data: bytes) -> None:

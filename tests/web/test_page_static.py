@@ -1,4 +1,4 @@
-"""Containers without a server of Lodestream: a host of files, ten lines of HTML, `lodestream view`, damaged files."""
+"""Containers without a server: a host of files, ten lines of HTML, `lodestream view`, and damaged files."""
 
 from __future__ import annotations
 

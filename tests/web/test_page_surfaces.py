@@ -135,9 +135,9 @@ def test_slope_change_lines_and_no_colours_are_drawn(tabs: Tabs, shelf: Shelf) -
     tab = tabs(shelf.address("terrain", VIRIDIS))
     tab.everything("m")
     pictures = [from_above(tab)]
+    legend = tab.view.locator(".legend-title")
     for name, title in (("Slope", "Slope (degrees)"), ("Last change", "Last change (m)"), ("Shading only", None)):
         tab.choose("Coloured by", name)
-        legend = tab.view.locator(".legend-title")
         if title is None:
             legend.wait_for(state="hidden")
         else:
