@@ -99,7 +99,10 @@ def register(subparsers: Subparsers) -> None:
         "that is encoded first. The page talks to this command alone; a token does not leave it. Ctrl-C ends it.",
     )
     parser.add_argument(
-        "files", nargs="+", metavar="FILE|URL", help="container, other file, or URL; - for standard input"
+        "files",
+        nargs="+",
+        metavar="FILE|URL",
+        help="container, other file, or URL; - for standard input. Several files are parts of one surface",
     )
     parser.add_argument("--no-browser", action="store_true", help="print the address only")
     parser.add_argument(

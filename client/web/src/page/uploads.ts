@@ -70,21 +70,23 @@ export class Uploads {
     this.list.prepend(item);
     const controller = new AbortController();
     cancel.addEventListener("click", () => controller.abort());
+    let failure = "Not uploaded";
     try {
       const surface = await this.send(file, controller.signal, (sent) => {
         bar.value = file.size > 0 ? sent / file.size : 1;
         setText(what, `Sent ${formatBytes(sent)} of ${formatBytes(file.size)}`);
       });
       cancel.remove();
+      failure = "Uploaded, but not built";
       this.changed(surface);
       await this.build(surface, what, bar);
       item.remove();
     } catch (error) {
       bar.remove();
       cancel.textContent = "Dismiss";
-      if (!cancel.isConnected) item.append(cancel);
+      if (!cancel.isConnected) what.before(cancel);
       cancel.addEventListener("click", () => item.remove());
-      setText(what, controller.signal.aborted ? "Cancelled" : "Not uploaded");
+      setText(what, controller.signal.aborted ? "Cancelled" : failure);
       if (!controller.signal.aborted)
         item.append(
           html("span", { class: "reason", role: "alert" }, error instanceof Error ? error.message : String(error)),
