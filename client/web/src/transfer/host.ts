@@ -35,9 +35,9 @@ export class Host implements Questions {
     const { source, options, kept } = opening;
     const target = makeTarget(opening.target);
     const { region, attributes, level } = target;
-    const wish = { region, attributes, maxVertices: opening.maxVertices ?? null };
+    const selection = { region, attributes, maxVertices: opening.maxVertices ?? null };
     // A later target may want more than this level, see `aim`.
-    this.decoder = new Decoder(await loadKernels(), level === undefined ? wish : { ...wish, level });
+    this.decoder = new Decoder(await loadKernels(), level === undefined ? selection : { ...selection, level });
     if (opening.keep || kept !== undefined) {
       this.store = new MemoryStore(opening.keep);
       for (const [offset, data] of kept?.pieces ?? []) {
