@@ -246,7 +246,7 @@ describe.each(KINDS)("%s", (kind) => {
     );
   }, 180_000);
 
-  it.each(TARGETS)("for %j parts of the file in any pieces end where the plan does", (options) => {
+  it.each(TARGETS)("for %j answers cut anywhere end where the plan does", (options) => {
     fc.assert(
       fc.property(
         fc.infiniteStream(fc.integer({ min: 1, max: 9000 })),
@@ -264,7 +264,7 @@ describe.each(KINDS)("%s", (kind) => {
     );
   });
 
-  it("parts of the file end where the plan does, whenever one looks elsewhere and wants something else", () => {
+  it("answers end where the plan does, whenever one looks elsewhere and wants something else", () => {
     const whole = TARGETS.filter((target) => target.region === undefined);
     const change = fc.oneof(
       fc.constantFrom<{ region: Region | undefined }>({ region: NEAR }, { region: FAR }, { region: undefined }),
@@ -308,7 +308,7 @@ describe.each(KINDS)("%s", (kind) => {
   }, 180_000);
 });
 
-/** Answer requests in pieces, now of the first and now of the second, some of them broken off. */
+/** Answer requests little by little, now of the first and now of the second, some of them broken off. */
 function serveRanges(
   download: RangeDownload<View>,
   data: Uint8Array,

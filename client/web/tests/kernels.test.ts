@@ -162,7 +162,7 @@ describe("SHA-256", () => {
   it("does not depend on how bytes are cut", () => {
     const arena = new Arena(kernels);
     const data = Uint8Array.from({ length: 2_500_001 }, (_, i) => (i * i) >> 3);
-    const pieces = [data.subarray(0, 1), data.subarray(1, 1_300_000), data.subarray(1_300_000)];
-    expect(sha256(arena, pieces)).toBe(sha256(arena, [data]));
+    const arrays = [data.subarray(0, 1), data.subarray(1, 1_300_000), data.subarray(1_300_000)];
+    expect(sha256(arena, arrays)).toBe(sha256(arena, [data]));
   });
 });

@@ -123,10 +123,10 @@ describe.each(TRANSPORTS)("over %s", (name, source, options) => {
     expect(await stream.next()).toEqual({ value: undefined, done: true });
   });
 
-  it("another target after the end goes on with what is held", async () => {
+  it("another target after the end goes on with what is cached", async () => {
     const stream = streamOf(source(), { maxBytes: 3000 }, options);
     await all(stream);
-    const held = stream.reception.dataBytes;
+    const cached = stream.reception.dataBytes;
     stream.aim({ level: 6 });
     await all(stream);
     expect(stream.ended).toBe("level");
@@ -134,7 +134,7 @@ describe.each(TRANSPORTS)("over %s", (name, source, options) => {
     const views = await all(stream);
     expect(stream.ended).toBe("complete");
     expectWhole(views.at(-1)!);
-    expect(held).toBeGreaterThan(0);
+    expect(cached).toBeGreaterThan(0);
     expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
     expect(() => stream.aim({ attributes: [] })).toThrow(/another stream/);
   });
@@ -321,8 +321,8 @@ describe("a link that breaks", () => {
       await expect(all(stream)).rejects.toThrow(LodestreamError);
       return stream.reception;
     });
-    const held = store.ranges.total;
-    expect(held).toBeGreaterThan(3000);
+    const cached = store.ranges.total;
+    expect(cached).toBeGreaterThan(3000);
     for (const source of [served.surface, served.static]) {
       const again = new MemoryStore(true);
       for (const [offset, data] of store.all()) again.write(offset, data);
@@ -331,7 +331,7 @@ describe("a link that breaks", () => {
       const onBytes = (_: number, data: Uint8Array) => void came.push(data.length);
       const stream = streamOf(source, {}, { store: again, container, size, onBytes });
       expectWhole((await all(stream)).at(-1)!);
-      expect(stream.reception.dataBytes).toBe(stream.reception.cached.total - held);
+      expect(stream.reception.dataBytes).toBe(stream.reception.cached.total - cached);
       expect(came.reduce((sum, length) => sum + length, 0)).toBe(stream.reception.dataBytes);
     }
   });
@@ -408,7 +408,7 @@ describe("a file", () => {
 });
 
 describe("a link that is far away", () => {
-  it.each(["ws", "http"] as const)("shows the first picture after two round trips: %s", async (transport) => {
+  it.each(["ws", "http"] as const)("shows the first view after two round trips: %s", async (transport) => {
     const roundTrip = 1.2;
     const source = transport === "ws" ? served.surface : served.static;
     await faulty(

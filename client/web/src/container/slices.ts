@@ -68,7 +68,7 @@ export class Slices {
   #hasMetadata = false;
   #bytes: number;
   #inFile = false;
-  #held = 0;
+  #received = 0;
   #finest = 0;
   #corrected = 0;
   #nearTiles: Uint8Array | null = null;
@@ -183,7 +183,7 @@ export class Slices {
 
   /** Note a chunk of the residual; the complete state, if everything is there. */
   holdChunk(chunk: Chunk): State | null {
-    if (this.#held !== this.#wanted.length) {
+    if (this.#received !== this.#wanted.length) {
       throw new CorruptStreamError("expected all segments before the residual, got fewer", chunk.range.offset);
     }
     this.#corrected++;
@@ -202,7 +202,7 @@ export class Slices {
   state(): State | null {
     const risen = this.#risen();
     const { layers, levels, header } = this.#index;
-    const layer = this.#byLayer.whole(this.#held);
+    const layer = this.#byLayer.whole(this.#received);
     if (layer !== null) {
       const record = layers[layer]!;
       const last = layer === layers.length - 1;
@@ -219,7 +219,7 @@ export class Slices {
         wholeNear: false,
       };
     }
-    const level = this.#byLevel.whole(this.#held);
+    const level = this.#byLevel.whole(this.#received);
     if (level !== null && level < header.levels && !this.#inFile) {
       return {
         number: level,
@@ -249,7 +249,7 @@ export class Slices {
 
   #count(segment: Segment): void {
     const level = this.#index.header.layout.tiles[segment.tile]!.level;
-    this.#held++;
+    this.#received++;
     this.#finest = Math.max(this.#finest, level);
     this.#byLayer.hold(segment.layer);
     this.#byLevel.hold(level);
@@ -323,7 +323,7 @@ function lowerBound(numbers: Float64Array, number: number): number {
   return low;
 }
 
-/** Segments by layer, or by level: when are the first groups whole, and nothing else held? */
+/** Segments by layer, or by level: when are the first groups whole, and nothing else received? */
 class Groups {
   readonly #missing: Int32Array;
   readonly #ends: Int32Array;
@@ -350,10 +350,10 @@ class Groups {
     this.#pass();
   }
 
-  /** The last of the groups that are whole, if these are all that is held. */
-  whole(held: number): number | null {
+  /** The last of the groups that are whole, if these are all that is received. */
+  whole(received: number): number | null {
     const last = this.#next - 1;
-    return last >= 0 && this.#ends[last] === held ? last : null;
+    return last >= 0 && this.#ends[last] === received ? last : null;
   }
 
   #pass(): void {

@@ -157,8 +157,8 @@ function putLevel(
         const numbers = [table.first[number]! + k];
         tiles.dequantize(numbers, state, finer ? 0 : table.layout.tiles.length, own, band.rows[0], band.columns[0]);
         const address = own.address + 4 * (down.skip * own.pitch + across.skip);
-        const part = { address, rows: down.stop - down.start, columns: across.stop - across.start, pitch: own.pitch };
-        copyPlane(arena, part, canvas, down.start, across.start);
+        const plane = { address, rows: down.stop - down.start, columns: across.stop - across.start, pitch: own.pitch };
+        copyPlane(arena, plane, canvas, down.start, across.start);
       });
     }
   }

@@ -102,10 +102,10 @@ export class Decoder {
   }
 
   /** Decode the next bytes of the file; returns the views that they complete. The layers before damage stay usable. */
-  feed(chunk: Uint8Array): View[] {
+  feed(data: Uint8Array): View[] {
     const before = this.layers.length;
-    this.capacity.take(chunk.length);
-    this.#feed(chunk);
+    this.capacity.take(data.length);
+    this.#feed(data);
     return this.layers.slice(before);
   }
 
@@ -113,22 +113,22 @@ export class Decoder {
    * Decode a slice of the container that starts at `offset`; returns the views that it completes. Slices must come in the
    * order of a plan. They may be cut anywhere.
    */
-  feedAt(offset: number, chunk: Uint8Array): View[] {
+  feedAt(offset: number, data: Uint8Array): View[] {
     const before = this.layers.length;
-    this.capacity.take(chunk.length);
+    this.capacity.take(data.length);
     if (this.#slices !== null) {
-      this.#takeSlice(this.#slices, offset, chunk);
+      this.#takeSlice(this.#slices, offset, data);
     } else if (offset === this.#frames.position + this.#frames.pending) {
-      this.#feed(chunk);
+      this.#feed(data);
       if (this.#begun !== null) {
         const early = this.#early;
         this.#early = [];
         for (const { offset: place, data } of early) this.#takeLoose(place, data);
       }
     } else if (this.#begun === null) {
-      this.#early.push({ offset, data: chunk.slice() });
+      this.#early.push({ offset, data: data.slice() });
     } else {
-      this.#takeLoose(offset, chunk);
+      this.#takeLoose(offset, data);
     }
     return this.layers.slice(before);
   }
@@ -169,12 +169,12 @@ export class Decoder {
     return this.view().surface(level);
   }
 
-  #feed(chunk: Uint8Array): void {
+  #feed(data: Uint8Array): void {
     if (this.#frames.ended) {
-      this.#takeFooter(chunk);
+      this.#takeFooter(data);
       return;
     }
-    for (const frame of this.#frames.feed(chunk)) this.#take(frame);
+    for (const frame of this.#frames.feed(data)) this.#take(frame);
     if (this.#frames.ended) this.#takeFooter(this.#frames.rest());
   }
 

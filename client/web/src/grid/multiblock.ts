@@ -135,7 +135,7 @@ export function covers(shape: Shape, closed: Closed, patches: readonly Patch[]):
   return area === whole[0]! * whole[1]! && !overlap(cells);
 }
 
-/** First and past-the-last cell along an axis, in one piece or two. */
+/** First and past-the-last cell along an axis, as one span or two. */
 function cellsAlong(length: number, wraps: boolean, closed: boolean, window: Span): Span[] {
   if (closed) return [[0, length]];
   const start = window[0];

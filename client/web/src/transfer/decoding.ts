@@ -28,7 +28,7 @@ export interface StreamDecoder<View extends ViewInfo> {
    *
    * Slices come in the order of a plan. They may be cut anywhere.
    */
-  feedAt(offset: number, chunk: Uint8Array): View[];
+  feedAt(offset: number, data: Uint8Array): View[];
 
   /** Announce another order of the bytes: first what a region needs; with null, the plan's own order. */
   focus(region: Region | null): void;

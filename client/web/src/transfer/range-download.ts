@@ -259,7 +259,7 @@ export class RangeDownload<View extends ViewInfo> {
   /** What to ask for before the index can be looked for. */
   private first(): Place | undefined {
     // How long the file is, the first answer tells.
-    if (this.reception.size === undefined) return this.underWay.size === 0 ? [0, this.beginning()] : undefined;
+    if (this.reception.size === undefined) return this.underWay.size === 0 ? [0, this.firstBytes()] : undefined;
     for (const place of this.ends(this.reception.size)) for (const gap of this.open(...place)) return gap;
     return undefined;
   }
@@ -280,7 +280,7 @@ export class RangeDownload<View extends ViewInfo> {
   }
 
   /** How many bytes to ask for first, of a file of which nothing is known. */
-  private beginning(): number {
+  private firstBytes(): number {
     const { target, cached } = this.reception;
     if (!inFileOrder(target) || cached.total > 0) return HEAD;
     if (target.maxBytes !== undefined) return Math.min(Math.max(target.maxBytes, HEAD), FIRST_MOST);
