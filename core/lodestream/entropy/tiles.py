@@ -58,7 +58,7 @@ class TileTable:
     @staticmethod
     @lru_cache(maxsize=REMEMBERED)
     def of(layout: Layout, coordinate: bool = True) -> TileTable:
-        """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from interfaces."""
+        """Lay out the tiles of a surface, for its coordinates or for other channels: without interfaces."""
         rows: list[tuple[int, ...]] = []
         origins: list[tuple[int, int, int]] = []
         of_grid: list[list[int]] = [[] for _ in layout.grids]
