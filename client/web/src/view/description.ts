@@ -74,7 +74,7 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
     rms: errors.rms,
     max: errors.maximum,
   }));
-  if (index.exactness !== null && last !== undefined) {
+  if (index.residual !== null && last !== undefined) {
     const { errors, level } = index.levels.at(-1)!;
     prices.push({ bytes: index.surfaceEnd, level, rms: errors.rms, max: errors.maximum });
   }
