@@ -146,11 +146,26 @@ def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Pat
     assert (tmp_path / "out" / "surface.lode").read_bytes() == container.read_bytes()
 
 
-def test_a_file_that_has_become_shorter(container: Path) -> None:
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_file_that_has_changed(container: Path, replace: bool) -> None:
     source = FileSource(container)
-    container.write_bytes(b"")
-    with pytest.raises(ls.CorruptStreamError, match="got fewer"):
+    other = container.with_suffix(".new") if replace else container
+    other.write_bytes(bytes(source.size))
+    os.utime(other, ns=(1, 1))
+    other.replace(container)
+    with pytest.raises(ls.LodestreamError, match="has changed"):
         source.read(0, 10)
+
+
+def test_a_container_of_another_host_that_has_changed(tmp_path: Path, container: Path) -> None:
+    with ranged(tmp_path) as host:
+        source = RemoteSource(f"{host.url}/{container.name}", None)
+        try:
+            container.write_bytes(bytes(source.size))
+            with pytest.raises(ls.RemoteError, match="got another"):
+                source.read(0, 10)
+        finally:
+            source.close()
 
 
 @pytest.fixture
