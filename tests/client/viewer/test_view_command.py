@@ -77,22 +77,23 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, container: Path
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine"]
 
 
+@pytest.mark.usefixtures("built")
 def test_a_folder_that_was_interrupted_is_written_again(
-    tmp_path: Path, container: Path, built: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, source = tmp_path / "out", FileSource(container)
+    out, source, pages = tmp_path / "out", FileSource(container), page.assets()
 
     def interrupted(done: float) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_static(out, page.assets(built), source, interrupted)
+        write_static(out, pages, source, interrupted)
     assert not (out / page.INDEX).exists()
     with monkeypatch.context() as patched:
         patched.setattr("lodestream_client.viewer.static.shutil.copyfile", lambda *_: interrupted(1))
         with pytest.raises(KeyboardInterrupt):
-            write_static(out, page.assets(built), source)
-    write_static(out, page.assets(built), source)
+            write_static(out, pages, source)
+    write_static(out, pages, source)
     assert (out / page.INDEX).is_file()
 
 
