@@ -23,10 +23,10 @@ from tests.core.entropy.coding import decode_runs, encode_runs, passes_of
 
 
 def main(seed: int, count: int) -> None:
-    """Steps, tiles, masks and pieces by turns."""
+    """Steps, tiles, masks and chunks by turns."""
     for number in range(seed, seed + count):
         chance, rng = random.Random(number), np.random.default_rng(number)
-        for kind, make in (("step", step), ("tiles", tiles), ("mask", mask), ("piece", piece)):
+        for kind, make in (("step", step), ("tiles", tiles), ("mask", mask), ("chunk", chunk)):
             print(json.dumps({"kind": kind, "number": number, **make(chance, rng)}), flush=True)
 
 
@@ -105,7 +105,7 @@ def mask(chance: random.Random, rng: np.random.Generator) -> dict[str, Any]:
     return {"shape": shape, "mask": packed(values), "data": base64.b64encode(encode_mask(values)).decode()}
 
 
-def piece(chance: random.Random, rng: np.random.Generator) -> dict[str, Any]:
+def chunk(chance: random.Random, rng: np.random.Generator) -> dict[str, Any]:
     """Values, and what restores them from others."""
     dtype = np.dtype(chance.choice(["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f4", "f4", "f8", "f8"]))
     count = chance.choice([1, 2, 50, 1000])

@@ -49,6 +49,7 @@ _ENDS = ("failed", "waiting", "missing")
 
 # What a container is called becomes the name of a file.
 _CONTAINER = re.compile(r"[0-9a-f]{64}")
+_TAG = re.compile('"([0-9a-f]{64})"')
 _LENGTH = re.compile(r"[0-9]{1,18}")
 _LARGEST_FILE = 2**62
 
@@ -243,11 +244,15 @@ def delete(url: str) -> Flow[None]:
     _refuse(answer, address)
 
 
-def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
+def fetch_range(url: str, offset: int, length: int, identity: Identity | None = None) -> Flow[bytes]:
     """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file.
+
+    With an identity the answer must be of the container that it is of, as far as the answer says.
 
     Raises
     ------
+    RemoteError
+        With the code ``other-container`` if there is another one now.
     RemoteProtocolError
         If the server does not support Range.
     CorruptStreamError
@@ -260,9 +265,25 @@ def fetch_range(url: str, offset: int, length: int) -> Flow[bytes]:
         raise RemoteProtocolError(
             f"expected a range of the container from {address}, got all of it: Range is not supported"
         )
+    if identity is not None and not _is_of(response, url, identity):
+        raise RemoteError("other-container", f"expected the container that {url} had before, got another")
     if len(response.content) != length:
         raise CorruptStreamError(f"expected {length} bytes of the container, got {len(response.content)}", offset)
     return response.content
+
+
+def _is_of(answer: Answer, url: str, identity: Identity) -> bool:
+    """Whether part of a file is of the container with this identity."""
+    version = answer.headers.get("etag") or answer.headers.get("last-modified")
+    size = answer.headers.get("content-range", "").rpartition("/")[2]
+    if _LENGTH.fullmatch(size) and int(size) != identity.size:
+        return False
+    if version is None:
+        return True
+    if identity.container is None:
+        return identity_of_file(url, version, identity.size) == identity
+    found = _TAG.fullmatch(version)  # a proxy may have put its own in the place of the server's
+    return found is None or found[1] == identity.container
 
 
 def _refuse(answer: Answer | None, url: str) -> Answer:

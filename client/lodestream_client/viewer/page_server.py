@@ -1,7 +1,8 @@
 """A small file server for one browser: the page, and a container with Range, on a free port of this machine.
 
 It belongs to ``lodestream view`` and ends with it. Its addresses begin with a random word, so that other users of the
-machine and other pages of the browser, which do not know it, get nothing.
+machine and other pages of the browser, which do not know it, get nothing. A browser is given the address as an
+argument, which other users may see in the list of processes; with ``--no-browser`` only who runs the command sees it.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import socketserver
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +27,7 @@ __all__ = ["PageServer", "byte_range", "serving"]
 
 _SURFACE = "surface.lode"
 _SECONDS = 30.0  # for which a connection may say nothing
+_AT_ONCE = 1 << 16  # bytes that have to be taken within these seconds: a page that shows a slow link takes them slowly
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
@@ -88,6 +91,11 @@ class PageServer(ThreadingHTTPServer):
         self.progress = 0.0
         self.asked = threading.Event()
 
+    def server_bind(self) -> None:
+        """Bind, and do not ask for the name of this machine, for which some wait seconds."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = "127.0.0.1", self.server_address[1]
+
     def config(self) -> dict[str, Any]:
         """What the page is to show, see ``client/web/src/page``."""
         surface: dict[str, Any] = {"name": self.name, "src": _SURFACE}
@@ -116,6 +124,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
     def _answer(self, send: Callable[[Iterator[bytes]], None]) -> None:
+        if "content-length" in self.headers or "transfer-encoding" in self.headers:
+            self.close_connection = True  # a body is not read, and is not to pass for the next request
         # Another page cannot read what it gets from here, unless its host's name was made to lead here.
         if self.headers.get("host") not in self.server.hosts:
             self._refuse(HTTPStatus.MISDIRECTED_REQUEST, send)
@@ -144,7 +154,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self, body: Iterator[bytes]) -> None:
         for data in body:
-            self.wfile.write(data)
+            for first in range(0, len(data), _AT_ONCE):
+                self.wfile.write(memoryview(data)[first : first + _AT_ONCE])
 
     def _refuse(self, status: HTTPStatus, send: Callable[[Iterator[bytes]], None], words: str = "") -> None:
         body = f"{words or status.phrase}\n".encode()
@@ -173,7 +184,7 @@ class _Handler(BaseHTTPRequestHandler):
         first, stop = part or (0, source.size)
         body = _bytes(source, first, stop)
         try:
-            begun = next(body)  # what cannot be had is refused before anything is promised
+            begun = next(body, b"")  # what cannot be had is refused before anything is promised
         except (LodestreamError, OSError) as error:
             self._refuse(HTTPStatus.BAD_GATEWAY, send, str(error))
             return

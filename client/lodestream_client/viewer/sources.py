@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
-from lodestream.errors import CorruptStreamError, RemoteProtocolError
+from lodestream.errors import LodestreamError, RemoteProtocolError
 
 from .. import sync
 from ..requests import api, calls
@@ -53,7 +53,7 @@ class FileSource:
         status = path.stat()
         self.name = path.name.removesuffix(".lode") if name is None else name
         self.size = status.st_size
-        self.tag = f"{status.st_ino:x}{status.st_mtime_ns:x}{status.st_size:x}"
+        self.tag = _tag(status)
         self._path = path
 
     def read(self, offset: int, length: int) -> bytes:
@@ -63,14 +63,20 @@ class FileSource:
         ------
         OSError
             If the file cannot be read.
-        CorruptStreamError
-            If it is shorter than it was.
+        LodestreamError
+            If it is another file than it was, or was written since.
         """
         with self._path.open("rb") as file:
             data = os.pread(file.fileno(), min(length, _AT_ONCE), offset)
-        if not data:
-            raise CorruptStreamError(f"expected {self.size} bytes in {self._path}, got fewer", offset)
+            # Asked afterwards: what was read before a change is of the old file.
+            same = _tag(os.fstat(file.fileno())) == self.tag
+        if not same or not data:
+            raise LodestreamError(f"expected {self._path} as it was when this began, got another: it has changed")
         return data
+
+
+def _tag(status: os.stat_result) -> str:
+    return f"{status.st_ino:x}{status.st_mtime_ns:x}{status.st_size:x}"
 
 
 class RemoteSource:
@@ -97,7 +103,7 @@ class RemoteSource:
         self.name = _name(url, token) or url.rstrip("/").rpartition("/")[2].removesuffix(".lode")
         self.size = identity.size
         self.tag = identity.name
-        self._url, self._token = url, token
+        self._url, self._token, self._identity = url, token, identity
         self._lock = threading.Lock()
         self._open = ExitStack()
         self._client = self._open.enter_context(httpx.Client(**calls.client_options(url, calls.TIMEOUT)))
@@ -112,11 +118,13 @@ class RemoteSource:
         Raises
         ------
         LodestreamError
-            If the server cannot be reached, refuses, or sends other bytes than were asked for.
+            If the server cannot be reached, refuses, sends other bytes than were asked for, or has another container
+            there than before.
         """
         wanted = min(length, _AT_ONCE, self.size - offset)
         with self._lock:
-            return sync.run(self._client, api.fetch_range(self._url, offset, wanted), self._url, self._token)
+            call = api.fetch_range(self._url, offset, wanted, self._identity)
+            return sync.run(self._client, call, self._url, self._token)
 
 
 def _name(url: str, token: str | None) -> str | None:

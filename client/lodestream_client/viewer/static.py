@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lodestream.errors import LodestreamError
-from lodestream.page import Asset
+from lodestream.page import INDEX, Asset
 
 from ..terminal.output import replacing
 from .sources import Source
@@ -43,18 +43,19 @@ def write_static(
     if folder.exists() and not (folder.is_dir() and (_ours(folder) or not any(folder.iterdir()))):
         raise LodestreamError(f"expected a folder that is new, empty, or written by this command before, got {folder}")
     folder.mkdir(parents=True, exist_ok=True)
-    for asset in pages.values():
-        path = folder / asset.name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            shutil.copyfile(asset.path, temporary)
     with replacing(folder / _SURFACE) as temporary, temporary.open("wb") as file:
         while (done := file.tell()) < source.size:
             file.write(source.read(done, source.size - done))
             progress(file.tell() / source.size)
     config = {"surfaces": [{"name": source.name, "src": _SURFACE, "bytes": source.size}], "live": False}
-    with replacing(folder / _CONFIG) as temporary:  # last: a page without it asks a server
+    with replacing(folder / _CONFIG) as temporary:
         temporary.write_text(json.dumps(config) + "\n", encoding="utf-8")
+    # Last, so that there is never a page without a container, and what was interrupted here is known as ours.
+    for asset in sorted(pages.values(), key=lambda asset: asset.name == INDEX):
+        path = folder / asset.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            shutil.copyfile(asset.path, temporary)
 
 
 def _ours(folder: Path) -> bool:

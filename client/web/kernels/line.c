@@ -1,4 +1,4 @@
-/* What the Python library leaves to numpy in restoring pieces of exactness (docs/format.md, sections 9.1 and 9.3):
+/* What the Python library leaves to numpy in restoring chunks of the residual (docs/format.md, sections 9.1 and 9.3):
  * values as places on a line of whole numbers and back, and the bases that offsets are counted from. Integers of 64
  * bits are slow in JavaScript.
  *

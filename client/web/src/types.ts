@@ -122,7 +122,7 @@ export interface Segment {
 }
 
 /** What corrects one channel in one window of a block. */
-export interface Piece {
+export interface Chunk {
   readonly range: ByteRange;
   /** The lower half of the CRC-32 of its bytes. */
   readonly check: number;
@@ -167,7 +167,7 @@ export interface ViewInfo {
   readonly number: number;
   /** Finest level of which there are decoded data. */
   readonly level: number;
-  /** Bytes received of header, layers and exactness. */
+  /** Bytes received of header, layers and residual. */
   readonly bytes: number;
   /** Measured errors at full resolution; NaN where they are not known. */
   readonly rms: number;

@@ -87,7 +87,7 @@ describe.each(WAYS)("%s", (_, way) => {
       const states: StreamState[] = [];
       const progress: Progress[] = [];
       const descriptions: Description[] = [];
-      const pieces: [number, Uint8Array][] = [];
+      const slices: [number, Uint8Array][] = [];
       const stream = connect(
         source,
         {},
@@ -96,7 +96,7 @@ describe.each(WAYS)("%s", (_, way) => {
           onState: (state) => void states.push(state),
           onProgress: (now) => void progress.push(now),
           onDescription: (now) => void descriptions.push(now),
-          onBytes: (offset, data) => void pieces.push([offset, data]),
+          onBytes: (offset, data) => void slices.push([offset, data]),
         },
       );
       let last: SurfaceView | undefined;
@@ -124,10 +124,10 @@ describe.each(WAYS)("%s", (_, way) => {
         ...{ size: served.data.length, metadata: { name: "terrain" } },
       });
       expect({ ...stream.progress, seconds: progress.at(-1)!.seconds }).toEqual(progress.at(-1));
-      for (const [offset, data] of pieces) {
+      for (const [offset, data] of slices) {
         expect(Buffer.from(data).equals(Buffer.from(served.data.subarray(offset, offset + data.length)))).toBe(true);
       }
-      expect(pieces.reduce((sum, [, data]) => sum + data.length, 0)).toBe(stream.progress.dataBytes);
+      expect(slices.reduce((sum, [, data]) => sum + data.length, 0)).toBe(stream.progress.dataBytes);
       const prices = await stream.prices();
       expect(prices.at(-1)).toMatchObject({ bytes: last!.bytes, rms: 0, maxError: 0 });
       expect(prices.map((price) => price.bytes)).toEqual(prices.map((p) => p.bytes).toSorted((a, b) => a - b));
@@ -180,14 +180,14 @@ describe.each(WAYS)("%s", (_, way) => {
     const kept = await first.kept();
     await first.close();
     expect(kept.size).toBe(served.data.length);
-    const held = kept.pieces.reduce((sum, [, data]) => sum + data.length, 0);
-    expect(held).toBe(first.progress.dataBytes);
+    const cached = kept.slices.reduce((sum, [, data]) => sum + data.length, 0);
+    expect(cached).toBe(first.progress.dataBytes);
     // A file that is the same but for its name.
     const again = connect(served.static, {}, options({ kept: { ...kept, version: undefined } }));
     let last: SurfaceView | undefined;
     for await (const view of again) last = view;
     expect(again.ended).toBe("complete");
-    expect(again.progress.dataBytes).toBeLessThanOrEqual(served.data.length - held);
+    expect(again.progress.dataBytes).toBeLessThanOrEqual(served.data.length - cached);
     expect((await last!.surface()).blocks[0]!.points).toEqual(whole.blocks[0]!.points);
     await again.close();
   });
@@ -209,7 +209,7 @@ describe.each(WAYS)("%s", (_, way) => {
       for await (const view of other) views.push(view);
     };
     await expect(received()).rejects.toMatchObject({ code: "other-container" });
-    expect(views.length).toBeGreaterThan(0); // what is held is shown at once
+    expect(views.length).toBeGreaterThan(0); // what is cached is shown at once
     expect(views.at(-1)!.bytes).toBeLessThanOrEqual(9000);
     await other.close();
   });

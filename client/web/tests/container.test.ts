@@ -1,5 +1,5 @@
 import { describe, expect, it } from "vitest";
-import { pieceWindows, readIndex } from "../src/container";
+import { chunkPlaces, readIndex } from "../src/container";
 import { checkOf } from "../src/container/crc";
 import { containerOf, EXPECTED, NAMES } from "./golden";
 
@@ -26,10 +26,10 @@ describe("the index of golden containers", () => {
     expect(index.header.masks.holes.length ? index.header.masks.holes : index.header.blocks.map(() => 0)).toEqual(
       expected.blocks.map((block) => block.holes),
     );
-    for (const item of [...index.segments, ...index.pieces]) {
+    for (const item of [...index.segments, ...index.chunks]) {
       const { offset, length } = item.range;
       if (length) expect(checkOf(data.subarray(offset, offset + length))).toBe(item.check);
     }
-    if (index.exactness) expect([...pieceWindows(index.header)].length).toBe(index.pieces.length);
+    if (index.residual) expect([...chunkPlaces(index.header)].length).toBe(index.chunks.length);
   });
 });

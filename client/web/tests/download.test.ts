@@ -10,8 +10,8 @@ import { makeTarget, type TargetOptions } from "../src/planning/target";
 import { MAX_CREDIT, type Segments } from "../src/protocol/messages";
 import { parse, serialize } from "../src/protocol/wire";
 import { Download } from "../src/transfer/download";
-import { type Part, RangeDownload } from "../src/transfer/range-download";
-import { Reception } from "../src/transfer/receiver-state";
+import { RangeDownload, type RangeRequest } from "../src/transfer/range-download";
+import { ReceiverState } from "../src/transfer/receiver-state";
 import { MemoryStore } from "../src/transfer/store";
 import type { Region, Target } from "../src/types";
 import { decoderFor } from "./decoders";
@@ -58,7 +58,7 @@ const TARGETS: TargetOptions[] = [
   { first: FAR },
 ];
 
-const reception = (target: Target, store?: MemoryStore) => new Reception(target, decoderFor(target), { store });
+const reception = (target: Target, store?: MemoryStore) => new ReceiverState(target, decoderFor(target), { store });
 
 /** A client and a server joined by queues, one step of one of them at a time. */
 class Link {
@@ -72,7 +72,7 @@ class Link {
 
   constructor(
     kind: string,
-    readonly reception: Reception<View>,
+    readonly reception: ReceiverState<View>,
     window = MAX_CREDIT,
   ) {
     this.server = new Sender(INDEX[kind]!, DATA[kind]!);
@@ -128,11 +128,11 @@ class Link {
 }
 
 /** All that was promised has come, nothing twice, and shows what the target says. */
-function checkEnd(received: Reception<View>, kind: string, target: Target): void {
+function checkEnd(received: ReceiverState<View>, kind: string, target: Target): void {
   const chosen = plan(INDEX[kind]!, target);
   const end = endOf(chosen);
   expect(received.ended).toBe(chosen.ended);
-  expect(received.dataBytes).toBe(received.held.total);
+  expect(received.dataBytes).toBe(received.cached.total);
   expect(received.received).toBe(end.bytes);
   const view = received.decoder.layers.at(-1)!;
   expect([view.bytes, view.rms, view.maxError]).toEqual([end.bytes, end.rms, end.maxError]);
@@ -173,8 +173,8 @@ describe("the exchange in docs/protocol.md", () => {
     }
     expect(outbox).toEqual([]);
     expect(received.ended).toBe("complete");
-    expect(received.dataBytes).toBe(received.held.total);
-    expect(Buffer.from(containerOf("two-points").subarray(0, 144)).length).toBe(received.held.total);
+    expect(received.dataBytes).toBe(received.cached.total);
+    expect(Buffer.from(containerOf("two-points").subarray(0, 144)).length).toBe(received.cached.total);
   });
 });
 
@@ -232,8 +232,8 @@ describe.each(KINDS)("%s", (kind) => {
           }
           const chosen = plan(INDEX[kind]!, target);
           expect(received.ended).toBe(chosen.ended);
-          expect(received.dataBytes).toBe(received.held.total);
-          for (const { offset, length } of slicesOf(chosen)) expect(received.held.covers(offset, length)).toBe(true);
+          expect(received.dataBytes).toBe(received.cached.total);
+          for (const { offset, length } of slicesOf(chosen)) expect(received.cached.covers(offset, length)).toBe(true);
           expect(received.received).toBeGreaterThanOrEqual(endOf(chosen).bytes);
           if (chosen.ended === "complete") {
             const whole = decoderFor(target);
@@ -246,7 +246,7 @@ describe.each(KINDS)("%s", (kind) => {
     );
   }, 180_000);
 
-  it.each(TARGETS)("for %j parts of the file in any pieces end where the plan does", (options) => {
+  it.each(TARGETS)("for %j answers cut anywhere end where the plan does", (options) => {
     fc.assert(
       fc.property(
         fc.infiniteStream(fc.integer({ min: 1, max: 9000 })),
@@ -255,7 +255,7 @@ describe.each(KINDS)("%s", (kind) => {
           const target = makeTarget(options);
           const received = reception(target);
           const download = new RangeDownload(received);
-          const served = serveParts(download, DATA[kind]!, sizes, [...cuts]);
+          const served = serveRanges(download, DATA[kind]!, sizes, [...cuts]);
           checkEnd(received, kind, target);
           expect(served.most).toBeLessThanOrEqual(2);
         },
@@ -264,7 +264,7 @@ describe.each(KINDS)("%s", (kind) => {
     );
   });
 
-  it("parts of the file end where the plan does, whenever one looks elsewhere and wants something else", () => {
+  it("answers end where the plan does, whenever one looks elsewhere and wants something else", () => {
     const whole = TARGETS.filter((target) => target.region === undefined);
     const change = fc.oneof(
       fc.constantFrom<{ region: Region | undefined }>({ region: NEAR }, { region: FAR }, { region: undefined }),
@@ -281,7 +281,7 @@ describe.each(KINDS)("%s", (kind) => {
           const received = reception(target);
           const download = new RangeDownload(received);
           const todo = changes.map(([pause, what]) => ({ pause, what }));
-          serveParts(download, DATA[kind]!, sizes, [...cuts], (leave) => {
+          serveRanges(download, DATA[kind]!, sizes, [...cuts], (leave) => {
             if (todo[0] === undefined || todo[0].pause-- > 0) return;
             const { what } = todo.shift()!;
             if ("region" in what) received.focus(what.region);
@@ -293,9 +293,9 @@ describe.each(KINDS)("%s", (kind) => {
           });
           const chosen = plan(INDEX[kind]!, target);
           expect(received.ended).toBe(chosen.ended);
-          expect(received.dataBytes).toBe(received.held.total);
+          expect(received.dataBytes).toBe(received.cached.total);
           expect(received.received).toBe(endOf(chosen).bytes);
-          for (const { offset, length } of slicesOf(chosen)) expect(received.held.covers(offset, length)).toBe(true);
+          for (const { offset, length } of slicesOf(chosen)) expect(received.cached.covers(offset, length)).toBe(true);
           if (chosen.ended === "complete") {
             const expected = decoderFor(target);
             expected.feed(DATA[kind]!);
@@ -308,27 +308,27 @@ describe.each(KINDS)("%s", (kind) => {
   }, 180_000);
 });
 
-/** Answer requests in pieces, now of the first and now of the second, some of them broken off. */
-function serveParts(
+/** Answer requests little by little, now of the first and now of the second, some of them broken off. */
+function serveRanges(
   download: RangeDownload<View>,
   data: Uint8Array,
   sizes: Iterator<number>,
   cuts: number[],
   between: (leave: () => void) => void = () => undefined,
 ): { most: number; places: [number, number][] } {
-  const flights: Part[] = [];
+  const flights: RangeRequest[] = [];
   const places: [number, number][] = [];
   let most = 0;
   for (let turn = 0; turn < 1e6; turn++) {
     for (;;) {
-      const { part } = download.request(turn);
-      if (part === undefined) break;
-      places.push([part.offset, part.length]);
-      const last = Math.min(part.end, data.length) - 1;
-      const headers = new Headers({ "Content-Range": `bytes ${part.offset}-${last}/${data.length}`, ETag: '"a"' });
-      if (part.headers["If-Range"] !== undefined) expect(part.headers["If-Range"]).toBe('"a"');
-      download.answer(part, 206, headers, turn);
-      flights.push(part);
+      const { request } = download.request(turn);
+      if (request === undefined) break;
+      places.push([request.offset, request.length]);
+      const last = Math.min(request.end, data.length) - 1;
+      const headers = new Headers({ "Content-Range": `bytes ${request.offset}-${last}/${data.length}`, ETag: '"a"' });
+      if (request.headers["If-Range"] !== undefined) expect(request.headers["If-Range"]).toBe('"a"');
+      download.answer(request, 206, headers, turn);
+      flights.push(request);
     }
     most = Math.max(most, flights.length);
     if (flights.length === 0) return { most, places };
@@ -336,15 +336,15 @@ function serveParts(
       for (const each of flights.splice(0)) download.leave(each);
     });
     if (flights.length === 0) continue;
-    const part = flights[sizes.next().value % flights.length]!;
-    const end = Math.min(part.position + sizes.next().value, part.end, data.length);
-    download.receive(part, data.slice(part.position, end));
+    const request = flights[sizes.next().value % flights.length]!;
+    const end = Math.min(request.position + sizes.next().value, request.end, data.length);
+    download.receive(request, data.slice(request.position, end));
     if (cuts[0] !== undefined && cuts[0]-- <= 0) {
       cuts.shift();
       for (const each of flights.splice(0)) download.leave(each);
-    } else if (end === Math.min(part.end, data.length)) {
-      flights.splice(flights.indexOf(part), 1);
-      download.finish(part, turn);
+    } else if (end === Math.min(request.end, data.length)) {
+      flights.splice(flights.indexOf(request), 1);
+      download.finish(request, turn);
     }
   }
   throw new Error("there is no end");
@@ -399,7 +399,7 @@ describe("what a server says that is not so", () => {
     [
       "damaged bytes",
       (link) => {
-        const next = link.reception.held.end;
+        const next = link.reception.cached.end;
         return serialize({ type: "segments", offset: next, data: DATA.integers!.slice(next, next + 4000).fill(7) });
       },
       CorruptStreamError,
@@ -447,7 +447,7 @@ describe("what a server says that is not so", () => {
 describe("answers over HTTP that are not what was asked for", () => {
   const asked = () => {
     const download = new RangeDownload(reception(makeTarget()));
-    return { download, part: download.request(0).part! };
+    return { download, request: download.request(0).request! };
   };
   it.each<[number, Record<string, string>, RegExp]>([
     [200, {}, /got all of it \(status 200\): the server does not support Range/],
@@ -458,19 +458,19 @@ describe("answers over HTTP that are not what was asked for", () => {
     [206, { "Content-Range": "bytes 0-19/20", "Content-Encoding": "gzip" }, /encoded with gzip/],
     [416, {}, /got a shorter file/],
   ])("%i %j", (status, headers, text) => {
-    const { download, part } = asked();
-    expect(() => download.answer(part, status, new Headers(headers))).toThrow(text);
+    const { download, request } = asked();
+    expect(() => download.answer(request, status, new Headers(headers))).toThrow(text);
   });
 
   it("a file that changes, and a body that is too long or short", () => {
     const data = DATA.integers!;
-    const { download, part } = asked();
-    const last = Math.min(part.length, data.length) - 1;
+    const { download, request } = asked();
+    const last = Math.min(request.length, data.length) - 1;
     const range = `bytes 0-${last}/${data.length}`;
-    download.answer(part, 206, new Headers({ "Content-Range": range, ETag: '"one"' }));
-    download.receive(part, data.slice(0, 3000));
-    expect(() => download.finish(part)).toThrow(TruncatedStreamError);
-    const next = download.request(1).part!;
+    download.answer(request, 206, new Headers({ "Content-Range": range, ETag: '"one"' }));
+    download.receive(request, data.slice(0, 3000));
+    expect(() => download.finish(request)).toThrow(TruncatedStreamError);
+    const next = download.request(1).request!;
     expect([next.offset, next.headers["If-Range"]]).toEqual([3000, '"one"']);
     const other = new Headers({ "Content-Range": `bytes 3000-${next.end - 1}/${data.length}`, ETag: '"two"' });
     expect(() => download.answer(next, 206, other)).toThrow(/it has changed/);

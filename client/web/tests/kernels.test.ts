@@ -7,7 +7,7 @@ import { Layout, plainGrid } from "../src/grid/layout";
 import { Arena } from "../src/kernels/arena";
 import { loadKernels } from "../src/kernels/instance";
 import { sha256 } from "../src/kernels/sha256";
-import { decodePiece } from "../src/residual/chunk-coder";
+import { decodeChunk } from "../src/residual/chunk-coder";
 import { allocatePlane, forwardStep, inverseStep } from "../src/transform/pyramid";
 import type { DType, Shape } from "../src/types";
 import { run } from "./python";
@@ -45,15 +45,15 @@ interface MaskCase {
   data: string;
 }
 
-interface PieceCase {
-  kind: "piece";
+interface ChunkCase {
+  kind: "chunk";
   dtype: DType;
   restored: string;
   original: string;
   data: string;
 }
 
-type Case = { number: number } & (StepCase | TilesCase | MaskCase | PieceCase);
+type Case = { number: number } & (StepCase | TilesCase | MaskCase | ChunkCase);
 
 const COUNT = Number(process.env.LODESTREAM_CALLS ?? 100);
 const SEED = Number(process.env.LODESTREAM_SEED ?? 1);
@@ -125,7 +125,7 @@ describe("the kernels give the bits of the Python library", () => {
         one.runs.map(([tile, first, passes, data]) => ({ tile, first, last: first - passes + 1, data: bytes(data) })),
       );
       const plane = allocatePlane(arena, one.shape);
-      tiles.spreadLevels(layout.levels, Int8Array.from(one.state), [plane], layout.levels);
+      tiles.dequantizeLevels(layout.levels, Int8Array.from(one.state), [plane], layout.levels);
       expect(take(arena, plane), `tiles ${one.number}`).toEqual(numbers(one.known));
     });
   });
@@ -136,13 +136,13 @@ describe("the kernels give the bits of the Python library", () => {
     });
   });
 
-  it("in pieces of exactness by every rule", () => {
+  it("in chunks of the residual by every rule", () => {
     const rules = new Set<number>();
-    each("piece", (one, arena) => {
+    each("chunk", (one, arena) => {
       const data = bytes(one.data);
       if (data.length) rules.add(data[0]! & 3);
-      const values = decodePiece(arena, bytes(one.restored), one.dtype, data, 0);
-      expect(values, `piece ${one.number} of ${one.dtype}`).toEqual(bytes(one.original));
+      const values = decodeChunk(arena, bytes(one.restored), one.dtype, data, 0);
+      expect(values, `chunk ${one.number} of ${one.dtype}`).toEqual(bytes(one.original));
     });
     expect([...rules].sort()).toEqual([0, 1, 2, 3]);
   });
@@ -162,7 +162,7 @@ describe("SHA-256", () => {
   it("does not depend on how bytes are cut", () => {
     const arena = new Arena(kernels);
     const data = Uint8Array.from({ length: 2_500_001 }, (_, i) => (i * i) >> 3);
-    const pieces = [data.subarray(0, 1), data.subarray(1, 1_300_000), data.subarray(1_300_000)];
-    expect(sha256(arena, pieces)).toBe(sha256(arena, [data]));
+    const arrays = [data.subarray(0, 1), data.subarray(1, 1_300_000), data.subarray(1_300_000)];
+    expect(sha256(arena, arrays)).toBe(sha256(arena, [data]));
   });
 });

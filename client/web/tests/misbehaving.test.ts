@@ -107,7 +107,7 @@ describe("a server", () => {
     const stream = streamOf(await scripted(() => undefined));
     await all(stream);
     expect(stream.ended).toBe("complete");
-    expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+    expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
   });
 
   it.each([
@@ -122,7 +122,7 @@ describe("a server", () => {
     await all(stream);
     expect(stream.ended).toBe("complete");
     expect(stream.progress.connections).toBe(4);
-    expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+    expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
     expect(states.filter((state) => state.phase === "reconnecting").length).toBe(3);
   });
 

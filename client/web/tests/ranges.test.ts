@@ -49,12 +49,12 @@ describe("bytes in memory", () => {
       fc.property(fc.shuffledSubarray([...Array(20).keys()]), fc.boolean(), fc.nat(19), (order, keepAll, until) => {
         const data = Uint8Array.from({ length: 60 }, (_, byte) => byte);
         const store = new MemoryStore(keepAll);
-        for (const piece of order) store.write(3 * piece, data.slice(3 * piece, 3 * piece + 3));
+        for (const slice of order) store.write(3 * slice, data.slice(3 * slice, 3 * slice + 3));
         for (const [offset, length] of store.ranges)
           expect(store.read(offset, length)).toEqual(data.slice(offset, offset + length));
         store.used(0, 3 * until);
-        const kept = order.filter((piece) => keepAll || piece >= until).sort((a, b) => a - b);
-        expect(store.all().map(([offset]) => offset)).toEqual(kept.map((piece) => 3 * piece));
+        const kept = order.filter((slice) => keepAll || slice >= until).sort((a, b) => a - b);
+        expect(store.all().map(([offset]) => offset)).toEqual(kept.map((slice) => 3 * slice));
       }),
     );
   });

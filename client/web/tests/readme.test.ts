@@ -3,6 +3,7 @@ import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { afterAll, beforeAll, expect, it } from "vitest";
 import WebSocket from "ws";
+import * as api from "../src";
 import { type ConnectOptions, connect, type SocketClass, type TargetOptions } from "../src";
 import { ROOT } from "./golden";
 import { type Served, serve } from "./servers";
@@ -44,4 +45,15 @@ it("has all options, and all that a stream can do", () => {
   expect(names.length).toBeGreaterThan(15);
   const rare = ["container", "size", "pauses"];
   for (const name of names) if (!rare.includes(name)) expect(PAGE, name).toMatch(new RegExp(`\`${name}[\`(]`));
+});
+
+it("names only what the package exports", () => {
+  const imported = [...PAGE.matchAll(/import \{ (.*?) \} from "lodestream"/g)].flatMap((found) =>
+    found[1]!.split(", "),
+  );
+  const called = ["coordinatesOf", "placementOf", "readIndex", "serveDecoder", "Stream"];
+  const errors = [...PAGE.matchAll(/`(\w+Error)`/g)].map((found) => found[1]!);
+  expect(errors.length).toBeGreaterThan(4);
+  for (const name of called) expect(PAGE).toContain(`\`${name}`);
+  for (const name of [...imported, ...called, ...errors]) expect(api, name).toHaveProperty(name);
 });

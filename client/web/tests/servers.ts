@@ -102,10 +102,10 @@ export class Faulty {
     far.on("data", (data) =>
       later(() => {
         if (left <= 0) return;
-        const piece = data.subarray(0, left);
-        left -= piece.length;
-        this.down += piece.length;
-        near.write(piece, () => {
+        const slice = data.subarray(0, left);
+        left -= slice.length;
+        this.down += slice.length;
+        near.write(slice, () => {
           if (left <= 0 && !fault.vanish) near.destroy();
         });
         if (left <= 0) far.destroy();

@@ -68,14 +68,14 @@ async function faulty<T>(
   }
 }
 
-const ROADS: [string, () => string | Blob, StreamOptions][] = [
+const TRANSPORTS: [string, () => string | Blob, StreamOptions][] = [
   ["a WebSocket", () => served.surface, { transport: "ws" }],
   ["HTTP Range of a surface", () => served.surface, { transport: "http" }],
   ["a plain file of a web server", () => served.static, {}],
   ["a Blob", () => new Blob([served.data as Uint8Array<ArrayBuffer>]), {}],
 ];
 
-describe.each(ROADS)("over %s", (name, source, options) => {
+describe.each(TRANSPORTS)("over %s", (name, source, options) => {
   it("a stream ends with the original", async () => {
     const stream = streamOf(source(), {}, options);
     const views = await all(stream);
@@ -83,7 +83,7 @@ describe.each(ROADS)("over %s", (name, source, options) => {
     expect(stream.ended).toBe("complete");
     expect(stream.state).toMatchObject({ phase: "ended", ended: "complete" });
     const { reception } = stream;
-    expect(reception.dataBytes).toBe(reception.held.total);
+    expect(reception.dataBytes).toBe(reception.cached.total);
     expect((reception.decoder as ReturnType<typeof decoderFor>).metadata).toMatchObject({ name: "terrain" });
   });
 
@@ -123,10 +123,10 @@ describe.each(ROADS)("over %s", (name, source, options) => {
     expect(await stream.next()).toEqual({ value: undefined, done: true });
   });
 
-  it("another target after the end goes on with what is held", async () => {
+  it("another target after the end goes on with what is cached", async () => {
     const stream = streamOf(source(), { maxBytes: 3000 }, options);
     await all(stream);
-    const held = stream.reception.dataBytes;
+    const cached = stream.reception.dataBytes;
     stream.aim({ level: 6 });
     await all(stream);
     expect(stream.ended).toBe("level");
@@ -134,8 +134,8 @@ describe.each(ROADS)("over %s", (name, source, options) => {
     const views = await all(stream);
     expect(stream.ended).toBe("complete");
     expectWhole(views.at(-1)!);
-    expect(held).toBeGreaterThan(0);
-    expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+    expect(cached).toBeGreaterThan(0);
+    expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
     expect(() => stream.aim({ attributes: [] })).toThrow(/another stream/);
   });
 
@@ -170,7 +170,7 @@ describe.each(ROADS)("over %s", (name, source, options) => {
     }
     expect(stream.ended).toBe("complete");
     if (name === "a WebSocket") expect(exact).toBeLessThan(0.9 * before);
-    expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+    expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
   });
 });
 
@@ -214,7 +214,7 @@ describe("a stop", () => {
     expect(performance.now() - began).toBeLessThan(2000);
   });
 
-  it("before the beginning asks nobody", async () => {
+  it("before it begins asks nobody", async () => {
     const stream = streamOf("http://127.0.0.1:1/v1/surfaces/0");
     await stream.stop();
     expect(await all(stream)).toEqual([]);
@@ -265,7 +265,7 @@ describe("a link that breaks", () => {
       const views = await all(stream);
       expectWhole(views.at(-1)!);
       expect(views.map((view) => view.number)).toEqual(views.map((_, number) => number));
-      expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+      expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
       expect(link.connections).toBeGreaterThanOrEqual(4);
     });
     const phases = states.map((state) => state.phase);
@@ -281,7 +281,7 @@ describe("a link that breaks", () => {
       const stream = streamOf(link.url, target, { transport: "ws", window: 500 });
       const views = await all(stream);
       expect(views.map((view) => view.info)).toEqual(expected.map((view) => view.info));
-      expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+      expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
     });
   });
 
@@ -293,7 +293,7 @@ describe("a link that breaks", () => {
         async (link) => {
           const stream = streamOf(link.url, {}, { transport, silence: 0.4, closeTimeout: 0.1, window: 2000 });
           expectWhole((await all(stream)).at(-1)!);
-          expect(stream.reception.dataBytes).toBe(stream.reception.held.total);
+          expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
         },
       );
     }
@@ -321,8 +321,8 @@ describe("a link that breaks", () => {
       await expect(all(stream)).rejects.toThrow(LodestreamError);
       return stream.reception;
     });
-    const held = store.ranges.total;
-    expect(held).toBeGreaterThan(3000);
+    const cached = store.ranges.total;
+    expect(cached).toBeGreaterThan(3000);
     for (const source of [served.surface, served.static]) {
       const again = new MemoryStore(true);
       for (const [offset, data] of store.all()) again.write(offset, data);
@@ -331,7 +331,7 @@ describe("a link that breaks", () => {
       const onBytes = (_: number, data: Uint8Array) => void came.push(data.length);
       const stream = streamOf(source, {}, { store: again, container, size, onBytes });
       expectWhole((await all(stream)).at(-1)!);
-      expect(stream.reception.dataBytes).toBe(stream.reception.held.total - held);
+      expect(stream.reception.dataBytes).toBe(stream.reception.cached.total - cached);
       expect(came.reduce((sum, length) => sum + length, 0)).toBe(stream.reception.dataBytes);
     }
   });
@@ -408,7 +408,7 @@ describe("a file", () => {
 });
 
 describe("a link that is far away", () => {
-  it.each(["ws", "http"] as const)("shows the first picture after two round trips: %s", async (transport) => {
+  it.each(["ws", "http"] as const)("shows the first view after two round trips: %s", async (transport) => {
     const roundTrip = 1.2;
     const source = transport === "ws" ? served.surface : served.static;
     await faulty(

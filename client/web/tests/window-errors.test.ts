@@ -1,6 +1,7 @@
 import { expect, it } from "vitest";
-import { readIndex, readWindowErrors } from "../src/container";
+import { readIndex } from "../src/container";
 import { CorruptStreamError, OptionError } from "../src/errors";
+import { readWindowErrors } from "../src/planning/window-errors";
 import type { Region } from "../src/types";
 import { containerOf } from "./golden";
 import { run } from "./python";

@@ -58,7 +58,7 @@ class TileTable:
     @staticmethod
     @lru_cache(maxsize=REMEMBERED)
     def of(layout: Layout, coordinate: bool = True) -> TileTable:
-        """Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves."""
+        """Lay out the tiles of a surface, for its coordinates or for other channels: without interfaces."""
         rows: list[tuple[int, ...]] = []
         origins: list[tuple[int, int, int]] = []
         of_grid: list[list[int]] = [[] for _ in layout.grids]
@@ -211,7 +211,7 @@ def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, st
     """What a band of this level says of its parent, see `bitplanes.code_passes`."""
     finer, coarser = layout.shape(band.grid, level - 1), layout.shape(band.grid, level - 2)
     down, right = int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
-    # Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
+    # Without its first row, which comes from an interface, a band has an odd origin: its parent's has one too.
     row = ((band.origin[0] + down) >> down) - parent.origin[0]
     column = ((band.origin[1] + right) >> right) - parent.origin[1]
     return place + row * stride + column, stride, down, right

@@ -75,13 +75,13 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self.ranges = RangeSet()
-        self._pieces: list[tuple[int, bytes]] = []
+        self._slices: list[tuple[int, bytes]] = []
         self._used = RangeSet()
 
     def read(self, offset: int, length: int) -> bytes:
         """Bytes that are kept."""
         found = bytearray(length)
-        for start, data in self._pieces:
+        for start, data in self._slices:
             first, last = max(start, offset), min(start + len(data), offset + length)
             if first < last:
                 found[first - offset : last - offset] = data[first - start : last - start]
@@ -90,12 +90,12 @@ class MemoryStore:
     def write(self, offset: int, data: bytes) -> None:
         """Keep bytes that are not kept yet."""
         self.ranges.add(offset, len(data))
-        self._pieces.append((offset, data))
+        self._slices.append((offset, data))
 
     def used(self, offset: int, length: int) -> None:
         """Forget what is read no more."""
         self._used.add(offset, length)
-        self._pieces = [(at, data) for at, data in self._pieces if not self._used.covers(at, len(data))]
+        self._slices = [(at, data) for at, data in self._slices if not self._used.covers(at, len(data))]
 
 
 class ReceiverState:

@@ -69,8 +69,8 @@ class Sender:
         return self._connection.state
 
     @property
-    def pieces(self) -> int:
-        """Number of pieces that a plan is made of; the time to make a plan is proportional to it."""
+    def plan_size(self) -> int:
+        """Segments, and ranges cached or sent, that a plan is made of; the time to make one is proportional to it."""
         return len(self._index.segments) + len(self.cached) + len(self._given)
 
     def receive(self, message: bytes) -> Event:

@@ -54,10 +54,10 @@ router = APIRouter()
 # A close frame carries 125 bytes, two of them the code.
 _LONGEST_REASON = 123
 
-# Planning with more pieces than this takes longer than the others should wait; each range that is held takes at least
-# so many bytes of a message.
-_PIECES_AT_ONCE = 2048
-_BYTES_OF_A_PIECE = 3
+# Planning with more segments and ranges than this takes longer than the others should wait; each cached range takes at
+# least so many bytes of a message.
+_PLANNED_AT_ONCE = 2048
+_BYTES_OF_A_RANGE = 3
 
 _Result = TypeVar("_Result")
 
@@ -265,8 +265,8 @@ class _Session:
         if self._sender.state is State.ENDED:
             # Somebody who opens again and again does it in turn with others.
             return isinstance(parse(data), Open)
-        pieces = self._sender.pieces + len(data) // _BYTES_OF_A_PIECE
-        return self._sender.state is State.IDLE and pieces > _PIECES_AT_ONCE
+        size = self._sender.plan_size + len(data) // _BYTES_OF_A_RANGE
+        return self._sender.state is State.IDLE and size > _PLANNED_AT_ONCE
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Do what takes long beside the event loop, which serves the others meanwhile."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
+import socket
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -126,3 +128,21 @@ def test_a_source_that_fails_is_an_error_or_a_connection_cut_short(server: PageS
         with connection.getresponse() as response, pytest.raises(http.client.IncompleteRead) as cut:
             response.read()
     assert cut.value.partial == b"x" * 60
+
+
+def test_the_body_of_a_request_is_no_request(server: PageServer) -> None:
+    inner = f"GET {server.url} HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
+    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\nContent-Length: {len(inner)}\r\n\r\n".encode()
+    with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as connection:
+        connection.sendall(head + inner)
+        said = bytearray()
+        with contextlib.suppress(ConnectionResetError):  # what was not read is answered by a reset
+            while data := connection.recv(4096):
+                said += data
+    assert said.count(b"HTTP/1.1 ") == 1
+
+
+def test_a_container_of_no_bytes(server: PageServer) -> None:
+    server.source = _Failing(0)
+    server.source.size = 0
+    assert get(server, "surface.lode").content == b""

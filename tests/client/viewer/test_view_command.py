@@ -78,6 +78,26 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, container: Path
 
 
 @pytest.mark.usefixtures("built")
+def test_a_folder_that_was_interrupted_is_written_again(
+    tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, source, pages = tmp_path / "out", FileSource(container), page.assets()
+
+    def interrupted(done: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_static(out, pages, source, interrupted)
+    assert not (out / page.INDEX).exists()
+    with monkeypatch.context() as patched:
+        patched.setattr("lodestream_client.viewer.static.shutil.copyfile", lambda *_: interrupted(1))
+        with pytest.raises(KeyboardInterrupt):
+            write_static(out, pages, source)
+    write_static(out, pages, source)
+    assert (out / page.INDEX).is_file()
+
+
+@pytest.mark.usefixtures("built")
 def test_other_files_are_encoded_first(tmp_path: Path) -> None:
     np.save(tmp_path / "hills.npy", HILLS)
     assert main(["view", str(tmp_path / "hills.npy"), "--name", "my hills", "--static", str(tmp_path / "out")]) == 0
@@ -146,11 +166,26 @@ def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Pat
     assert (tmp_path / "out" / "surface.lode").read_bytes() == container.read_bytes()
 
 
-def test_a_file_that_has_become_shorter(container: Path) -> None:
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_file_that_has_changed(container: Path, replace: bool) -> None:
     source = FileSource(container)
-    container.write_bytes(b"")
-    with pytest.raises(ls.CorruptStreamError, match="got fewer"):
+    other = container.with_suffix(".new") if replace else container
+    other.write_bytes(bytes(source.size))
+    os.utime(other, ns=(1, 1))
+    other.replace(container)
+    with pytest.raises(ls.LodestreamError, match="has changed"):
         source.read(0, 10)
+
+
+def test_a_container_of_another_host_that_has_changed(tmp_path: Path, container: Path) -> None:
+    with ranged(tmp_path) as host:
+        source = RemoteSource(f"{host.url}/{container.name}", None)
+        try:
+            container.write_bytes(bytes(source.size))
+            with pytest.raises(ls.RemoteError, match="got another"):
+                source.read(0, 10)
+        finally:
+            source.close()
 
 
 @pytest.fixture

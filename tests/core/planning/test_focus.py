@@ -334,13 +334,13 @@ def test_the_work_of_a_plan_grows_as_what_it_is_made_of(target: ls.Target) -> No
     for count in (MAX_HELD // 8, MAX_HELD):
         server = Sender(found, sha256)
         server.receive(serialize(Open(target, held=crumbs("floats", count), container=sha256)))
-        assert server.pieces == count + len(found.segments)
+        assert server.plan_size == count + len(found.segments)
         while server.next_message() is not None:
             pass
         opening = steps_of(lambda server=server: plan(found, target, server.cached))  # type: ignore[misc]
         turning = steps_of(lambda server=server: plan(found, replace(target, first=NEAR), server.cached))  # type: ignore[misc]
-        assert opening < 14 * server.pieces
-        assert turning < 29 * server.pieces
+        assert opening < 14 * server.plan_size
+        assert turning < 29 * server.plan_size
 
 
 def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
@@ -410,7 +410,7 @@ def test_what_is_sent_again_and_again_is_remembered_once() -> None:
     data = container("integers")
     name = hashlib.sha256(data).hexdigest()
     server = Sender(index("integers"), name)
-    chunks = []
+    sizes = []
     for _ in range(5):
         server.receive(serialize(Open(ls.Target(order="level"), 20_000, container=name)))
         wanted: ByteRange | None = None
@@ -420,9 +420,9 @@ def test_what_is_sent_again_and_again_is_remembered_once() -> None:
                 wanted = None
         server.receive(serialize(Stop()))
         assert parse(server.next_message() or b"") == End("stopped")
-        chunks.append(server.pieces)
+        sizes.append(server.plan_size)
     assert server.sent == 5 * 20_000
-    assert len(set(chunks)) == 1
+    assert len(set(sizes)) == 1
 
 
 def test_a_focus_after_the_end_does_nothing() -> None:

@@ -1,10 +1,10 @@
-/** The part of a header that says how blocks are cut into parts and curves (docs/format.md, section 3.1). */
+/** The part of a header that says how blocks are cut into patches and interfaces (docs/format.md, section 3.1). */
 import { CorruptStreamError } from "../errors";
-import { type Arrangement, type Curve, covers, type Part, type Side } from "../grid/multiblock";
+import { type Arrangement, covers, type Interface, type Patch, type Side } from "../grid/multiblock";
 import type { Closed, Shape, Span } from "../types";
 import { type FieldReader, LARGEST } from "./fields";
 
-const MOST_PARTS = 1 << 16;
+const MOST_PATCHES = 1 << 16;
 
 /** A block's rows and columns, and which of its axes wrap. */
 export interface BlockShape {
@@ -12,7 +12,7 @@ export interface BlockShape {
   readonly closed: Closed;
 }
 
-/** Blocks, curves and parts; checks that parts cover the blocks and fit their curves. */
+/** Blocks, interfaces and patches; checks that patches cover the blocks and fit their interfaces. */
 export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; arrangement: Arrangement } {
   const start = fields.at;
   const blocks: BlockShape[] = [];
@@ -26,31 +26,31 @@ export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; a
     }
     blocks.push({ shape, closed: [(flags & 1) !== 0, (flags & 2) !== 0] });
   }
-  const curves: Curve[] = [];
+  const interfaces: Interface[] = [];
   for (let left = countOf(fields, 0); left > 0; left--) {
     const number = fields.varint();
-    curves.push({ length: Math.floor(number / 4), closed: number % 2 === 1, stops: number % 4 >= 2 });
+    interfaces.push({ length: Math.floor(number / 4), closed: number % 2 === 1, stops: number % 4 >= 2 });
   }
-  const parts: Part[] = [];
-  for (let left = countOf(fields, 1); left > 0; left--) parts.push(parsePart(fields, blocks, curves));
-  const used = new Set(parts.flatMap((part) => part.sides.flatMap((side) => (side ? [side.curve] : []))));
-  if (used.size !== curves.length) {
-    const others = curves.length - used.size;
-    throw new CorruptStreamError(`expected curves that are sides of parts, got ${others} others`, start);
+  const patches: Patch[] = [];
+  for (let left = countOf(fields, 1); left > 0; left--) patches.push(parsePatch(fields, blocks, interfaces));
+  const used = new Set(patches.flatMap((patch) => patch.sides.flatMap((side) => (side ? [side.interface] : []))));
+  if (used.size !== interfaces.length) {
+    const others = interfaces.length - used.size;
+    throw new CorruptStreamError(`expected interfaces that are sides of patches, got ${others} others`, start);
   }
-  const own: Part[][] = blocks.map(() => []);
-  for (const part of parts) own[part.block]!.push(part);
+  const own: Patch[][] = blocks.map(() => []);
+  for (const patch of patches) own[patch.block]!.push(patch);
   blocks.forEach(({ shape, closed }, number) => {
     if (!covers(shape, closed, own[number]!)) {
-      throw new CorruptStreamError(`expected parts that cover block ${number} once, got others`, start);
+      throw new CorruptStreamError(`expected patches that cover block ${number} once, got others`, start);
     }
   });
-  return { blocks, arrangement: { parts, curves } };
+  return { blocks, arrangement: { patches, interfaces } };
 }
 
 function countOf(fields: FieldReader, least: number): number {
   const start = fields.at;
-  const count = fields.varint(MOST_PARTS);
+  const count = fields.varint(MOST_PATCHES);
   // Each takes a byte at least: nothing is made that was not sent.
   if (count < least || count > fields.data.length) {
     throw new CorruptStreamError(`expected ${least} to ${fields.data.length} of them, got ${count}`, start);
@@ -58,7 +58,7 @@ function countOf(fields: FieldReader, least: number): number {
   return count;
 }
 
-function parsePart(fields: FieldReader, blocks: readonly BlockShape[], curves: readonly Curve[]): Part {
+function parsePatch(fields: FieldReader, blocks: readonly BlockShape[], interfaces: readonly Interface[]): Patch {
   const start = fields.at;
   const block = fields.varint(blocks.length - 1);
   const flags = fields.byte();
@@ -76,23 +76,23 @@ function parsePart(fields: FieldReader, blocks: readonly BlockShape[], curves: r
   const stops = [(flags & 16) !== 0, (flags & 32) !== 0] as const;
   const sides = ([0, 1, 2, 3] as const).map((number): Side | null => {
     if (!(ends & (16 << number))) return null;
-    const value = fields.varint(2 * MOST_PARTS);
-    const side = { curve: value >> 1, reversed: value % 2 === 1 };
+    const value = fields.varint(2 * MOST_PATCHES);
+    const side = { interface: value >> 1, reversed: value % 2 === 1 };
     const along = number < 2 ? 1 : 0;
-    const curve = curves[side.curve];
+    const shared = interfaces[side.interface];
     const length = lengths[number < 2 ? 0 : 1];
-    const pole = curve?.length === 1;
-    const same = curve?.length === length && curve.closed === closed[along] && curve.stops === stops[along];
+    const pole = shared?.length === 1;
+    const same = shared?.length === length && shared.closed === closed[along] && shared.stops === stops[along];
     if (!(pole || same) || closed[1 - along] || !(ends & (1 << number))) {
-      const got = curve ? `one of ${curve.length}` : "none";
-      throw new CorruptStreamError(`expected a curve of ${length} points at a clamped side, got ${got}`, start);
+      const got = shared ? `one of ${shared.length}` : "none";
+      throw new CorruptStreamError(`expected an interface of ${length} points at a clamped side, got ${got}`, start);
     }
     return side;
   });
   const [top, bottom, left, right] = sides as [Side | null, Side | null, Side | null, Side | null];
   const wraps = [whole[0] && lengths[1] === shape[0], whole[1] && lengths[0] === shape[1]];
   if (flags > 127 || Math.min(...lengths) < 1 || (closed[0] && !wraps[0]) || (closed[1] && !wraps[1])) {
-    throw new CorruptStreamError(`expected a part of a block of ${shape[0]} x ${shape[1]}, got another`, start);
+    throw new CorruptStreamError(`expected a patch of a block of ${shape[0]} x ${shape[1]}, got another`, start);
   }
   return {
     block,

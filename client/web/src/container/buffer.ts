@@ -1,4 +1,4 @@
-/** Bytes that arrive in chunks and are taken from the front. */
+/** Bytes that arrive little by little and are taken from the front. */
 export class ByteBuffer {
   #bytes = new Uint8Array(1024);
   #start = 0;
@@ -10,17 +10,17 @@ export class ByteBuffer {
   }
 
   /** Add bytes at the end; they are copied. */
-  append(chunk: Uint8Array): void {
-    if (this.#end + chunk.length > this.#bytes.length) {
-      const length = this.length + chunk.length;
+  append(data: Uint8Array): void {
+    if (this.#end + data.length > this.#bytes.length) {
+      const length = this.length + data.length;
       const room = length > this.#bytes.length / 2 ? new Uint8Array(2 * length) : this.#bytes;
       room.set(this.#bytes.subarray(this.#start, this.#end));
       this.#bytes = room;
       this.#end = this.length;
       this.#start = 0;
     }
-    this.#bytes.set(chunk, this.#end);
-    this.#end += chunk.length;
+    this.#bytes.set(data, this.#end);
+    this.#end += data.length;
   }
 
   /** The first bytes, at most so many: a view that is valid until the next call. */

@@ -12,10 +12,10 @@ export const BYTES_PER_VERTEX = 128;
 
 // In any case: headers, metadata, the tables of small surfaces.
 const LEAST = 16 * 1024 * 1024;
-/** WebAssembly addresses 4 GiB; what is there already and what pictures take in between needs room too. */
+/** WebAssembly addresses 4 GiB; what is there already and what reconstructions take in between needs room too. */
 const DEFAULT_BYTES = 3 * 1024 ** 3;
 
-const [COEFFICIENT, PICTURE, MASKS, TABLE] = [7, 16, 4, 2048];
+const [COEFFICIENT, RECONSTRUCTION, MASKS, TABLE] = [7, 16, 4, 2048];
 const EDGE = 12; // rows or columns
 
 /** Rows and columns of a grid, and the bytes of a number in each of its channels. */
@@ -50,7 +50,7 @@ export class Capacity {
     for (const { shape, sizes } of grids) {
       const edges = (1 + EDGE / shape[0]) * (1 + EDGE / shape[1]);
       let each = 0;
-      for (const size of sizes) each += PICTURE + 2 * size + COEFFICIENT * edges;
+      for (const size of sizes) each += RECONSTRUCTION + 2 * size + COEFFICIENT * edges;
       needed += Math.floor(shape[0] * shape[1] * each);
     }
     if (needed > this.bytes) {

@@ -1,9 +1,9 @@
-/** The pieces of an exactness section: one for each channel in each window of each block (docs/format.md, section 9). */
+/** The chunks of a residual section: one for each channel in each window of each block (docs/format.md, section 9). */
 import type { Span } from "../types";
 import type { Header } from "./header";
 
-/** A piece's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept. */
-export interface PieceWindow {
+/** A chunk's channel and place: rows and columns, half-open, of a block; whether it is of holes that are kept. */
+export interface ChunkPlace {
   readonly channel: number;
   readonly block: number;
   readonly rows: Span;
@@ -11,9 +11,9 @@ export interface PieceWindow {
   readonly kept: boolean;
 }
 
-/** All pieces in the order of the file: block by block, row by row of windows, channel by channel. */
-export function* pieceWindows(header: Header): Generator<PieceWindow> {
-  const [height, width] = [2 ** header.piece[0], 2 ** header.piece[1]];
+/** All chunks in the order of the file: block by block, row by row of windows, channel by channel. */
+export function* chunkPlaces(header: Header): Generator<ChunkPlace> {
+  const [height, width] = [2 ** header.chunk[0], 2 ** header.chunk[1]];
   for (const [block, { shape }] of header.blocks.entries()) {
     for (const kept of header.masks.kept[block] ? [false, true] : [false]) {
       for (let top = 0; top < shape[0]; top += height) {
@@ -27,12 +27,12 @@ export function* pieceWindows(header: Header): Generator<PieceWindow> {
   }
 }
 
-/** How many windows there are, each with a piece for every channel; those of kept holes count for themselves. */
+/** How many windows there are, each with a chunk for every channel; those of kept holes count for themselves. */
 export function countWindows(header: Header): number {
   let count = 0;
   for (const [block, { shape }] of header.blocks.entries()) {
-    const down = Math.ceil(shape[0] / 2 ** header.piece[0]);
-    const across = Math.ceil(shape[1] / 2 ** header.piece[1]);
+    const down = Math.ceil(shape[0] / 2 ** header.chunk[0]);
+    const across = Math.ceil(shape[1] / 2 ** header.chunk[1]);
     count += down * across * (header.masks.kept[block] ? 2 : 1);
   }
   return count;

@@ -48,7 +48,7 @@ export function crc32(data: Uint8Array, before = 0): number {
   return ~crc >>> 0;
 }
 
-/** What tells that a segment or a piece by itself is whole: the lower half of its CRC-32. */
+/** What tells that a segment or a chunk by itself is whole: the lower half of its CRC-32. */
 export function checkOf(data: Uint8Array): number {
   return crc32(data) & 0xffff;
 }

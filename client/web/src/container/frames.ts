@@ -1,4 +1,4 @@
-/** A container as it arrives: sections out of any chunking of its bytes, each checked before it is handed on. */
+/** A container as it arrives: sections however its bytes are cut, each checked before it is handed on. */
 import { CorruptStreamError, UnsupportedVersionError } from "../errors";
 import { ByteBuffer } from "./buffer";
 import { crc32 } from "./crc";
@@ -46,8 +46,8 @@ export class FrameReader {
    * Throws `CorruptStreamError` where the bytes are no container, or a section fails its CRC; `UnsupportedVersionError`
    * where the container is of another version, or a section that must be understood is not known.
    */
-  *feed(chunk: Uint8Array): Generator<Frame> {
-    this.#data.append(chunk);
+  *feed(data: Uint8Array): Generator<Frame> {
+    this.#data.append(data);
     while (!this.ended) {
       const frame = this.#next();
       if (frame === null) return;

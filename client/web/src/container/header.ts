@@ -1,9 +1,9 @@
 /** The header section, and the masks that may follow it (docs/format.md, sections 3 and 3.3). */
 import { CorruptStreamError, TooLargeError } from "../errors";
 import { Layout, plainGrid } from "../grid/layout";
-import { type Arrangement, gridsOf, type Part, wholePart } from "../grid/multiblock";
+import { type Arrangement, gridsOf, type Patch, wholePatch } from "../grid/multiblock";
 import { levelShapes } from "../grid/patches";
-import { CURVES, fittedSteps, Predictors } from "../transform/predictors";
+import { fittedSteps, INTERFACES, Predictors } from "../transform/predictors";
 import { type AttributeKind, type Closed, DTYPES, type DType, type Lattice, type Shape } from "../types";
 import { type BlockShape, parseArrangement } from "./arrangement";
 import { parseCodecs } from "./codecs";
@@ -14,7 +14,7 @@ import { KIND } from "./sections";
 
 /** Most rows or columns of a block that kernels take. */
 const LONGEST_AXIS = 2 ** 31 - 1;
-/** Rows of a tile, or of a piece of exactness, times columns, as exponents of two. */
+/** Rows of a tile, or of a chunk of the residual, times columns, as exponents of two. */
 const [LEAST_BITS, MOST_BITS] = [8, 16];
 const MOST_BASE = 2 ** 24 - 1;
 
@@ -33,7 +33,7 @@ interface Fields {
   readonly extent: number;
   readonly empty: readonly number[];
   readonly tile: Exponents;
-  readonly piece: Exponents;
+  readonly chunk: Exponents;
   readonly large: number;
   readonly exact: boolean;
   readonly corrected: boolean;
@@ -94,13 +94,13 @@ export class Header {
   readonly empty: readonly number[];
   /** Of a tile, in coefficients of one band. */
   readonly tile: Exponents;
-  /** Of a piece of exactness, in points. */
-  readonly piece: Exponents;
+  /** Of a chunk of the residual, in points. */
+  readonly chunk: Exponents;
   /** The coarsest level whose units are large; 0: none are. */
   readonly large: number;
   /** The complete stream restores every value bit for bit. */
   readonly exact: boolean;
-  /** An exactness section follows the layers. */
+  /** A residual section follows the layers. */
   readonly corrected: boolean;
   readonly layerCount: number;
   readonly codecs: readonly number[];
@@ -132,7 +132,7 @@ export class Header {
     this.extent = fields.extent;
     this.empty = fields.empty;
     this.tile = fields.tile;
-    this.piece = fields.piece;
+    this.chunk = fields.chunk;
     this.large = fields.large;
     this.exact = fields.exact;
     this.corrected = fields.corrected;
@@ -191,22 +191,22 @@ export class Header {
     return [...own, ...others];
   }
 
-  /** What is coded as a grid each, curves apart. */
-  get parts(): readonly Part[] {
-    return this.arrangement?.parts ?? [wholePart(0, this.shape, this.closed)];
+  /** What is coded as a grid each, interfaces apart. */
+  get patches(): readonly Patch[] {
+    return this.arrangement?.patches ?? [wholePatch(0, this.shape, this.closed)];
   }
 
   /** Rows and columns of a level of the only block; null where there are several. */
   levelShape(level: number): Shape | null {
-    return this.blocks.length > 1 ? null : levelShapes(this.parts, this.layout, level, [this.shape])[0]!;
+    return this.blocks.length > 1 ? null : levelShapes(this.patches, this.layout, level, [this.shape])[0]!;
   }
 
-  /** About how many tiles and pieces all channels have, and blocks: told without laying them out. */
+  /** About how many tiles and chunks all channels have, and blocks: told without laying them out. */
   get tables(): number {
     const tiles = countRectangles(this.blocks, this.tile);
     const kept = this.masks.kept.some((count) => count > 0);
-    const pieces = this.corrected ? countRectangles(this.blocks, this.piece) * (kept ? 2 : 1) : 0;
-    return (16 + this.blocks.length + 2 * tiles + pieces) * this.channels;
+    const chunks = this.corrected ? countRectangles(this.blocks, this.chunk) * (kept ? 2 : 1) : 0;
+    return (16 + this.blocks.length + 2 * tiles + chunks) * this.channels;
   }
 }
 
@@ -223,7 +223,7 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
   const pointChannels = fields.varint(2 ** 16);
   const layerCount = fields.varint();
   const tile = exponentsOf(fields.byte());
-  const piece = exponentsOf(fields.byte());
+  const chunk = exponentsOf(fields.byte());
   const large = fields.byte();
   const base = fields.varint(MOST_BASE);
   const extent = fields.number();
@@ -252,7 +252,7 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
     throw new TooLargeError(`expected at most ${LONGEST_AXIS} rows and columns of a block, got ${longest}`);
   }
   checkExponents("tiles", tile, blocks, points, offset);
-  checkExponents("pieces", piece, blocks, points, offset);
+  checkExponents("chunks", chunk, blocks, points, offset);
   if (!(Number.isFinite(extent) && extent >= 0)) {
     throw new CorruptStreamError(`expected an extent of 0 or more, got ${extent}`, offset);
   }
@@ -275,7 +275,7 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
     extent,
     empty,
     tile,
-    piece,
+    chunk,
     large,
     exact: (flags & 8) !== 0,
     corrected: (flags & 16) !== 0,
@@ -335,7 +335,7 @@ function parsePredictors(
   const found: Predictors[] = [];
   let wrong = false;
   for (let channel = 0; channel < channels; channel++) {
-    const own = fitted.filter((step) => step.axis < CURVES || channel < geometric);
+    const own = fitted.filter((step) => step.axis < INTERFACES || channel < geometric);
     const predictors = new Predictors(layout.levels);
     const start = fields.at;
     const count = fields.varint();

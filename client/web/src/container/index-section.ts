@@ -1,12 +1,12 @@
 /**
- * The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and pieces
+ * The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and chunks
  * (docs/format.md, section 11).
  *
- * A page tells of a run of tiles, or of windows of exactness, and needs no other to be understood.
+ * A page tells of a run of tiles, or of windows of the residual, and needs no other to be understood.
  */
 import { CorruptStreamError } from "../errors";
 import { COEFFICIENT_BITS } from "../transform/predictors";
-import type { ByteRange, Errors, LayerRecord, OptionalSection, Piece, Segment } from "../types";
+import type { ByteRange, Chunk, Errors, LayerRecord, OptionalSection, Segment } from "../types";
 import { countWindows } from "./chunks";
 import { crc32 } from "./crc";
 import { FieldReader } from "./fields";
@@ -15,7 +15,7 @@ import type { Header } from "./header";
 import { Index } from "./model";
 import { checkMetadataLength, FOOTER_LENGTH, OPTIONAL, sectionStart } from "./sections";
 
-/** Tiles, or windows of exactness, that a page tells of. */
+/** Tiles, or windows of the residual, that a page tells of. */
 export const PAGE = 256;
 // In the first byte of an entry: passes - 1 and layers skipped from which on more bytes tell the rest.
 const [MOST_PASSES, MOST_SKIP] = [7, 31];
@@ -28,15 +28,15 @@ export interface PagePlace {
   readonly told: number;
 }
 
-/** What the root tells; of segments and pieces it names the pages only. `index` is the place of pages and root. */
+/** What the root tells; of segments and chunks it names the pages only. `index` is the place of pages and root. */
 export interface Root {
   readonly layers: readonly { readonly range: ByteRange; readonly errors: Errors }[];
   readonly levels: readonly Errors[];
-  readonly exactness: ByteRange | null;
+  readonly residual: ByteRange | null;
   readonly metadata: ByteRange;
   readonly optional: readonly OptionalSection[];
   readonly segmentPages: readonly PagePlace[];
-  readonly piecePages: readonly PagePlace[];
+  readonly chunkPages: readonly PagePlace[];
   readonly index: ByteRange;
 }
 
@@ -54,7 +54,7 @@ export function parseRoot(frame: Frame, header: Header): Root {
   const levels: Errors[] = [];
   for (let left = fields.varint(most); left > 0; left--) levels.push(fields.errors(header.channels));
   const start = fields.varint();
-  const exactness = fields.varint();
+  const residual = fields.varint();
   const said = fields.at;
   const metadataLength = fields.varint();
   checkMetadataLength(metadataLength, said, true);
@@ -65,7 +65,7 @@ export function parseRoot(frame: Frame, header: Header): Root {
 
   const places = new Places(start, optional);
   const layers = lengths.map(({ length, errors }) => ({ range: places.next(length), errors }));
-  const exact = exactness ? places.next(exactness) : null;
+  const exact = residual ? places.next(residual) : null;
   const metadata = places.next(metadataLength);
   const pages = places.end();
   const agree = layers.length === header.layerCount && levels.length === header.levels + 1;
@@ -92,11 +92,11 @@ export function parseRoot(frame: Frame, header: Header): Root {
   return {
     layers,
     levels,
-    exactness: exact,
+    residual: exact,
     metadata,
     optional,
     segmentPages: found[0]!,
-    piecePages: found[1]!,
+    chunkPages: found[1]!,
     index: { offset: pages, length: frame.end - pages },
   };
 }
@@ -119,8 +119,8 @@ export function parseIndex(pages: Frame, root: Frame, header: Header): Index {
     layers,
     levelErrors: told.levels,
     segments: segments.flat(),
-    exactness: told.exactness,
-    pieces: told.exactness ? parsePieceList(pagesOf(pages, told.piecePages), header, told.exactness) : [],
+    residual: told.residual,
+    chunks: told.residual ? parseChunkList(pagesOf(pages, told.chunkPages), header, told.residual) : [],
     metadata: told.metadata,
     index: told.index,
     size: root.end + FOOTER_LENGTH,
@@ -274,22 +274,22 @@ function parseUnits(
   if (unit > units) throw new CorruptStreamError(`expected ${units} units, got ${unit}`, fields.at);
 }
 
-/** The pieces of the exactness section. */
-function parsePieceList(pages: readonly FieldReader[], header: Header, exactness: ByteRange): Piece[] {
+/** The chunks of the residual section. */
+function parseChunkList(pages: readonly FieldReader[], header: Header, residual: ByteRange): Chunk[] {
   const count = countWindows(header) * header.channels;
-  const found: Piece[] = [];
+  const found: Chunk[] = [];
   let at = -1;
-  const end = endOf(exactness) - CRC;
+  const end = endOf(residual) - CRC;
   for (const fields of pages) {
     const start = fields.at;
-    // Pieces fill the end of their section, before its CRC.
-    const first = end - fields.varint(exactness.length);
-    if (first < exactness.offset || (at !== -1 && at !== first)) {
-      throw new CorruptStreamError("expected pieces within their section, one after another, got others", start);
+    // Chunks fill the end of their section, before its CRC.
+    const first = end - fields.varint(residual.length);
+    if (first < residual.offset || (at !== -1 && at !== first)) {
+      throw new CorruptStreamError("expected chunks within their section, one after another, got others", start);
     }
     at = first;
     for (let left = Math.min(PAGE * header.channels, count - found.length); left > 0; left--) {
-      const length = fields.varint(exactness.length);
+      const length = fields.varint(residual.length);
       const check = length ? fields.u16() : 0;
       found.push({ range: { offset: at, length }, check });
       at += length;
@@ -297,7 +297,7 @@ function parsePieceList(pages: readonly FieldReader[], header: Header, exactness
     fields.end();
   }
   if (at !== end) {
-    throw new CorruptStreamError("expected pieces that fill their section, got others", exactness.offset);
+    throw new CorruptStreamError("expected chunks that fill their section, got others", residual.offset);
   }
   return found;
 }

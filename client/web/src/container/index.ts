@@ -1,18 +1,8 @@
 /** Bytes into frames, and the index of a complete container. */
 
-export {
-  checkWish,
-  restoredRegion,
-  type Selection,
-  select,
-  type Wish,
-  wishedChannels,
-  wishedTiles,
-} from "../planning/selection";
-export { readWindowErrors, type WindowErrors } from "../planning/window-errors";
 export type { BlockShape } from "./arrangement";
 export { Capacity } from "./capacity";
-export { countWindows, type PieceWindow, pieceWindows } from "./chunks";
+export { type ChunkPlace, chunkPlaces, countWindows } from "./chunks";
 export { checkOf, crc32 } from "./crc";
 export type { CoordinateRule, Plane } from "./extras";
 export { type Frame, FrameReader, indexExtent, sectionExtent } from "./frames";

@@ -1,4 +1,4 @@
-/** The payloads of layers and of the exactness section (docs/format.md, sections 6 and 9). */
+/** The payloads of layers and of the residual section (docs/format.md, sections 6 and 9). */
 import { CorruptStreamError } from "../errors";
 import { COEFFICIENT_BITS } from "../transform/predictors";
 import type { Errors } from "../types";
@@ -63,28 +63,28 @@ export function parseLayer(
   return { errors, entries, start: fields.place };
 }
 
-/** A piece's bytes and their place in the container. */
+/** A chunk's bytes and their place in the container. */
 export interface PlacedBytes {
   readonly data: Uint8Array;
   readonly offset: number;
 }
 
-/** The errors that an exactness section, which stands at `offset`, leaves, and its pieces. */
-export function parsePieces(
+/** The errors that a residual section, which stands at `offset`, leaves, and its chunks. */
+export function parseChunks(
   payload: Uint8Array,
   offset: number,
   header: Header,
-): { errors: Errors; pieces: PlacedBytes[] } {
+): { errors: Errors; chunks: PlacedBytes[] } {
   const fields = new FieldReader(payload, offset);
   const errors = fields.errors(header.channels);
   const lengths: number[] = [];
   for (let left = countWindows(header) * header.channels; left > 0; left--) {
     lengths.push(fields.varint(payload.length));
   }
-  const pieces = lengths.map((length): PlacedBytes => {
+  const chunks = lengths.map((length): PlacedBytes => {
     const at = fields.at;
     return { data: fields.take(length), offset: at };
   });
   fields.end();
-  return { errors, pieces };
+  return { errors, chunks };
 }

@@ -1,5 +1,5 @@
 /** Where everything lies in a complete container. */
-import type { ByteRange, Errors, LayerRecord, LevelRecord, OptionalSection, Piece, Segment } from "../types";
+import type { ByteRange, Chunk, Errors, LayerRecord, LevelRecord, OptionalSection, Segment } from "../types";
 import type { Header } from "./header";
 import type { Metadata } from "./sections";
 
@@ -8,8 +8,8 @@ interface Parsed {
   readonly layers: readonly LayerRecord[];
   readonly levelErrors: readonly Errors[];
   readonly segments: readonly Segment[];
-  readonly exactness: ByteRange | null;
-  readonly pieces: readonly Piece[];
+  readonly residual: ByteRange | null;
+  readonly chunks: readonly Chunk[];
   readonly metadata: ByteRange;
   readonly index: ByteRange;
   readonly size: number;
@@ -25,10 +25,10 @@ export class Index {
   readonly levels: readonly LevelRecord[];
   /** Layer by layer, in a layer by rising number of the unit: in file order. */
   readonly segments: readonly Segment[];
-  /** The section of exactness; null where the lattice alone is exact, or nothing is stored beyond it. */
-  readonly exactness: ByteRange | null;
-  /** In the order of `pieceWindows`. */
-  readonly pieces: readonly Piece[];
+  /** The residual section; null where the lattice alone is exact, or nothing is stored beyond it. */
+  readonly residual: ByteRange | null;
+  /** In the order of `chunkPlaces`. */
+  readonly chunks: readonly Chunk[];
   /** The section of metadata. */
   readonly metadata: ByteRange;
   /** The pages and the root. */
@@ -47,8 +47,8 @@ export class Index {
     this.header = parsed.header;
     this.layers = parsed.layers;
     this.segments = parsed.segments;
-    this.exactness = parsed.exactness;
-    this.pieces = parsed.pieces;
+    this.residual = parsed.residual;
+    this.chunks = parsed.chunks;
     this.metadata = parsed.metadata;
     this.index = parsed.index;
     this.size = parsed.size;
@@ -58,9 +58,9 @@ export class Index {
     this.levels = this.#levelRecords(parsed.levelErrors);
   }
 
-  /** The length of the prefix that holds header, layers and exactness: the complete surface. */
+  /** The length of the prefix that holds header, layers and residual: the complete surface. */
   get surfaceEnd(): number {
-    return this.exactness ? this.exactness.offset + this.exactness.length : this.layers.at(-1)!.end;
+    return this.residual ? this.residual.offset + this.residual.length : this.layers.at(-1)!.end;
   }
 
   /** The same index with metadata. */

@@ -67,15 +67,15 @@ export function* headerSteps(size: number, capacity?: Capacity): Generator<ByteR
   let wanted = FIRST_READ;
   for (let position = 0; position < size; wanted *= 2) {
     capacity?.take(Math.min(wanted, size - position));
-    const chunk = yield { offset: position, length: Math.min(wanted, size - position) };
-    for (const frame of reader.feed(chunk)) {
+    const data = yield { offset: position, length: Math.min(wanted, size - position) };
+    for (const frame of reader.feed(data)) {
       if (header === null) header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
       else if (frame.kind === KIND.masks || frame.kind === KIND.keptMasks) return parseMasks(header, frame);
       else throw new CorruptStreamError(`expected masks, got a section of kind ${frame.kind}`, frame.offset);
       if (!header.masked) return header;
     }
-    if (!chunk.length) break;
-    position += chunk.length;
+    if (!data.length) break;
+    position += data.length;
   }
   throw new TruncatedStreamError(`expected a container with a whole header, got ${size} bytes without`);
 }

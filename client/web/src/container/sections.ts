@@ -18,7 +18,7 @@ const EARLIER_MAGIC = Uint8Array.of(0x89, 0x4c, 0x4f, 0x44, 0x45, 0x0d, 0x0a);
 export const KIND = {
   header: 1,
   layer: 2,
-  exactness: 3,
+  residual: 3,
   metadata: 4,
   index: 5,
   masks: 6,

@@ -1,8 +1,8 @@
 /** Slices of a container whose index is known: which segments they complete, and which states those make. */
 
 import { CorruptStreamError } from "../errors";
-import type { Selection } from "../planning/selection";
-import type { Piece, Segment } from "../types";
+import type { SelectedSlices } from "../planning/selection";
+import type { Chunk, Segment } from "../types";
 import { ByteBuffer } from "./buffer";
 import { type Frame, wholeSection } from "./frames";
 import type { Index } from "./model";
@@ -16,22 +16,22 @@ export interface State {
   readonly rms: number;
   readonly maxError: number;
   readonly complete: boolean;
-  /** Nothing but exactness is missing. */
+  /** Nothing but the residual is missing. */
   readonly allPlanes: boolean;
   /** The level to which everything is there where levels come one after another, counted from the coarsest; else -1. */
   readonly wholeLevel: number;
-  /** Nothing but exactness is missing in the region that comes first. */
+  /** Nothing but the residual is missing in the region that comes first. */
   readonly wholeNear: boolean;
 }
 
-/** A segment, or a piece of exactness with its number, and its bytes. */
+/** A segment, or a chunk of the residual with its number, and its bytes. */
 export type Arrived =
   | { readonly segment: Segment; readonly data: Uint8Array }
-  | { readonly piece: Piece; readonly number: number; readonly data: Uint8Array };
+  | { readonly chunk: Chunk; readonly number: number; readonly data: Uint8Array };
 
-type Item = { readonly segment: Segment } | { readonly piece: Piece; readonly number: number };
+type Item = { readonly segment: Segment } | { readonly chunk: Chunk; readonly number: number };
 
-const rangeOf = (item: Item) => ("segment" in item ? item.segment : item.piece).range;
+const rangeOf = (item: Item) => ("segment" in item ? item.segment : item.chunk).range;
 const endOf = (item: Item) => rangeOf(item).offset + rangeOf(item).length;
 
 /** Bytes that follow each other, from `start` on. */
@@ -48,7 +48,7 @@ class Run {
   }
 }
 
-/** Collects bytes at their places and hands each segment and piece of exactness on once, when it is whole. */
+/** Collects bytes at their places and hands each segment and chunk of the residual on once, when it is whole. */
 export class Slices {
   readonly #index: Index;
   readonly #partial: boolean;
@@ -61,14 +61,14 @@ export class Slices {
   readonly #layerLevel: number[];
   readonly #byLayer: Groups;
   readonly #byLevel: Groups;
-  readonly #pieces: number;
+  readonly #chunks: number;
   // What is not whole yet: runs of bytes by the place where each goes on, several where the order has changed.
   readonly #runs = new Map<number, Run>();
   #run = new Run(0);
   #hasMetadata = false;
   #bytes: number;
   #inFile = false;
-  #held = 0;
+  #received = 0;
   #finest = 0;
   #corrected = 0;
   #nearTiles: Uint8Array | null = null;
@@ -76,18 +76,18 @@ export class Slices {
   #reached: number[] | null = null; // null while all comes in order
 
   /** `partial`: what is wanted is not the whole surface, so errors of states on the way are not known (NaN). */
-  constructor(index: Index, wanted: Selection, partial: boolean) {
+  constructor(index: Index, wanted: SelectedSlices, partial: boolean) {
     this.#index = index;
     this.#partial = partial;
     this.#whole = wanted.whole;
     this.#wanted = wanted.segments;
-    const pieces = [...wanted.pieces].map(([number, piece]): Item => ({ number, piece }));
-    const items: Item[] = [...wanted.segments.map((segment): Item => ({ segment })), ...pieces];
+    const chunks = [...wanted.chunks].map(([number, chunk]): Item => ({ number, chunk }));
+    const items: Item[] = [...wanted.segments.map((segment): Item => ({ segment })), ...chunks];
     this.#items = items.sort((a, b) => rangeOf(a).offset - rangeOf(b).offset);
     this.#starts = Float64Array.from(this.#items, (item) => rangeOf(item).offset);
     this.#seen = new Uint8Array(this.#items.length);
     this.#bytes = index.header.length;
-    this.#pieces = wanted.pieces.size;
+    this.#chunks = wanted.chunks.size;
     const { tiles } = index.header.layout;
     this.#levels = Int32Array.from(wanted.segments, (segment) => tiles[segment.tile]!.level);
     this.#layerLevel = index.layers.map(() => 0);
@@ -106,7 +106,7 @@ export class Slices {
 
   /**
    * Begin where a file was read in its order as far as a section that ends at `position`. All bytes of the surface count
-   * from there on, not only those of segments and pieces.
+   * from there on, not only those of segments and chunks.
    */
   continueFile(position: number): void {
     this.#inFile = true;
@@ -149,7 +149,7 @@ export class Slices {
     }
   }
 
-  /** Segments and pieces that are whole now, in the order of the file. */
+  /** Segments and chunks that are whole now, in the order of the file. */
   *items(): Generator<Arrived> {
     const { start, end } = this.#run;
     const first = lowerBound(this.#starts, start);
@@ -181,19 +181,19 @@ export class Slices {
     return this.state();
   }
 
-  /** Note a piece of exactness; the complete state, if everything is there. */
-  holdPiece(piece: Piece): State | null {
-    if (this.#held !== this.#wanted.length) {
-      throw new CorruptStreamError("expected all segments before exactness, got fewer", piece.range.offset);
+  /** Note a chunk of the residual; the complete state, if everything is there. */
+  holdChunk(chunk: Chunk): State | null {
+    if (this.#received !== this.#wanted.length) {
+      throw new CorruptStreamError("expected all segments before the residual, got fewer", chunk.range.offset);
     }
     this.#corrected++;
-    if (!this.#inFile) this.#bytes += piece.range.length;
-    if (this.#corrected < this.#pieces) return null;
-    const { exactness, pieces, layers } = this.#index;
-    if (this.#whole && !this.#inFile && exactness) {
+    if (!this.#inFile) this.#bytes += chunk.range.length;
+    if (this.#corrected < this.#chunks) return null;
+    const { residual, chunks, layers } = this.#index;
+    if (this.#whole && !this.#inFile && residual) {
       // With the frame of the section.
-      this.#bytes += exactness.length;
-      for (const { range } of pieces) this.#bytes -= range.length;
+      this.#bytes += residual.length;
+      for (const { range } of chunks) this.#bytes -= range.length;
     }
     return this.#end(layers.length);
   }
@@ -202,11 +202,11 @@ export class Slices {
   state(): State | null {
     const risen = this.#risen();
     const { layers, levels, header } = this.#index;
-    const layer = this.#byLayer.whole(this.#held);
+    const layer = this.#byLayer.whole(this.#received);
     if (layer !== null) {
       const record = layers[layer]!;
       const last = layer === layers.length - 1;
-      if (last && !this.#pieces) return this.#end(layer);
+      if (last && !this.#chunks) return this.#end(layer);
       const level = this.#layerLevel[layer]!;
       return {
         number: layer,
@@ -219,7 +219,7 @@ export class Slices {
         wholeNear: false,
       };
     }
-    const level = this.#byLevel.whole(this.#held);
+    const level = this.#byLevel.whole(this.#received);
     if (level !== null && level < header.levels && !this.#inFile) {
       return {
         number: level,
@@ -249,7 +249,7 @@ export class Slices {
 
   #count(segment: Segment): void {
     const level = this.#index.header.layout.tiles[segment.tile]!.level;
-    this.#held++;
+    this.#received++;
     this.#finest = Math.max(this.#finest, level);
     this.#byLayer.hold(segment.layer);
     this.#byLevel.hold(level);
@@ -323,7 +323,7 @@ function lowerBound(numbers: Float64Array, number: number): number {
   return low;
 }
 
-/** Segments by layer, or by level: when are the first groups whole, and nothing else held? */
+/** Segments by layer, or by level: when are the first groups whole, and nothing else received? */
 class Groups {
   readonly #missing: Int32Array;
   readonly #ends: Int32Array;
@@ -350,10 +350,10 @@ class Groups {
     this.#pass();
   }
 
-  /** The last of the groups that are whole, if these are all that is held. */
-  whole(held: number): number | null {
+  /** The last of the groups that are whole, if these are all that is received. */
+  whole(received: number): number | null {
     const last = this.#next - 1;
-    return last >= 0 && this.#ends[last] === held ? last : null;
+    return last >= 0 && this.#ends[last] === received ? last : null;
   }
 
   #pass(): void {

@@ -1,7 +1,7 @@
 /**
- * The picture of a window: of every level only what the window is made of, so that it costs what a window costs.
+ * The reconstruction of a window: of every level only what the window is made of, so that it costs what a window costs.
  *
- * From the finest level down, an axis is followed by the samples that are wanted, see `grid/reach`. The nodes and details
+ * From the finest level down, an axis is followed by the samples that are wanted, see `grid/support`. The nodes and details
  * that give them back are one stretch of the axis. It is stepped like an axis of its own: where it ends inside the
  * surface, what lies beyond would be extended wrongly, but nothing that is wanted looks there.
  */
@@ -74,7 +74,7 @@ type Taken = readonly [first: number, taken: number, nodes: number];
  * coordinates over two to the power of `fraction`. `state` has the passes that remain of each tile, 0 where nothing is
  * needed.
  */
-export function windowPicture(
+export function reconstructWindow(
   arena: Arena,
   header: Header,
   channel: number,
@@ -94,8 +94,8 @@ export function windowPicture(
     spans = [nodesOf(crop[0]), nodesOf(crop[1])];
   }
   const sizes = [spans[0][1] - spans[0][0], spans[1][1] - spans[1][0]] as const;
-  let picture = allocatePlane(arena, sizes);
-  putLevel(arena, tiles, 0, state, false, picture, [
+  let reconstructed = allocatePlane(arena, sizes);
+  putLevel(arena, tiles, 0, state, false, reconstructed, [
     [spans[0][0], sizes[0], 0],
     [spans[1][0], sizes[1], 0],
   ]);
@@ -106,7 +106,7 @@ export function windowPicture(
     const steps = [crop[0].step, crop[1].step] as const;
     const canvas = allocatePlane(arena, [steps[0].length, steps[1].length]);
     const nodes = corner(canvas, [steps[0].coarse, steps[1].coarse]);
-    copyPlane(arena, picture, nodes);
+    copyPlane(arena, reconstructed, nodes);
     if (level === whole + 1) toEighths(arena, nodes);
     const full = layout.steps(0, level);
     putLevel(arena, tiles, level, state, level > whole, canvas, [
@@ -119,9 +119,9 @@ export function windowPicture(
     }
     const [[top, bottom], [left, right]] = wanted;
     const address = canvas.address + 4 * (crop[0].start * canvas.pitch + crop[1].start);
-    picture = { address, rows: bottom - top, columns: right - left, pitch: canvas.pitch };
+    reconstructed = { address, rows: bottom - top, columns: right - left, pitch: canvas.pitch };
   }
-  return { plane: picture, fraction: whole < layout.levels ? FRACTION_BITS : 0 };
+  return { plane: reconstructed, fraction: whole < layout.levels ? FRACTION_BITS : 0 };
 }
 
 /** Copy a plane into the first rows and columns of another. */
@@ -155,10 +155,10 @@ function putLevel(
         const shape = [band.rows[1] - band.rows[0], band.columns[1] - band.columns[0]] as const;
         const own = allocatePlane(arena, shape);
         const numbers = [table.first[number]! + k];
-        tiles.spread(numbers, state, finer ? 0 : table.layout.tiles.length, own, band.rows[0], band.columns[0]);
+        tiles.dequantize(numbers, state, finer ? 0 : table.layout.tiles.length, own, band.rows[0], band.columns[0]);
         const address = own.address + 4 * (down.skip * own.pitch + across.skip);
-        const part = { address, rows: down.stop - down.start, columns: across.stop - across.start, pitch: own.pitch };
-        copyPlane(arena, part, canvas, down.start, across.start);
+        const plane = { address, rows: down.stop - down.start, columns: across.stop - across.start, pitch: own.pitch };
+        copyPlane(arena, plane, canvas, down.start, across.start);
       });
     }
   }

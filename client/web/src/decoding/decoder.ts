@@ -5,14 +5,14 @@ import { checkOf } from "../container/crc";
 import { type Frame, FrameReader, indexExtent, sectionExtent } from "../container/frames";
 import { type Header, parseHeader, parseMasks } from "../container/header";
 import { parseIndex } from "../container/index-section";
-import { parseLayer, parsePieces } from "../container/layers";
+import { parseChunks, parseLayer } from "../container/layers";
 import type { Index } from "../container/model";
 import { INDEX_GROWTH, indexFrom, readMetadata, takeDigest } from "../container/reader";
 import { FOOTER_LENGTH, KIND, type Metadata, parseFooter, parseMetadata } from "../container/sections";
 import { Slices, type State } from "../container/slices";
 import { UNANNOUNCED } from "../entropy/tiles";
 import { CorruptStreamError, TruncatedStreamError } from "../errors";
-import { checkSize, checkWish, select, type Wish, wishedTiles } from "../planning/selection";
+import { checkSelection, checkSize, type Selection, select, selectedTiles } from "../planning/selection";
 import type { Region, Surface } from "../types";
 import { Progress } from "./progress";
 import { type Coded, Reconstruction } from "./reconstruction";
@@ -22,7 +22,7 @@ import { type Shared, View } from "./view";
 const ENTRY = 256;
 
 /** What a decoder may be asked for. */
-export interface DecoderOptions extends Wish {
+export interface DecoderOptions extends Selection {
   /** Limit on the memory of the surface, see `Capacity`. */
   readonly maxVertices?: number | null;
   /** The finest level that the caller will use; only memory for it is then counted. */
@@ -38,7 +38,7 @@ interface Begun {
 }
 
 /**
- * Decodes a container piece by piece, and gives a `View` for each state whose errors are known.
+ * Decodes a container as its bytes come, and gives a `View` for each state whose errors are known.
  *
  * `feed` takes the bytes in file order; `feedAt` takes slices in the order of a plan. Damage throws `CorruptStreamError`
  * with its offset; everything before it stays usable. Bytes are copied: callers may reuse their buffers.
@@ -49,7 +49,7 @@ export class Decoder {
   /** How much memory may be taken. */
   readonly capacity: Capacity;
   readonly #module: WebAssembly.Module;
-  readonly #wish: Wish;
+  readonly #selection: Selection;
   readonly #finest: number | undefined;
   readonly #frames = new FrameReader();
   readonly #values: Metadata = {};
@@ -71,7 +71,7 @@ export class Decoder {
   /** `module` is that of `loadKernels`. */
   constructor(module: WebAssembly.Module, options: DecoderOptions = {}) {
     this.#module = module;
-    this.#wish = { region: options.region, attributes: options.attributes };
+    this.#selection = { region: options.region, attributes: options.attributes };
     this.#finest = options.level;
     this.capacity = new Capacity(options.maxVertices);
   }
@@ -96,39 +96,39 @@ export class Decoder {
     return this.layers.at(-1)?.complete ?? false;
   }
 
-  /** Bytes received of header, layers and exactness; 0 before the first layer is complete. */
+  /** Bytes received of header, layers and residual; 0 before the first layer is complete. */
   get bytes(): number {
     return this.layers.at(-1)?.bytes ?? 0;
   }
 
   /** Decode the next bytes of the file; returns the views that they complete. The layers before damage stay usable. */
-  feed(chunk: Uint8Array): View[] {
+  feed(data: Uint8Array): View[] {
     const before = this.layers.length;
-    this.capacity.take(chunk.length);
-    this.#feed(chunk);
+    this.capacity.take(data.length);
+    this.#feed(data);
     return this.layers.slice(before);
   }
 
   /**
    * Decode a slice of the container that starts at `offset`; returns the views that it completes. Slices must come in the
-   * order of a plan. They may be cut into pieces of any size.
+   * order of a plan. They may be cut anywhere.
    */
-  feedAt(offset: number, chunk: Uint8Array): View[] {
+  feedAt(offset: number, data: Uint8Array): View[] {
     const before = this.layers.length;
-    this.capacity.take(chunk.length);
+    this.capacity.take(data.length);
     if (this.#slices !== null) {
-      this.#takeSlice(this.#slices, offset, chunk);
+      this.#takeSlice(this.#slices, offset, data);
     } else if (offset === this.#frames.position + this.#frames.pending) {
-      this.#feed(chunk);
+      this.#feed(data);
       if (this.#begun !== null) {
         const early = this.#early;
         this.#early = [];
         for (const { offset: place, data } of early) this.#takeLoose(place, data);
       }
     } else if (this.#begun === null) {
-      this.#early.push({ offset, data: chunk.slice() });
+      this.#early.push({ offset, data: data.slice() });
     } else {
-      this.#takeLoose(offset, chunk);
+      this.#takeLoose(offset, data);
     }
     return this.layers.slice(before);
   }
@@ -141,7 +141,7 @@ export class Decoder {
   focus(region: Region | null): void {
     this.#focus = region;
     this.#turned = true;
-    if (this.#header !== null && region !== null) checkWish({ region }, this.#header);
+    if (this.#header !== null && region !== null) checkSelection({ region }, this.#header);
     this.#followFocus();
   }
 
@@ -169,12 +169,12 @@ export class Decoder {
     return this.view().surface(level);
   }
 
-  #feed(chunk: Uint8Array): void {
+  #feed(data: Uint8Array): void {
     if (this.#frames.ended) {
-      this.#takeFooter(chunk);
+      this.#takeFooter(data);
       return;
     }
-    for (const frame of this.#frames.feed(chunk)) this.#take(frame);
+    for (const frame of this.#frames.feed(data)) this.#take(frame);
     if (this.#frames.ended) this.#takeFooter(this.#frames.rest());
   }
 
@@ -192,8 +192,8 @@ export class Decoder {
       throw new CorruptStreamError(`expected masks, got a section of kind ${kind}`, offset);
     } else if (kind === KIND.layer) {
       this.#takeLayer(frame, this.#begun);
-    } else if (kind === KIND.exactness) {
-      this.#takeExactness(frame, this.#begun);
+    } else if (kind === KIND.residual) {
+      this.#takeResidual(frame, this.#begun);
     } else if (kind === KIND.metadata) {
       this.#takeMetadata(parseMetadata(frame.payload, frame.payloadOffset));
     } else if (kind === KIND.pages) {
@@ -226,8 +226,8 @@ export class Decoder {
     if (this.#header !== null) throw new CorruptStreamError("expected one header, got a second", frame.offset);
     const header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
     this.#header = header;
-    checkWish(this.#wish, header);
-    checkSize(this.#wish, header, this.capacity, this.#finest);
+    checkSelection(this.#selection, header);
+    checkSize(this.#selection, header, this.capacity, this.#finest);
     if (!header.masked) this.#begin(header);
   }
 
@@ -235,7 +235,7 @@ export class Decoder {
     this.#header = header;
     this.#begun = {
       header,
-      wanted: wishedTiles(this.#wish, header),
+      wanted: selectedTiles(this.#selection, header),
       progress: new Progress(header),
       shared: {
         reconstruction: new Reconstruction(this.#module, header),
@@ -277,13 +277,13 @@ export class Decoder {
     });
   }
 
-  #takeExactness(frame: Frame, begun: Begun): void {
+  #takeResidual(frame: Frame, begun: Begun): void {
     const { header, shared } = begun;
     if (this.layers.length !== header.layerCount || !header.corrected) {
-      throw new CorruptStreamError("expected layers, got exactness", frame.offset);
+      throw new CorruptStreamError("expected layers, got a residual", frame.offset);
     }
-    const { errors, pieces } = parsePieces(frame.payload, frame.payloadOffset, header);
-    for (const [number, { data, offset }] of pieces.entries()) shared.reconstruction.correct(number, data, offset);
+    const { errors, chunks } = parseChunks(frame.payload, frame.payloadOffset, header);
+    for (const [number, { data, offset }] of chunks.entries()) shared.reconstruction.correct(number, data, offset);
     this.#show(begun, {
       number: this.layers.length,
       level: header.levels,
@@ -319,7 +319,7 @@ export class Decoder {
       if (near?.[tile] && state[unit] === UNANNOUNCED) state[unit] = 0;
       if (!wanted[tile]) state[unit] = 0; // what lies outside has no part in the window
     }
-    this.layers.push(new View(made, shared, { length: shared.reconstruction.length, state }, this.#wish));
+    this.layers.push(new View(made, shared, { length: shared.reconstruction.length, state }, this.#selection));
   }
 
   /** Bytes that do not continue the file and belong to a service section: the index or the metadata. */
@@ -348,7 +348,7 @@ export class Decoder {
     this.capacity.take(INDEX_GROWTH * data.length);
     const index = indexFrom(data, start, begun.header).withMetadata(this.#metadata ?? {}, this.#digest.value);
     this.#index = index;
-    const slices = new Slices(index, select(index, this.#wish), this.#wish.region !== undefined);
+    const slices = new Slices(index, select(index, this.#selection), this.#selection.region !== undefined);
     this.#slices = slices;
     if (this.layers.length || this.#frames.pending) {
       // The file was read in its own order so far, and is not any more.
@@ -367,7 +367,7 @@ export class Decoder {
 
   #followFocus(): void {
     if (!this.#turned || this.#slices === null || this.#header === null) return;
-    this.#near = this.#focus === null ? null : wishedTiles({ region: this.#focus }, this.#header);
+    this.#near = this.#focus === null ? null : selectedTiles({ region: this.#focus }, this.#header);
     this.#slices.focus(this.#near);
   }
 
@@ -376,14 +376,14 @@ export class Decoder {
     const { progress, shared } = begun;
     slices.add(offset, data);
     for (const item of slices.items()) {
-      const { range, check } = "segment" in item ? item.segment : item.piece;
+      const { range, check } = "segment" in item ? item.segment : item.chunk;
       if (checkOf(item.data) !== check) {
-        throw new CorruptStreamError("expected a segment or piece to match its CRC, got other bytes", range.offset);
+        throw new CorruptStreamError("expected a segment or chunk to match its CRC, got other bytes", range.offset);
       }
       let state: State | null;
-      if ("piece" in item) {
+      if ("chunk" in item) {
         shared.reconstruction.correct(item.number, item.data, range.offset);
-        state = slices.holdPiece(item.piece);
+        state = slices.holdChunk(item.chunk);
       } else {
         const { tile, channel, passes, top } = item.segment;
         const told = progress.isKnown(tile, channel) ? 0 : top;

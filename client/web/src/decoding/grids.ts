@@ -1,6 +1,6 @@
-/** Grids of blocks: values of one array, and how they are put together from the grids of parts. */
+/** Grids of blocks: values of one array, and how they are put together from the grids of patches. */
 import type { Header } from "../container/header";
-import { isWhole, levelPositions, type NumberedPart, partPositions } from "../grid/patches";
+import { isWhole, levelPositions, type NumberedPatch, patchPositions } from "../grid/patches";
 import { ARRAYS } from "../kernels/arena";
 import type { DType, Shape, Values } from "../types";
 import { holePattern, patternsOf, wordsOf } from "./bits";
@@ -72,18 +72,18 @@ export function cutGrid(grid: Grid, rows: readonly [number, number], columns: re
   return cut;
 }
 
-/** A block's grid of a level out of the grids of its parts, `own`; `grids` are those of all parts, as stored. */
+/** A block's grid of a level out of the grids of its patches, `own`; `grids` are those of all patches, as stored. */
 export function assemble(
   header: Header,
-  own: readonly NumberedPart[],
+  own: readonly NumberedPatch[],
   level: number,
   block: Shape,
   grids: readonly Grid[],
 ): Grid {
   const only = own[0]!;
   const one = grids[only.number]!;
-  if (own.length === 1 && isWhole(only.part, block)) {
-    const [down, right] = only.part.flipped;
+  if (own.length === 1 && isWhole(only.patch, block)) {
+    const [down, right] = only.patch.flipped;
     if (!down && !right) return one;
     const turned = newGrid(one.dtype, one.shape, one.components);
     const order = (flipped: boolean, length: number) =>
@@ -91,14 +91,14 @@ export function assemble(
     placeGrid(turned, one, order(down, one.shape[0]), order(right, one.shape[1]));
     return turned;
   }
-  const [rows, columns] = levelPositions(own, header.parts.length, header.layout, level, block);
+  const [rows, columns] = levelPositions(own, header.patches.length, header.layout, level, block);
   const whole = newGrid(one.dtype, [rows.length, columns.length], one.components);
   const [rowPlace, columnPlace] = [placesOf(rows, block[0]), placesOf(columns, block[1])];
-  for (const part of own) {
-    const [down, right] = partPositions(part, header.parts.length, header.layout, level, block);
+  for (const patch of own) {
+    const [down, right] = patchPositions(patch, header.patches.length, header.layout, level, block);
     placeGrid(
       whole,
-      grids[part.number]!,
+      grids[patch.number]!,
       down.map((row) => rowPlace[row]!),
       right.map((column) => columnPlace[column]!),
     );

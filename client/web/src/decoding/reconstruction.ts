@@ -1,18 +1,18 @@
-/** Segments into points: the state of a surface that is being refined, and pictures of any state that it passed. */
+/** Segments into points: the state of a surface that is being refined, and values of any state that it passed. */
 
-import { type PieceWindow, pieceWindows } from "../container/chunks";
+import { type ChunkPlace, chunkPlaces } from "../container/chunks";
 import type { Header } from "../container/header";
 import { type BlockMasks, decodeKept, decodeMasks } from "../entropy/mask";
 import { TileTable } from "../entropy/tile-table";
 import { type Plane, Tiles } from "../entropy/tiles";
-import { partsByBlock } from "../grid/patches";
+import { patchesByBlock } from "../grid/patches";
 import { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
 import { sha256 } from "../kernels/sha256";
-import { decodePiece } from "../residual/chunk-coder";
+import { decodeChunk } from "../residual/chunk-coder";
 import { allocatePlane, FRACTION_BITS, inverse } from "../transform/pyramid";
 import { DTYPE_BYTES, DTYPES, type DType, type Region, type Span } from "../types";
-import { windowPicture } from "./crop";
+import { reconstructWindow } from "./crop";
 import { assemble, clearGrid, type Grid, newGrid, putPoints, takePoints } from "./grids";
 
 /** A segment with its bytes: `passes` passes of a unit down from `first`. */
@@ -25,7 +25,7 @@ export interface Coded {
 }
 
 /** Lattice coordinates of grids over two to the power of `fraction`. */
-export interface Picture {
+export interface Reconstructed {
   readonly planes: readonly Plane[];
   readonly fraction: number;
 }
@@ -43,14 +43,14 @@ export type BlockGrids = readonly Grid[];
 const BATCH = 256;
 
 /**
- * Decodes segments when a picture asks for them, in the order in which they were added.
+ * Decodes segments when values are asked for, in the order in which they were added.
  *
- * States that lie behind what was decoded are pictures too: what later passes told is ignored.
+ * States that lie behind what was decoded can be reconstructed too: what later passes told is ignored.
  */
 export class Reconstruction {
   readonly header: Header;
   readonly #arena: Arena;
-  readonly #pieces = new Map<number, { data: Uint8Array; offset: number }>();
+  readonly #chunks = new Map<number, { data: Uint8Array; offset: number }>();
   #queue: Coded[] = [];
   #added = 0;
   #tiles: Tiles[] | null = null;
@@ -85,14 +85,14 @@ export class Reconstruction {
     this.#added++;
   }
 
-  /** Take a piece of the exactness section, which stands at `offset`. */
+  /** Take a chunk of the residual section, which stands at `offset`. */
   correct(number: number, data: Uint8Array, offset: number): void {
-    if (data.length) this.#pieces.set(number, { data, offset });
+    if (data.length) this.#chunks.set(number, { data, offset });
   }
 
   /**
    * The grids of `level`, one for each block, exact where `corrected`. Channels that are not `chosen` mean nothing.
-   * Throws `CorruptStreamError` where a piece of the exactness section does not fit.
+   * Throws `CorruptStreamError` where a chunk of the residual section does not fit.
    */
   blocks(known: Known, level: number, corrected: boolean, chosen: readonly boolean[]): BlockGrids[] {
     const blocks = this.#whole(known, level, chosen);
@@ -102,7 +102,7 @@ export class Reconstruction {
 
   /** A window of the surface, of one grid. Takes memory for what the window is made of, not for the surface. */
   window(known: Known, region: Region, corrected: boolean, chosen: readonly boolean[]): BlockGrids {
-    const grids = this.#part(known, region, chosen);
+    const grids = this.#window(known, region, chosen);
     if (corrected) this.#correct([grids], chosen, region);
     return grids;
   }
@@ -113,32 +113,32 @@ export class Reconstruction {
   }
 
   /** The SHA-256 of values one after another, in hexadecimal digits. */
-  digest(pieces: Iterable<Uint8Array>): string {
-    return sha256(this.#arena, pieces);
+  digest(bytes: Iterable<Uint8Array>): string {
+    return sha256(this.#arena, bytes);
   }
 
-  /** The values of all blocks before exactness and holes. */
+  /** The values of all blocks before residual and holes. */
   #whole(known: Known, level: number, chosen: readonly boolean[]): BlockGrids[] {
     const { header } = this;
-    const { layout, parts } = header;
+    const { layout, patches } = header;
     const tiles = this.#decoded(known.length);
-    const curves = layout.grids.length - parts.length;
-    const own = partsByBlock(parts, header.blocks.length);
+    const interfaces = layout.grids.length - patches.length;
+    const own = patchesByBlock(patches, header.blocks.length);
     const found: Grid[][] = header.blocks.map(() => []);
     this.#eachArray((dtype, count, first) => {
       const grids = this.#arena.scope(() => {
-        const made = parts.map((_, part) => {
-          const [rows, columns] = layout.shape(curves + part, level);
+        const made = patches.map((_, patch) => {
+          const [rows, columns] = layout.shape(interfaces + patch, level);
           return { rows, columns, points: this.#arena.zeros(rows * columns * count * DTYPE_BYTES[dtype]) };
         });
         for (let component = 0; component < count; component++) {
           const channel = first + component;
           if (!chosen[channel]) continue;
           this.#arena.scope(() => {
-            const picture = this.#picture(tiles[channel]!, channel, known.state, level);
-            for (const [part, { points }] of made.entries()) {
-              const plane = picture.planes[curves + part]!;
-              this.#store(channel, plane, picture.fraction, points, dtype, count, component);
+            const reconstructed = this.#reconstruct(tiles[channel]!, channel, known.state, level);
+            for (const [patch, { points }] of made.entries()) {
+              const plane = reconstructed.planes[interfaces + patch]!;
+              this.#store(channel, plane, reconstructed.fraction, points, dtype, count, component);
             }
           });
         }
@@ -154,8 +154,8 @@ export class Reconstruction {
     return found;
   }
 
-  /** The values of a window before exactness and holes. */
-  #part(known: Known, region: Region, chosen: readonly boolean[]): Grid[] {
+  /** The values of a window before residual and holes. */
+  #window(known: Known, region: Region, chosen: readonly boolean[]): Grid[] {
     const tiles = this.#decoded(known.length);
     const shape = [region[0][1] - region[0][0], region[1][1] - region[1][0]] as const;
     const found: Grid[] = [];
@@ -168,8 +168,15 @@ export class Reconstruction {
             const channel = first + component;
             const state = this.#stateOf(channel, known.state);
             this.#arena.scope(() => {
-              const picture = windowPicture(this.#arena, this.header, channel, tiles[channel]!, state, region);
-              this.#store(channel, picture.plane, picture.fraction, points, dtype, count, component);
+              const reconstructed = reconstructWindow(
+                this.#arena,
+                this.header,
+                channel,
+                tiles[channel]!,
+                state,
+                region,
+              );
+              this.#store(channel, reconstructed.plane, reconstructed.fraction, points, dtype, count, component);
             });
           }
           const bytes = new Uint8Array(grid.values.buffer);
@@ -223,13 +230,13 @@ export class Reconstruction {
   }
 
   /** One channel of the grids of a level; in memory that the caller's scope ends. */
-  #picture(tiles: Tiles, channel: number, every: Int8Array, level: number): Picture {
+  #reconstruct(tiles: Tiles, channel: number, every: Int8Array, level: number): Reconstructed {
     const { layout, predictors, geometric } = this.header;
     const state = this.#stateOf(channel, every);
     let whole = 0;
     while (whole < level && !state.subarray(...layout.tilesOf(whole + 1)).some((left) => left !== 0)) whole++;
     const planes = layout.grids.map((_, grid) => allocatePlane(this.#arena, layout.shape(grid, level)));
-    tiles.spreadLevels(level, state, planes, whole);
+    tiles.dequantizeLevels(level, state, planes, whole);
     inverse(this.#arena, planes, layout, predictors[channel]!, level, whole, channel < geometric);
     return { planes, fraction: whole < level ? FRACTION_BITS : 0 };
   }
@@ -240,12 +247,12 @@ export class Reconstruction {
     return Int8Array.from({ length: layout.tiles.length }, (_, tile) => every[tile * channels + channel]!);
   }
 
-  /** Restore all windows of exactness that there are, or of a region of the only block those inside. */
+  /** Restore all windows of the residual that there are, or of a region of the only block those inside. */
   #correct(blocks: readonly BlockGrids[], chosen: readonly boolean[], region: Region | null): void {
     let number = -1;
-    for (const window of pieceWindows(this.header)) {
-      const piece = this.#pieces.get(++number);
-      if (!piece || !chosen[window.channel]) continue;
+    for (const window of chunkPlaces(this.header)) {
+      const chunk = this.#chunks.get(++number);
+      if (!chunk || !chosen[window.channel]) continue;
       if (region && !(isInside(window.rows, region[0]) && isInside(window.columns, region[1]))) continue;
       let component = window.channel;
       const grids = blocks[window.block]!;
@@ -256,13 +263,13 @@ export class Reconstruction {
       })!;
       const points = this.#pointsOf(window, grid, region ? [region[0][0], region[1][0]] : [0, 0]);
       const restored = takePoints(grid, component, points);
-      const values = decodePiece(this.#arena, restored, grid.dtype, piece.data, piece.offset);
+      const values = decodeChunk(this.#arena, restored, grid.dtype, chunk.data, chunk.offset);
       putPoints(grid, component, points, values);
     }
   }
 
-  /** The points of a grid that a piece restores; the grid begins at a row and column of the block. */
-  #pointsOf(window: PieceWindow, grid: Grid, [top, left]: readonly [number, number]): Int32Array {
+  /** The points of a grid that a chunk restores; the grid begins at a row and column of the block. */
+  #pointsOf(window: ChunkPlace, grid: Grid, [top, left]: readonly [number, number]): Int32Array {
     const { rows, columns, block } = window;
     const mask = (window.kept ? this.kept : this.masks)[block];
     const width = this.header.blocks[block]!.shape[1];

@@ -6,8 +6,8 @@ import type { State } from "../container/slices";
 import { rint } from "../coordinates/coordinate-rules";
 import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane } from "../coordinates/height-fields";
 import { CorruptStreamError, InputError, OptionError } from "../errors";
-import { levelPositions, type Positions, partsByBlock } from "../grid/patches";
-import { checkWish, restoredRegion, type Wish, wishedChannels, wishedTiles } from "../planning/selection";
+import { levelPositions, type Positions, patchesByBlock } from "../grid/patches";
+import { checkSelection, restoredRegion, type Selection, selectedChannels, selectedTiles } from "../planning/selection";
 import type { Block, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
 import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
 import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
@@ -35,9 +35,9 @@ export class View implements ViewInfo {
   readonly complete: boolean;
   readonly #shared: Shared;
   readonly #known: Known;
-  readonly #wish: Wish;
+  readonly #selection: Selection;
 
-  constructor(state: Omit<ViewInfo, never> & Partial<State>, shared: Shared, known: Known, wish: Wish) {
+  constructor(state: Omit<ViewInfo, never> & Partial<State>, shared: Shared, known: Known, selection: Selection) {
     this.number = state.number;
     this.level = state.level;
     this.bytes = state.bytes;
@@ -46,7 +46,7 @@ export class View implements ViewInfo {
     this.complete = state.complete;
     this.#shared = shared;
     this.#known = known;
-    this.#wish = wish;
+    this.#selection = selection;
   }
 
   /** What is known of the state without decoding it, in plain values. */
@@ -61,9 +61,9 @@ export class View implements ViewInfo {
    */
   window(region: Region): Surface {
     const { header } = this.#shared.reconstruction;
-    const wish: Wish = { region, attributes: this.#wish.attributes };
-    checkWish(wish, header);
-    const shown = this.#wish.region;
+    const selection: Selection = { region, attributes: this.#selection.attributes };
+    checkSelection(selection, header);
+    const shown = this.#selection.region;
     if (
       shown &&
       !([0, 1] as const).every((axis) => shown[axis][0] <= region[axis][0] && region[axis][1] <= shown[axis][1])
@@ -72,10 +72,10 @@ export class View implements ViewInfo {
         `expected a region inside the one received, ${shown.join(" x ")}, got ${region.join(" x ")}`,
       );
     }
-    const wanted = wishedTiles(wish, header);
+    const wanted = selectedTiles(selection, header);
     const state = this.#known.state.slice();
     for (let unit = 0; unit < state.length; unit++) if (!wanted[Math.floor(unit / header.channels)]) state[unit] = 0;
-    return new View(this, this.#shared, { length: this.#known.length, state }, wish).surface();
+    return new View(this, this.#shared, { length: this.#known.length, state }, selection).surface();
   }
 
   /**
@@ -87,7 +87,7 @@ export class View implements ViewInfo {
   surface(level?: number): Surface {
     const { reconstruction, metadata, digest } = this.#shared;
     const { header } = reconstruction;
-    const { region } = this.#wish;
+    const { region } = this.#selection;
     const asked = level !== undefined;
     const shownLevel = level ?? header.levels;
     const finest = shownLevel === header.levels;
@@ -103,7 +103,7 @@ export class View implements ViewInfo {
       delete values.seam;
       delete values.turn;
     }
-    const chosen = wishedChannels(this.#wish, header);
+    const chosen = selectedChannels(this.#selection, header);
     const nodes = this.#nodes(shownLevel);
     const grids = region
       ? [this.#window(region, chosen)]
@@ -152,7 +152,7 @@ export class View implements ViewInfo {
     return { blocks, metadata: values };
   }
 
-  /** Whether exactness is known. */
+  /** Whether the residual is known. */
   get #corrected(): boolean {
     return this.complete && this.#shared.reconstruction.header.corrected;
   }
@@ -160,10 +160,10 @@ export class View implements ViewInfo {
   /** Which rows and columns of each block are shown at a level, or in the window. */
   #nodes(level: number): Positions[] {
     const { header } = this.#shared.reconstruction;
-    const { region } = this.#wish;
+    const { region } = this.#selection;
     if (region) return [[range(region[0]), range(region[1])]];
-    return partsByBlock(header.parts, header.blocks.length).map((own, block) =>
-      levelPositions(own, header.parts.length, header.layout, level, header.blocks[block]!.shape),
+    return patchesByBlock(header.patches, header.blocks.length).map((own, block) =>
+      levelPositions(own, header.patches.length, header.layout, level, header.blocks[block]!.shape),
     );
   }
 
@@ -195,7 +195,7 @@ export class View implements ViewInfo {
     const { header } = this.#shared.reconstruction;
     const named = new Map<string, PointArray>();
     for (const [number, kind] of header.attributes.entries()) {
-      if (this.#wish.attributes && !this.#wish.attributes.includes(kind.name)) continue;
+      if (this.#selection.attributes && !this.#selection.attributes.includes(kind.name)) continue;
       const { dtype, components, values } = attributes[number]!;
       named.set(kind.name, { dtype, components, flat: kind.components === 0, values });
     }

@@ -38,7 +38,7 @@ export class TileTable {
   /** Of each band its tile, and its first row and column among all coefficients. */
   readonly windows: Address;
 
-  /** Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from curves. */
+  /** Lay out the tiles of a surface, for its coordinates or for other channels, which take nothing from interfaces. */
   constructor(arena: Arena, layout: Layout, coordinate: boolean) {
     this.layout = layout;
     this.members = layout.tiles.map((tile) => (coordinate ? tile.bands : tile.whole));
@@ -87,7 +87,7 @@ function joinedTo(parent: Placed, band: Band, level: number, layout: Layout): re
   const coarser = layout.shape(band.grid, level - 2);
   const down = Number(finer[0] !== coarser[0]);
   const right = Number(finer[1] !== coarser[1]);
-  // Without its first row, which comes from a curve, a band has an odd origin: its parent's has one too.
+  // Without its first row, which comes from an interface, a band has an odd origin: its parent's has one too.
   const row = ((band.origin[0] + down) >> down) - parent.band.origin[0];
   const column = ((band.origin[1] + right) >> right) - parent.band.origin[1];
   return [parent.place + row * parent.stride + column, parent.stride, down, right];

@@ -117,13 +117,13 @@ export class Tiles {
    *
    * `state` has the passes that remain of each tile; coefficients of the tiles from `finer` on are multiplied by 8.
    */
-  spread(numbers: ArrayLike<number>, state: Int8Array, finer: number, out: Plane, row = 0, column = 0): void {
+  dequantize(numbers: ArrayLike<number>, state: Int8Array, finer: number, out: Plane, row = 0, column = 0): void {
     const arena = this.#arena;
     const { table } = this;
     arena.scope(() => {
       const chosen = arena.putI64(numbers);
       const remaining = arena.put(new Uint8Array(state.buffer, state.byteOffset, state.length));
-      const result = arena.kernels.spread(
+      const result = arena.kernels.dequantize(
         this.#known,
         this.#sign,
         this.#early,
@@ -144,18 +144,18 @@ export class Tiles {
         row,
         column,
       );
-      accepted(result, "spread");
+      accepted(result, "dequantize");
     });
   }
 
-  /** `spread` all tiles of the levels up to one into planes of the grids; those above `whole` multiplied by 8. */
-  spreadLevels(level: number, state: Int8Array, planes: readonly Plane[], whole: number): void {
+  /** `dequantize` all tiles of the levels up to one into planes of the grids; those above `whole` multiplied by 8. */
+  dequantizeLevels(level: number, state: Int8Array, planes: readonly Plane[], whole: number): void {
     const { table } = this;
     const last = table.first[table.layout.tilesOf(level)[1]]!;
     const finer = table.layout.tilesOf(whole)[1];
     for (const [grid, plane] of planes.entries()) {
       const chosen = table.ofGrid[grid]!.filter((band) => band < last && state[table.tileOf[band]!]! < UNANNOUNCED);
-      if (chosen.length) this.spread(chosen, state, finer, plane);
+      if (chosen.length) this.dequantize(chosen, state, finer, plane);
     }
   }
 }

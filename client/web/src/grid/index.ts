@@ -3,5 +3,5 @@
 export { type AxisStep, axisStep } from "./axis";
 export type { Band, Grid, Tile } from "./layout";
 export { Layout } from "./layout";
-export type { Arrangement, Curve, Part, Side } from "./multiblock";
-export { levelPositions, partsByBlock } from "./patches";
+export type { Arrangement, Interface, Patch, Side } from "./multiblock";
+export { levelPositions, patchesByBlock } from "./patches";

@@ -1,10 +1,10 @@
 /**
  * Where the levels, bands and tiles of a surface lie (docs/format.md, sections 4 and 5).
  *
- * A surface is coded as one or more *grids*: the parts of its blocks, and the curves along which parts meet. The
+ * A surface is coded as one or more *grids*: the patches of its blocks, and the interfaces along which patches meet. The
  * coefficients of one channel of a grid fill an array of the grid's own shape; level l occupies its first rows and
- * columns. A *tile* is a piece of all bands of one level over the same part of a grid, or all bands of a level of several
- * small grids; level 0 of all grids is one tile.
+ * columns. A *tile* is a rectangle of all bands of one level over the same part of a grid, or all bands of a level of
+ * several small grids; level 0 of all grids is one tile.
  */
 import type { Closed, Shape, Span } from "../types";
 import { type AxisStep, axisLengths, axisStep } from "./axis";
@@ -12,13 +12,13 @@ import { type AxisStep, axisLengths, axisStep } from "./axis";
 /** First row, last row, first column, last column. */
 export type Sides<T> = readonly [T, T, T, T];
 
-/** Where a side's points come from: the grid of a curve, perhaps backwards. Of a curve's end: another curve's end. */
+/** Where a side's points come from: the grid of an interface, perhaps backwards; of its end: another interface's end. */
 export interface Source {
   readonly grid: number;
   readonly reversed: boolean;
 }
 
-/** What is coarsened by itself: a part of a block, or a curve of one column. */
+/** What is coarsened by itself: a patch of a block, or an interface of one column. */
 export interface Grid {
   readonly shape: Shape;
   readonly closed: Closed;
@@ -28,7 +28,7 @@ export interface Grid {
   readonly stops: readonly [boolean, boolean];
   /** Where the points of sides come from, as far as the channel is a coordinate. No tile holds those. */
   readonly sources: Sides<Source | null>;
-  readonly curve: boolean;
+  readonly interface: boolean;
 }
 
 /** A tile's part of one band. */
@@ -48,7 +48,7 @@ export interface Band {
 export interface Tile {
   readonly level: number;
   readonly bands: readonly Band[];
-  /** The bands of channels that take nothing from curves. */
+  /** The bands of channels that take nothing from interfaces. */
   readonly whole: readonly Band[];
   readonly parent: number;
 }
@@ -57,7 +57,7 @@ const NONE: Sides<boolean> = [false, false, false, false];
 
 /** A grid that shares no side. */
 export function plainGrid(shape: Shape, closed: Closed): Grid {
-  return { shape, closed, clamped: NONE, stops: [false, false], sources: [null, null, null, null], curve: false };
+  return { shape, closed, clamped: NONE, stops: [false, false], sources: [null, null, null, null], interface: false };
 }
 
 /** Where tiles of 2^exponent coefficients begin along an axis of so many nodes, and where the last one ends. */
@@ -76,14 +76,14 @@ export class Layout {
   readonly tile: readonly [number, number];
   /** Number L of the finest level. */
   readonly levels: number;
-  /** Whether any side comes from a curve. */
+  /** Whether any side comes from an interface. */
   readonly shared: boolean;
   readonly #shapes: Shape[][];
   readonly #steps: (readonly [AxisStep, AxisStep])[][];
   #tiles: Tile[] | null = null;
   #starts: number[] = [];
 
-  /** Grids: curves first. A surface of one block that shares no side is one grid. */
+  /** Grids: interfaces first. A surface of one block that shares no side is one grid. */
   constructor(grids: readonly Grid[], tile: readonly [number, number]) {
     this.grids = grids;
     this.tile = tile;
@@ -117,7 +117,7 @@ export class Layout {
     return this.#steps[grid]![level]!;
   }
 
-  /** All tiles, coarsest level first, then group by group (curves first), row by row. */
+  /** All tiles, coarsest level first, then group by group (interfaces first), row by row. */
   get tiles(): readonly Tile[] {
     if (this.#tiles === null) {
       this.#tiles = this.#layTiles();
@@ -170,7 +170,7 @@ export class Layout {
     return tiles;
   }
 
-  /** For each level the grids whose tiles are common: all curves, and neighbouring parts that are small there. */
+  /** For each level the grids whose tiles are common: all interfaces, and neighbouring patches that are small there. */
   #groups(): number[][][] {
     const most = 4 * 2 ** (this.tile[0] + this.tile[1]); // points of a tile's three bands, and of the nodes under them
     const levels: number[][][] = Array.from({ length: this.levels + 1 }, () => []);
@@ -182,8 +182,8 @@ export class Layout {
         let points = 0;
         for (const number of group) points += this.shape(number, level)[0] * this.shape(number, level)[1];
         const last = merged.at(-1);
-        const curve = this.grids[group[0]!]!.curve;
-        if (last && this.grids[last[0]!]!.curve === curve && (curve || size + points <= most)) {
+        const isInterface = this.grids[group[0]!]!.interface;
+        if (last && this.grids[last[0]!]!.interface === isInterface && (isInterface || size + points <= most)) {
           for (const number of group) last.push(number);
           size += points;
         } else {
@@ -207,7 +207,7 @@ export class Layout {
 
   #bounds(group: readonly number[], level: number): Bounds {
     const coarse = this.shape(group[0]!, level - 1);
-    if (group.length > 1 || this.grids[group[0]!]!.curve) {
+    if (group.length > 1 || this.grids[group[0]!]!.interface) {
       // One tile, of which only the number of bounds matters.
       return [
         [0, coarse[0]],
@@ -217,7 +217,7 @@ export class Layout {
     return [tileBounds(coarse[0], this.tile[0]), tileBounds(coarse[1], this.tile[1])];
   }
 
-  /** The tile's bands of coordinates, and of channels that take nothing from curves and have none. */
+  /** The tile's bands of coordinates, and of channels that take nothing from interfaces and have none. */
   #members(group: readonly number[], level: number, bounds: Bounds | null, place: readonly [number, number]) {
     const bands: Band[] = [];
     const whole: Band[] = [];
@@ -233,7 +233,7 @@ export class Layout {
             ];
       const [first, last, left, right] = grid.sources;
       this.#addBands(bands, number, level, own, place, [first !== null, last !== null, left !== null, right !== null]);
-      if (this.shared && !grid.curve) this.#addBands(whole, number, level, own, place, NONE);
+      if (this.shared && !grid.interface) this.#addBands(whole, number, level, own, place, NONE);
     }
     return { bands, whole: this.shared ? whole : bands };
   }

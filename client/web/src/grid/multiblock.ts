@@ -1,15 +1,18 @@
-/** The grids of a surface of several blocks: curves along which parts meet, and parts of blocks (docs/format.md, 3.1). */
+/**
+ * The grids of a surface of several blocks: interfaces along which patches meet, and patches of blocks (docs/format.md,
+ * section 3.1).
+ */
 import type { Closed, Shape, Span } from "../types";
 import type { Grid, Sides, Source } from "./layout";
 
-/** A side of a part that is a curve; `reversed`: the part's order along the side runs against the curve's. */
+/** A side of a patch that is an interface; `reversed`: the patch's order along the side runs against the interface's. */
 export interface Side {
-  readonly curve: number;
+  readonly interface: number;
   readonly reversed: boolean;
 }
 
 /** What is coded as one grid: a window of a block, perhaps turned round. */
-export interface Part {
+export interface Patch {
   /** Number of its block. */
   readonly block: number;
   /** First and past-the-last index in the block; along a closed axis they count modulo its length. */
@@ -23,21 +26,21 @@ export interface Part {
   readonly stops: readonly [boolean, boolean];
 }
 
-/** Points that are a side of parts. */
-export interface Curve {
+/** Points that are a side of patches. */
+export interface Interface {
   readonly length: number;
   readonly closed: boolean;
   readonly stops: boolean;
 }
 
-/** Parts of all blocks, and the curves that they share. */
+/** Patches of all blocks, and the interfaces that they share. */
 export interface Arrangement {
-  readonly parts: readonly Part[];
-  readonly curves: readonly Curve[];
+  readonly patches: readonly Patch[];
+  readonly interfaces: readonly Interface[];
 }
 
-/** A block as its only part, which shares no side. */
-export function wholePart(block: number, shape: Shape, closed: Closed): Part {
+/** A block as its only patch, which shares no side. */
+export function wholePatch(block: number, shape: Shape, closed: Closed): Patch {
   return {
     block,
     rows: [0, shape[0]],
@@ -50,42 +53,42 @@ export function wholePart(block: number, shape: Shape, closed: Closed): Part {
   };
 }
 
-/** The grids of an arrangement: curves first, then parts. */
+/** The grids of an arrangement: interfaces first, then patches. */
 export function gridsOf(arrangement: Arrangement): Grid[] {
   const owners = ownersOf(arrangement);
-  const curves = arrangement.curves.map((curve, number): Grid => {
+  const interfaces = arrangement.interfaces.map((own, number): Grid => {
     const ends: (Source | null)[] = [0, 1].map((end) => {
       const owner = owners.get(2 * number + end) ?? 2 * number + end;
-      const ownerCurve = owner >> 1;
+      const ownerInterface = owner >> 1;
       const ownerEnd = owner & 1;
-      const elsewhere = ownerCurve !== number || (ownerEnd !== end && curve.length > 1);
-      return elsewhere ? { grid: ownerCurve, reversed: ownerEnd === 1 } : null;
+      const elsewhere = ownerInterface !== number || (ownerEnd !== end && own.length > 1);
+      return elsewhere ? { grid: ownerInterface, reversed: ownerEnd === 1 } : null;
     });
     return {
-      shape: [curve.length, 1],
-      closed: [curve.closed, false],
-      clamped: [!curve.closed, !curve.closed, false, false],
-      stops: [curve.stops, false],
-      sources: [ends[0]!, curve.length === 1 ? null : ends[1]!, null, null],
-      curve: true,
+      shape: [own.length, 1],
+      closed: [own.closed, false],
+      clamped: [!own.closed, !own.closed, false, false],
+      stops: [own.stops, false],
+      sources: [ends[0]!, own.length === 1 ? null : ends[1]!, null, null],
+      interface: true,
     };
   });
-  const parts = arrangement.parts.map((part): Grid => {
-    const source = (side: Side | null): Source | null => side && { grid: side.curve, reversed: side.reversed };
-    const [first, last, left, right] = part.sides;
+  const patches = arrangement.patches.map((patch): Grid => {
+    const source = (side: Side | null): Source | null => side && { grid: side.interface, reversed: side.reversed };
+    const [first, last, left, right] = patch.sides;
     return {
-      shape: [part.rows[1] - part.rows[0], part.columns[1] - part.columns[0]],
-      closed: part.closed,
-      clamped: part.clamped,
-      stops: part.stops,
+      shape: [patch.rows[1] - patch.rows[0], patch.columns[1] - patch.columns[0]],
+      closed: patch.closed,
+      clamped: patch.clamped,
+      stops: patch.stops,
       sources: [source(first), source(last), source(left), source(right)],
-      curve: false,
+      interface: false,
     };
   });
-  return [...curves, ...parts];
+  return [...interfaces, ...patches];
 }
 
-/** For every end of a curve the first end that is the same point; an end is 2 curve, or 2 curve + 1 for the last. */
+/** For every end of an interface the first end that is the same point; ends are 2 number, and 2 number + 1 (the last). */
 function ownersOf(arrangement: Arrangement): Map<number, number> {
   const parent = new Map<number, number>();
   const find = (end: number): number => {
@@ -96,15 +99,15 @@ function ownersOf(arrangement: Arrangement): Map<number, number> {
     }
   };
   const endOf = (side: Side, last: number): number => {
-    const pole = arrangement.curves[side.curve]!.length === 1;
-    return 2 * side.curve + (pole ? 0 : last ^ Number(side.reversed));
+    const pole = arrangement.interfaces[side.interface]!.length === 1;
+    return 2 * side.interface + (pole ? 0 : last ^ Number(side.reversed));
   };
-  for (const part of arrangement.parts) {
-    if (part.closed[0] || part.closed[1]) continue;
+  for (const patch of arrangement.patches) {
+    if (patch.closed[0] || patch.closed[1]) continue;
     for (const row of [0, 1]) {
       for (const column of [0, 1]) {
-        const along = part.sides[row];
-        const across = part.sides[2 + column];
+        const along = patch.sides[row];
+        const across = patch.sides[2 + column];
         if (!along || !across) continue;
         const one = find(endOf(along, column));
         const other = find(endOf(across, row));
@@ -117,12 +120,13 @@ function ownersOf(arrangement: Arrangement): Map<number, number> {
 
 type Cells = readonly [rows: Span, columns: Span];
 
-/** Whether parts of a block cover each of its cells once; along a closed axis the last cells wrap. */
-export function covers(shape: Shape, closed: Closed, parts: readonly Part[]): boolean {
+/** Whether patches of a block cover each of its cells once; along a closed axis the last cells wrap. */
+export function covers(shape: Shape, closed: Closed, patches: readonly Patch[]): boolean {
   const cells: Cells[] = [];
-  for (const part of parts) {
-    for (const rows of cellsAlong(shape[0], closed[0], part.closed[0], part.rows)) {
-      for (const columns of cellsAlong(shape[1], closed[1], part.closed[1], part.columns)) cells.push([rows, columns]);
+  for (const patch of patches) {
+    for (const rows of cellsAlong(shape[0], closed[0], patch.closed[0], patch.rows)) {
+      for (const columns of cellsAlong(shape[1], closed[1], patch.closed[1], patch.columns))
+        cells.push([rows, columns]);
     }
   }
   const whole = [0, 1].map((axis) => (closed[axis] ? shape[axis]! : Math.max(shape[axis]! - 1, 1)));
@@ -131,7 +135,7 @@ export function covers(shape: Shape, closed: Closed, parts: readonly Part[]): bo
   return area === whole[0]! * whole[1]! && !overlap(cells);
 }
 
-/** First and past-the-last cell along an axis, in one piece or two. */
+/** First and past-the-last cell along an axis, as one span or two. */
 function cellsAlong(length: number, wraps: boolean, closed: boolean, window: Span): Span[] {
   if (closed) return [[0, length]];
   const start = window[0];

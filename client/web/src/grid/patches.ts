@@ -1,30 +1,30 @@
-/** Blocks cut into parts: where the nodes of parts stand in their blocks, at any level (docs/format.md, section 4). */
+/** Blocks cut into patches: where the nodes of patches stand in their blocks, at any level (docs/format.md, section 4). */
 import type { Shape } from "../types";
 import { hasTail } from "./axis";
 import type { Layout } from "./layout";
-import type { Part } from "./multiblock";
+import type { Patch } from "./multiblock";
 
-/** A part with its number among those of all blocks. */
-export interface NumberedPart {
+/** A patch with its number among those of all blocks. */
+export interface NumberedPatch {
   readonly number: number;
-  readonly part: Part;
+  readonly patch: Patch;
 }
 
 /** Rows and columns of a block. */
 export type Positions = readonly [rows: Int32Array, columns: Int32Array];
 
-/** The parts of each of so many blocks. */
-export function partsByBlock(parts: readonly Part[], count: number): NumberedPart[][] {
-  const found: NumberedPart[][] = Array.from({ length: count }, () => []);
-  parts.forEach((part, number) => {
-    found[part.block]!.push({ number, part });
+/** The patches of each of so many blocks. */
+export function patchesByBlock(patches: readonly Patch[], count: number): NumberedPatch[][] {
+  const found: NumberedPatch[][] = Array.from({ length: count }, () => []);
+  patches.forEach((patch, number) => {
+    found[patch.block]!.push({ number, patch });
   });
   return found;
 }
 
-/** Whether a part is its block as it is, perhaps turned round. */
-export function isWhole(part: Part, shape: Shape): boolean {
-  const { rows, columns } = part;
+/** Whether a patch is its block as it is, perhaps turned round. */
+export function isWhole(patch: Patch, shape: Shape): boolean {
+  const { rows, columns } = patch;
   return rows[0] === 0 && rows[1] === shape[0] && columns[0] === 0 && columns[1] === shape[1];
 }
 
@@ -43,36 +43,36 @@ function nodePositions(layout: Layout, grid: number, axis: number, level: number
   return positions;
 }
 
-/** Which rows and columns of its block, of this shape, the nodes of a part stand at, in the order of the part's grid. */
-export function partPositions(
-  own: NumberedPart,
-  parts: number,
+/** Which rows and columns of its block, of this shape, the nodes of a patch stand at, in the order of the patch's grid. */
+export function patchPositions(
+  own: NumberedPatch,
+  patches: number,
   layout: Layout,
   level: number,
   shape: Shape,
 ): Positions {
-  const grid = layout.grids.length - parts + own.number;
-  const [rows, columns] = [own.part.rows, own.part.columns].map((window, axis) => {
+  const grid = layout.grids.length - patches + own.number;
+  const [rows, columns] = [own.patch.rows, own.patch.columns].map((window, axis) => {
     const nodes = nodePositions(layout, grid, axis, level);
     const last = layout.grids[grid]!.shape[axis]! - 1;
-    const flipped = own.part.flipped[axis];
+    const flipped = own.patch.flipped[axis];
     // Along closed axes windows go on from the last sample to the first.
     return nodes.map((node) => (window[0] + (flipped ? last - node : node)) % shape[axis]!);
   });
   return [rows!, columns!];
 }
 
-/** Which rows and columns of a block of this shape stand at a level's nodes, increasing; `own` are its parts of `parts`. */
+/** Which rows and columns of a block of this shape, whose patches are `own`, stand at a level's nodes, increasing. */
 export function levelPositions(
-  own: readonly NumberedPart[],
-  parts: number,
+  own: readonly NumberedPatch[],
+  patches: number,
   layout: Layout,
   level: number,
   shape: Shape,
 ): Positions {
   const seen = [new Uint8Array(shape[0]), new Uint8Array(shape[1])];
-  for (const part of own) {
-    partPositions(part, parts, layout, level, shape).forEach((positions, axis) => {
+  for (const patch of own) {
+    patchPositions(patch, patches, layout, level, shape).forEach((positions, axis) => {
       for (const position of positions) seen[axis]![position] = 1;
     });
   }
@@ -88,13 +88,18 @@ export function levelPositions(
 }
 
 /** Rows and columns of each block's grid at a level; `shapes` are the blocks'. */
-export function levelShapes(parts: readonly Part[], layout: Layout, level: number, shapes: readonly Shape[]): Shape[] {
-  if (parts.length === shapes.length && parts.every((part) => isWhole(part, shapes[part.block]!))) {
-    const curves = layout.grids.length - parts.length;
-    return shapes.map((_, number) => layout.shape(curves + number, level));
+export function levelShapes(
+  patches: readonly Patch[],
+  layout: Layout,
+  level: number,
+  shapes: readonly Shape[],
+): Shape[] {
+  if (patches.length === shapes.length && patches.every((patch) => isWhole(patch, shapes[patch.block]!))) {
+    const interfaces = layout.grids.length - patches.length;
+    return shapes.map((_, number) => layout.shape(interfaces + number, level));
   }
-  return partsByBlock(parts, shapes.length).map((own, block): Shape => {
-    const [rows, columns] = levelPositions(own, parts.length, layout, level, shapes[block]!);
+  return patchesByBlock(patches, shapes.length).map((own, block): Shape => {
+    const [rows, columns] = levelPositions(own, patches.length, layout, level, shapes[block]!);
     return [rows.length, columns.length];
   });
 }

@@ -25,7 +25,7 @@ export interface KernelExports {
     state: number,
     budget: number,
   ): number;
-  spread(
+  dequantize(
     known: number,
     sign: number,
     early: number,

@@ -96,9 +96,13 @@ export class Server {
       if (this.token !== null) request.setRequestHeader("authorization", `Bearer ${this.token}`);
       request.upload.onprogress = ({ loaded }) => progress(loaded);
       request.onload = () => {
-        if (request.status === 200 || request.status === 202)
+        if (request.status !== 200 && request.status !== 202)
+          return reject(problemOf(request.status, request.responseText));
+        try {
           resolve(JSON.parse(request.responseText) as ListedSurface);
-        else reject(problemOf(request.status, request.responseText));
+        } catch {
+          reject(problemOf(request.status, ""));
+        }
       };
       request.onerror = () => reject(new ProblemError(0, "network", "The server could not be reached", ""));
       request.onabort = () => reject(new ProblemError(0, "cancelled", "Cancelled", ""));

@@ -89,7 +89,12 @@ function closeAll(): void {
 /** The id of a surface in the part of the address after #; null: the list. */
 function asked(): string | null {
   const found = /(?:^#|&)s=([^&]+)/.exec(location.hash)?.[1];
-  return found === undefined ? null : decodeURIComponent(found);
+  if (found === undefined) return null;
+  try {
+    return decodeURIComponent(found);
+  } catch {
+    return found; // anybody can write an address
+  }
 }
 
 async function route(): Promise<void> {
@@ -179,6 +184,15 @@ function start(surfaces: ShownSurface[] | null): void {
   }
   if (surfaces.length > 1) addEventListener("hashchange", () => void showConfigured(surfaces).catch(fail));
   showConfigured(surfaces).catch(fail);
+}
+
+// A file dropped beside the place for it would be opened by the browser in the place of this page and its transfers.
+for (const name of ["dragover", "drop"] as const) {
+  addEventListener(name, (event) => {
+    if (event.defaultPrevented || !event.dataTransfer?.types.includes("Files")) return;
+    event.preventDefault();
+    event.dataTransfer.dropEffect = "none";
+  });
 }
 
 configured().then(start).catch(fail);

@@ -70,14 +70,17 @@ export class Uploads {
     this.list.prepend(item);
     const controller = new AbortController();
     cancel.addEventListener("click", () => controller.abort());
-    let failure = "Not uploaded";
+    // Closing the page would end the transfer.
+    const keep = (event: BeforeUnloadEvent): void => event.preventDefault();
+    addEventListener("beforeunload", keep);
+    let sent = false;
     try {
-      const surface = await this.send(file, controller.signal, (sent) => {
-        bar.value = file.size > 0 ? sent / file.size : 1;
-        setText(what, `Sent ${formatBytes(sent)} of ${formatBytes(file.size)}`);
-      });
+      const surface = await this.send(file, controller.signal, (bytes) => {
+        bar.value = file.size > 0 ? bytes / file.size : 1;
+        setText(what, `Sent ${formatBytes(bytes)} of ${formatBytes(file.size)}`);
+      }).finally(() => removeEventListener("beforeunload", keep));
+      sent = true;
       cancel.remove();
-      failure = "Uploaded, but not built";
       this.changed(surface);
       await this.build(surface, what, bar);
       item.remove();
@@ -86,7 +89,7 @@ export class Uploads {
       cancel.textContent = "Dismiss";
       if (!cancel.isConnected) what.before(cancel);
       cancel.addEventListener("click", () => item.remove());
-      setText(what, controller.signal.aborted ? "Cancelled" : failure);
+      setText(what, controller.signal.aborted ? "Cancelled" : sent ? "Uploaded, but not ready" : "Not uploaded");
       if (!controller.signal.aborted)
         item.append(
           html("span", { class: "reason", role: "alert" }, error instanceof Error ? error.message : String(error)),

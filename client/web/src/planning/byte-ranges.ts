@@ -1,4 +1,4 @@
-/** Sets of byte ranges of a file: which bytes of a container are held, and which are missing. */
+/** Sets of byte ranges of a file: which bytes of a container are cached, and which are missing. */
 
 /** Bytes `offset` to `offset + length` of a file. */
 export type Place = readonly [offset: number, length: number];

@@ -8,7 +8,7 @@ export type Ended = "complete" | "level" | "rms" | "max" | "bytes" | "seconds" |
 /**
  * A state that the receiver reaches when it has received `sent` bytes of the plan's ranges.
  *
- * `number` is that of the layer (quality order) or level (level order). `bytes` counts what is held of the container.
+ * `number` is that of the layer (quality order) or level (level order). `bytes` counts what is cached of the container.
  * Errors are NaN where they are not known.
  */
 export interface Mark {
@@ -20,7 +20,7 @@ export interface Mark {
   readonly maxError: number;
 }
 
-/** Slices of a container in sending order, without what is held. */
+/** Slices of a container in sending order, without what is cached. */
 export interface Plan {
   /** Service slices that must come first: the index, if segments are sent without the tables of their layers. */
   readonly before: readonly ByteRange[];
@@ -28,7 +28,7 @@ export interface Plan {
   readonly ranges: readonly ByteRange[];
   /** The metadata. */
   readonly after: readonly ByteRange[];
-  /** States on the way, the last one at the end; states with a `sent` of 0 are held already. */
+  /** States on the way, the last one at the end; states with a `sent` of 0 are cached already. */
   readonly marks: readonly Mark[];
   /** Why the plan ends. */
   readonly ended: Ended;
@@ -41,7 +41,7 @@ export function slicesOf(plan: Plan): ByteRange[] {
   return [...plan.before, ...plan.ranges, ...plan.after];
 }
 
-/** The state at the end of a plan; its `bytes` are those of the surface's slices, sent or held. */
+/** The state at the end of a plan; its `bytes` are those of the surface's slices, sent or cached. */
 export function endOf(plan: Plan): Mark {
   return plan.marks[plan.marks.length - 1]!;
 }

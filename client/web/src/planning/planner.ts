@@ -18,10 +18,10 @@ import { absolute } from "./target";
  *
  * @throws OptionError if there is no such level or region, or not even the first layer fits into the allowed bytes.
  */
-export function plan(index: Index, target: Target = {}, held?: RangeSet): Plan {
+export function plan(index: Index, target: Target = {}, cached?: RangeSet): Plan {
   let chosen = whole(index, target);
   if (target.first !== undefined) chosen = regionFirst(index, chosen, target.first);
-  return held === undefined || held.size === 0 ? chosen : less(chosen, held);
+  return cached === undefined || cached.size === 0 ? chosen : less(chosen, cached);
 }
 
 function whole(index: Index, target: Target): Plan {
@@ -50,8 +50,8 @@ function prefix(index: Index, target: Target): Plan {
     rms: record.errors.rms,
     maxError: record.errors.maximum,
   }));
-  if (index.exactness !== null) {
-    const end = index.exactness.offset + index.exactness.length;
+  if (index.residual !== null) {
+    const end = index.residual.offset + index.residual.length;
     marks.push(markOfLevel(index.levels[index.levels.length - 1]!, end, marks.length));
   }
   const [kept, ended] = until(marks, target, index.header.extent);
@@ -100,27 +100,27 @@ function slicesOfLayers(index: Index, level: number): Plan {
     const record = index.layers[segment.layer]!;
     if (record.level <= level) {
       marks.push({
-        sent: slices.held,
+        sent: slices.total,
         number: segment.layer,
         level: record.level,
-        bytes: slices.held,
+        bytes: slices.total,
         rms: record.errors.rms,
         maxError: record.errors.maximum,
       });
     }
   }
-  const before = marks.filter((mark) => mark.sent < slices.held);
+  const before = marks.filter((mark) => mark.sent < slices.total);
   return {
     before: [index.index],
     ranges: slices.ranges,
     after: [index.metadata],
-    marks: [...before, markOfLevel(index.levels[level]!, slices.held)],
+    marks: [...before, markOfLevel(index.levels[level]!, slices.total)],
     ended: "level",
     prefix: false,
   };
 }
 
-/** Level order: level by level, the segments of all layers; the complete surface also has its exactness. */
+/** Level order: level by level, the segments of all layers; the complete surface also has its residual. */
 function byLevel(index: Index, target: Target, level: number): Plan {
   const { tiles, levels: finest } = index.header.layout;
   const slices = new Slices(index);
@@ -129,8 +129,8 @@ function byLevel(index: Index, target: Target, level: number): Plan {
   for (const segment of index.segments) ofLevel[tiles[segment.tile]!.level]!.push(segment.range);
   for (const state of index.levels.slice(0, level + 1)) {
     for (const place of ofLevel[state.level]!) slices.append(place);
-    if (state.level === finest && index.exactness !== null) slices.append(index.exactness);
-    marks.push(markOfLevel(state, slices.held));
+    if (state.level === finest && index.residual !== null) slices.append(index.residual);
+    marks.push(markOfLevel(state, slices.total));
   }
   const parts = { before: [index.index], after: [index.metadata], prefix: false };
   if (target.level !== undefined) {
@@ -140,7 +140,7 @@ function byLevel(index: Index, target: Target, level: number): Plan {
   return { ...parts, ranges: cut(slices.ranges, kept[kept.length - 1]!.sent), marks: kept, ended };
 }
 
-/** A window, or some attributes only: segments in file order or level by level, then pieces of exactness. */
+/** A window, or some attributes only: segments in file order or level by level, then chunks of the residual. */
 function selected(index: Index, target: Target): Plan {
   const chosen = select(index, target);
   const { tiles, levels } = index.header.layout;
@@ -160,14 +160,14 @@ function selected(index: Index, target: Target): Plan {
     const after = segments[number + 1];
     if (target.order === "level") {
       if (after === undefined || levelOf(after.tile) > own) {
-        marks.push(known(markOfLevel(index.levels[own]!, slices.held), partial));
+        marks.push(known(markOfLevel(index.levels[own]!, slices.total), partial));
       }
     } else if (after === undefined || after.layer > segment.layer) {
       // Layers of which nothing is wanted are there as well.
       const record = after === undefined ? index.layers[index.layers.length - 1]! : index.layers[after.layer - 1]!;
       const { rms, maximum: maxError } = record.errors;
       if (target.level === undefined || level <= target.level) {
-        const mark = { sent: slices.held, number: record.number, level, bytes: slices.held, rms, maxError };
+        const mark = { sent: slices.total, number: record.number, level, bytes: slices.total, rms, maxError };
         marks.push(known(mark, partial));
       }
     }
@@ -175,37 +175,37 @@ function selected(index: Index, target: Target): Plan {
   let last: Mark;
   let ended: Ended;
   if (finest < levels) {
-    last = known(markOfLevel(index.levels[finest]!, slices.held), partial);
+    last = known(markOfLevel(index.levels[finest]!, slices.total), partial);
     ended = "level";
   } else {
-    for (const piece of chosen.pieces.values()) slices.append(piece.range);
-    const number = chosen.pieces.size > 0 ? index.layers.length : index.layers.length - 1;
-    last = { ...markOfLevel(index.levels[index.levels.length - 1]!, slices.held, number), level: finest };
+    for (const chunk of chosen.chunks.values()) slices.append(chunk.range);
+    const number = chosen.chunks.size > 0 ? index.layers.length : index.layers.length - 1;
+    last = { ...markOfLevel(index.levels[index.levels.length - 1]!, slices.total, number), level: finest };
     ended = "complete";
   }
-  marks = [...marks.filter((mark) => mark.sent < slices.held), last];
+  marks = [...marks.filter((mark) => mark.sent < slices.total), last];
   if (target.level === undefined) [marks, ended] = until(marks, target, index.header.extent);
   const ranges = cut(slices.ranges, marks[marks.length - 1]!.sent);
   return { before: [index.index], ranges, after: [index.metadata], marks, ended, prefix: false };
 }
 
-function markOfLevel(state: LevelRecord, held: number, number: number = state.level): Mark {
+function markOfLevel(state: LevelRecord, bytes: number, number: number = state.level): Mark {
   const { rms, maximum: maxError } = state.errors;
-  return { sent: held, number, level: state.level, bytes: held, rms, maxError };
+  return { sent: bytes, number, level: state.level, bytes, rms, maxError };
 }
 
 function known(mark: Mark, partial: boolean): Mark {
   return partial ? { ...mark, rms: Number.NaN, maxError: Number.NaN } : mark;
 }
 
-/** Slices of the surface after its header, joined where they touch; `held` is their length. */
+/** Slices of the surface after its header, joined where they touch; `total` is their length. */
 class Slices {
   readonly ranges: ByteRange[];
-  held: number;
+  total: number;
 
   constructor(index: Index) {
-    this.held = index.header.length;
-    this.ranges = [{ offset: 0, length: this.held }];
+    this.total = index.header.length;
+    this.ranges = [{ offset: 0, length: this.total }];
   }
 
   append(place: ByteRange): void {
@@ -215,7 +215,7 @@ class Slices {
     } else {
       this.ranges.push(place);
     }
-    this.held += place.length;
+    this.total += place.length;
   }
 }
 
@@ -230,15 +230,15 @@ function cut(ranges: readonly ByteRange[], length: number): ByteRange[] {
   return kept;
 }
 
-/** The plan without what is held; each mark stands where the last missing byte before it does. */
-function less(chosen: Plan, held: RangeSet): Plan {
+/** The plan without what is cached; each mark stands where the last missing byte before it does. */
+function less(chosen: Plan, cached: RangeSet): Plan {
   const marks: Mark[] = [];
   const ranges: ByteRange[] = [];
   let todo = 0;
   let planned = 0;
   let sent = 0;
   for (const place of chosen.ranges) {
-    const gaps = missing(place, held);
+    const gaps = missing(place, cached);
     // Marks and gaps both go forward: each gap is looked at once, however many marks there are.
     let passed = 0;
     for (; todo < chosen.marks.length; todo++) {
@@ -256,17 +256,17 @@ function less(chosen: Plan, held: RangeSet): Plan {
     for (; passed < gaps.length; passed++) sent += gaps[passed]!.length;
     ranges.push(...gaps);
   }
-  // What is held beyond a state that has no figures of its own counts too.
+  // What is cached beyond a state that has no figures of its own counts too.
   const ahead = endOf(chosen).bytes - sent;
   return {
     ...chosen,
-    before: chosen.before.flatMap((place) => missing(place, held)),
+    before: chosen.before.flatMap((place) => missing(place, cached)),
     ranges,
-    after: chosen.after.flatMap((place) => missing(place, held)),
+    after: chosen.after.flatMap((place) => missing(place, cached)),
     marks: marks.map((mark) => (Number.isNaN(mark.rms) ? { ...mark, bytes: ahead + mark.sent } : mark)),
   };
 }
 
-function missing(place: ByteRange, held: RangeSet): ByteRange[] {
-  return [...held.missing(place.offset, place.length)].map(([offset, length]) => ({ offset, length }));
+function missing(place: ByteRange, cached: RangeSet): ByteRange[] {
+  return [...cached.missing(place.offset, place.length)].map(([offset, length]) => ({ offset, length }));
 }

@@ -4,7 +4,7 @@ import type { Index } from "../container/model";
 import type { ByteRange, Region } from "../types";
 import { RangeSet } from "./byte-ranges";
 import type { Mark, Plan } from "./plan";
-import { checkWish, wishedTiles } from "./selection";
+import { checkSelection, selectedTiles } from "./selection";
 
 /** A mark, and of the bytes before it in the plan's order those that now come ahead and behind. */
 interface Step {
@@ -25,8 +25,8 @@ interface Step {
  * @throws OptionError if the surface has no such region, or several blocks.
  */
 export function regionFirst(index: Index, chosen: Plan, region: Region): Plan {
-  checkWish({ region }, index.header);
-  const tiles = wishedTiles({ region }, index.header);
+  checkSelection({ region }, index.header);
+  const tiles = selectedTiles({ region }, index.header);
   const near = new RangeSet(
     index.segments.filter((segment) => tiles[segment.tile]).map(({ range }) => [range.offset, range.length] as const),
   );

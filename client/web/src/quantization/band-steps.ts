@@ -29,8 +29,8 @@ function along(band: Band, level: number, layout: Layout, axis: 0 | 1): number {
   const first = Math.max(level, 1);
   let count = 0;
   let details: boolean = band.kind[axis];
-  if (layout.grids[band.grid]!.curve && axis === 1) {
-    // The points of a curve reach across the parts beside it, as nodes do.
+  if (layout.grids[band.grid]!.interface && axis === 1) {
+    // The points of an interface reach across the patches beside it, as nodes do.
     count = layout.levels + 1 - first;
     details = false;
   } else {

@@ -1,4 +1,4 @@
-/** Pieces that turn restored values into the original ones, bit for bit (docs/format.md, section 9). */
+/** Chunks that turn restored values into the original ones, bit for bit (docs/format.md, section 9). */
 import { CorruptStreamError } from "../errors";
 import type { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
@@ -8,16 +8,16 @@ const RULE = { raw: 0, patterns: 1, decimals: 2, offsets: 3 } as const;
 const MOST_DECIMALS = 15;
 /** Contexts and memory of differences, contexts of offsets, and the most bits of an offset. */
 const [DIFFERENCES_MODEL, DIFFERENCES_MEMORY, OFFSETS_MODEL, MOST_BITS] = [294, 1 << 14, 147, 34];
-/** Bytes of a piece of offsets before those that are coded: rule and step. */
+/** Bytes of a chunk of offsets before those that are coded: rule and step. */
 const OFFSETS_HEAD = 9;
 
 /**
- * The original values of a piece, which stands at `offset` of the container, as bytes.
+ * The original values of a chunk, which stands at `offset` of the container, as bytes.
  *
  * `restored` are the bytes of the values that the layers give. Takes memory in proportion to these, whatever the data.
  * Throws `CorruptStreamError` where the data do not hold one difference for each value.
  */
-export function decodePiece(
+export function decodeChunk(
   arena: Arena,
   restored: Uint8Array,
   dtype: DType,
@@ -29,7 +29,7 @@ export function decodePiece(
   const count = restored.length / size;
   if (data.length > 1 + restored.length) {
     throw new CorruptStreamError(
-      `expected at most ${1 + restored.length} bytes of exactness for ${count} values, got ${data.length}`,
+      `expected at most ${1 + restored.length} bytes of residual for ${count} values, got ${data.length}`,
       offset,
     );
   }
@@ -45,7 +45,7 @@ export function decodePiece(
   const floats = dtype === "float32" || dtype === "float64";
   const limit = rule === RULE.patterns ? 8 * size - 1 : MOST_DECIMALS;
   if (rule === RULE.raw || argument > limit || (rule === RULE.decimals && !floats)) {
-    throw new CorruptStreamError(`expected a rule of exactness for ${dtype} values, got ${data[0]}`, offset);
+    throw new CorruptStreamError(`expected a rule of residual for ${dtype} values, got ${data[0]}`, offset);
   }
   return decodeDifferences(arena, restored, dtype, rule, argument, data, offset);
 }
@@ -68,10 +68,7 @@ function decodeDifferences(
   const { length, start } = readLength(data, 3 + specials * size);
   const end = start + length;
   if (data.length < end) {
-    throw new CorruptStreamError(
-      `expected exactness of at least ${end} bytes, got ${data.length}`,
-      offset + data.length,
-    );
+    throw new CorruptStreamError(`expected a chunk of at least ${end} bytes, got ${data.length}`, offset + data.length);
   }
   return arena.scope(() => {
     const { kernels } = arena;
@@ -129,7 +126,7 @@ function decodeOffsets(
   offset: number,
 ): Uint8Array {
   if (dtype !== "float32" || bits > MOST_BITS || data.length < OFFSETS_HEAD) {
-    throw new CorruptStreamError(`expected a rule of exactness for ${dtype} values, got ${data[0]}`, offset);
+    throw new CorruptStreamError(`expected a rule of residual for ${dtype} values, got ${data[0]}`, offset);
   }
   const step = new DataView(data.buffer, data.byteOffset + 1, 8).getFloat64(0, true);
   if (!(Number.isFinite(step) && step > 0)) {
@@ -148,7 +145,7 @@ function decodeOffsets(
     const read = accepted(arena.kernels.offsets(bases, line, count, bits, places, model, coded, length), "offsets");
     if (length > read) {
       const most = OFFSETS_HEAD + read;
-      throw new CorruptStreamError(`expected at most ${most} bytes of exactness, got ${data.length}`, offset + most);
+      throw new CorruptStreamError(`expected at most ${most} bytes of residual, got ${data.length}`, offset + most);
     }
     arena.kernels.offset_values(places, count, values);
     return arena.u8(values, restored.length).slice();

@@ -3,34 +3,34 @@
 import { MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
 import type { Journey } from "./journey";
-import { type Part, RangeDownload } from "./range-download";
-import type { PartAnswer, PartSource } from "./range-sources";
+import { RangeDownload, type RangeRequest } from "./range-download";
+import type { RangeAnswer, RangeSource } from "./range-sources";
 import { seconds } from "./waiting";
 
 /** A request under way: its answer once there is one, and what comes next of it. */
 interface Flight {
-  readonly part: Part;
+  readonly request: RangeRequest;
   readonly abort: AbortController;
-  answer?: PartAnswer;
+  answer?: RangeAnswer;
   next: Promise<Landed>;
 }
 
-/** An answer, or a piece of its body; undefined at its end. */
+/** An answer, or bytes of its body; undefined at its end. */
 interface Landed {
   readonly flight: Flight;
-  readonly answer?: PartAnswer;
-  readonly piece?: Uint8Array | undefined;
+  readonly answer?: RangeAnswer;
+  readonly slice?: Uint8Array | undefined;
 }
 
 /** Up to two requests at a time. */
-export class PartsRoad<View extends ViewInfo> {
+export class RangeTransport<View extends ViewInfo> {
   private readonly download: RangeDownload<View>;
   private readonly flights = new Set<Flight>();
   private turns = 0;
 
   constructor(
     private readonly journey: Journey<View>,
-    private readonly source: PartSource,
+    private readonly source: RangeSource,
     version?: string,
   ) {
     this.download = new RangeDownload(journey.reception, version);
@@ -80,64 +80,64 @@ export class PartsRoad<View extends ViewInfo> {
   private turn(): void {
     if (this.turns === this.journey.turns) return;
     this.turns = this.journey.turns;
-    for (const flight of [...this.flights]) if (flight.part.left > MIN_WINDOW) this.leave(flight);
+    for (const flight of [...this.flights]) if (flight.request.left > MIN_WINDOW) this.leave(flight);
   }
 
   private ask(): void {
     for (;;) {
-      let part: Part | undefined;
+      let request: RangeRequest | undefined;
       this.journey.take(() => {
         const asked = this.download.request(seconds());
-        part = asked.part;
+        request = asked.request;
         return asked.views;
       });
-      if (part === undefined) return;
-      this.launch(part);
+      if (request === undefined) return;
+      this.launch(request);
     }
   }
 
-  private launch(part: Part): void {
+  private launch(request: RangeRequest): void {
     const abort = new AbortController();
-    const asked = this.source.ask(part, () => this.journey.patience(), abort.signal);
-    const flight: Flight = { part, abort, next: asked.then((answer) => ({ flight, answer })) };
+    const asked = this.source.ask(request, () => this.journey.patience(), abort.signal);
+    const flight: Flight = { request, abort, next: asked.then((answer) => ({ flight, answer })) };
     flight.next.catch(ignore);
     this.flights.add(flight);
   }
 
-  private async land({ flight, answer, piece }: Landed): Promise<void> {
+  private async land({ flight, answer, slice }: Landed): Promise<void> {
     const { journey, download } = this;
     if (answer !== undefined) {
-      download.answer(flight.part, answer.status, answer.headers, seconds());
+      download.answer(flight.request, answer.status, answer.headers, seconds());
       journey.met();
       flight.answer = answer;
-    } else if (piece !== undefined) {
-      await this.use(flight.part, piece);
+    } else if (slice !== undefined) {
+      await this.use(flight.request, slice);
     } else {
       this.flights.delete(flight);
-      download.finish(flight.part, seconds());
+      download.finish(flight.request, seconds());
       return;
     }
-    // The next piece is asked for when this one has been used.
-    flight.next = flight.answer!.read().then((next) => ({ flight, piece: next }));
+    // More is asked for when these bytes have been used.
+    flight.next = flight.answer!.read().then((next) => ({ flight, slice: next }));
     flight.next.catch(ignore);
   }
 
-  /** Take a piece of an answer, at a limited rate little by little. */
-  private async use(part: Part, piece: Uint8Array): Promise<void> {
+  /** Take bytes of an answer, at a limited rate little by little. */
+  private async use(request: RangeRequest, slice: Uint8Array): Promise<void> {
     const { journey, download } = this;
-    for (let start = 0; start < piece.length && !journey.stopped; ) {
-      const portion = piece.subarray(start, start + journey.portion);
+    for (let start = 0; start < slice.length && !journey.stopped; ) {
+      const portion = slice.subarray(start, start + journey.portion);
       await journey.pace(portion.length);
       this.tick();
       if (journey.reception.ended !== undefined) return;
-      journey.take(() => download.receive(part, portion));
+      journey.take(() => download.receive(request, portion));
       start += portion.length;
     }
   }
 
   private leave(flight: Flight): void {
     this.flights.delete(flight);
-    this.download.leave(flight.part);
+    this.download.leave(flight.request);
     flight.abort.abort();
   }
 }

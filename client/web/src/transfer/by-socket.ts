@@ -11,7 +11,7 @@ import { isClosing, Socket, type SocketClass } from "./socket";
 import { seconds } from "./waiting";
 
 /** One connection at a time. */
-export class SocketRoad<View extends ViewInfo> {
+export class SocketTransport<View extends ViewInfo> {
   private download: Download<View> | undefined;
   private socket: Socket | undefined;
 

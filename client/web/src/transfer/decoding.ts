@@ -10,7 +10,7 @@ import type { Header } from "../container/header";
 import type { Index } from "../container/model";
 import type { Region, ViewInfo } from "../types";
 
-/** Decodes a container piece by piece, and gives a view for each state whose errors are known. */
+/** Decodes a container as its bytes come, and gives a view for each state whose errors are known. */
 export interface StreamDecoder<View extends ViewInfo> {
   /** What the header says, once it and the masks after it have come. */
   readonly header: Header | null;
@@ -26,9 +26,9 @@ export interface StreamDecoder<View extends ViewInfo> {
   /**
    * Decode a slice of the container that starts at `offset`; returns the views that it completes.
    *
-   * Slices come in the order of a plan. They may be cut into pieces of any size.
+   * Slices come in the order of a plan. They may be cut anywhere.
    */
-  feedAt(offset: number, chunk: Uint8Array): View[];
+  feedAt(offset: number, data: Uint8Array): View[];
 
   /** Announce another order of the bytes: first what a region needs; with null, the plan's own order. */
   focus(region: Region | null): void;

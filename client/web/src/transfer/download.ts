@@ -7,9 +7,9 @@ import { Connection } from "../protocol/connection";
 import { Window } from "../protocol/flow-control";
 import { CODES, type Header, type Layer, MAX_HELD, type Segments } from "../protocol/messages";
 import type { Region, Target, ViewInfo } from "../types";
-import type { Reception } from "./receiver-state";
+import type { ReceiverState } from "./receiver-state";
 
-/** What may be given to a download beside its reception. */
+/** What may be given to a download beside its receiver state. */
 export interface DownloadOptions {
   /**
    * Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it is
@@ -25,7 +25,8 @@ export interface DownloadOptions {
  *
  * The caller moves messages: it passes each received message to `receive`, and sends whatever `dataToSend` returns, at
  * the start and after every call. When the stream has ended, what `dataToSend` then returns is the last message, and the
- * server closes the connection. If the connection breaks earlier, another `Download` with the same reception continues.
+ * server closes the connection. If the connection breaks earlier, another `Download` with the same receiver state
+ * continues.
  */
 export class Download<View extends ViewInfo> {
   /** The server's first message. */
@@ -44,11 +45,11 @@ export class Download<View extends ViewInfo> {
   private outbox: Uint8Array[];
 
   constructor(
-    readonly reception: Reception<View>,
+    readonly reception: ReceiverState<View>,
     options: DownloadOptions = {},
   ) {
     this.window = new Window(options.window);
-    // Of a container that is not known by name, nothing can be said to be held.
+    // Of a container that is not known by name, nothing can be said to be cached.
     const held = reception.container === undefined ? [] : largest(reception);
     this.opening = this.openWith(held, reception.container, options.token);
     this.outbox = [this.opening];
@@ -124,7 +125,7 @@ export class Download<View extends ViewInfo> {
   /**
    * Request something else of the same surface, before the stream has ended. The next answer to it is a new header.
    *
-   * @throws OptionError see `Reception.retarget`.
+   * @throws OptionError see `ReceiverState.retarget`.
    */
   retarget(target: Target): void {
     this.reception.retarget(target);
@@ -132,7 +133,7 @@ export class Download<View extends ViewInfo> {
   }
 
   /**
-   * End the current order, and open again with the changed target of the reception.
+   * End the current order, and open again with the changed target of the receiver state.
    *
    * @param aiming Whether more than the region that comes first has changed, so that what is under way may end and the
    * next target still be wanted.
@@ -236,9 +237,9 @@ export class Download<View extends ViewInfo> {
   }
 }
 
-/** What is held, the smallest ranges left out where there are more than a message may name. */
-function largest(reception: Reception<ViewInfo>): Place[] {
-  const ranges = [...reception.held];
+/** What is cached, the smallest ranges left out where there are more than a message may name. */
+function largest(reception: ReceiverState<ViewInfo>): Place[] {
+  const ranges = [...reception.cached];
   if (ranges.length <= MAX_HELD) return ranges;
   return ranges
     .sort((a, b) => b[1] - a[1])

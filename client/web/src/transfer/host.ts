@@ -35,12 +35,12 @@ export class Host implements Questions {
     const { source, options, kept } = opening;
     const target = makeTarget(opening.target);
     const { region, attributes, level } = target;
-    const wish = { region, attributes, maxVertices: opening.maxVertices ?? null };
+    const selection = { region, attributes, maxVertices: opening.maxVertices ?? null };
     // A later target may want more than this level, see `aim`.
-    this.decoder = new Decoder(await loadKernels(), level === undefined ? wish : { ...wish, level });
+    this.decoder = new Decoder(await loadKernels(), level === undefined ? selection : { ...selection, level });
     if (opening.keep || kept !== undefined) {
       this.store = new MemoryStore(opening.keep);
-      for (const [offset, data] of kept?.pieces ?? []) {
+      for (const [offset, data] of kept?.slices ?? []) {
         for (const [start, length] of [...this.store.ranges.missing(offset, data.length)]) {
           this.store.write(start, data.subarray(start - offset, start - offset + length));
         }
@@ -117,7 +117,7 @@ export class Host implements Questions {
 
   kept(): Kept {
     const { container, size } = this.own.reception;
-    return { container, size, version: this.own.version, pieces: this.store?.all() ?? [] };
+    return { container, size, version: this.own.version, slices: this.store?.all() ?? [] };
   }
 
   private get own(): Stream<View> {

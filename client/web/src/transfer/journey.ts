@@ -1,13 +1,13 @@
-/** What the roads to a surface, a WebSocket and HTTP Range, need of the stream that takes them. */
+/** What the transports of a surface, a WebSocket and HTTP Range, need of the stream that uses them. */
 
 import type { ViewInfo } from "../types";
-import type { Reception } from "./receiver-state";
+import type { ReceiverState } from "./receiver-state";
 import type { Waiting } from "./waiting";
 
-/** A stream as its road sees it. */
+/** A stream as its transport sees it. */
 export interface Journey<View extends ViewInfo> {
   /** What has arrived so far. */
-  readonly reception: Reception<View>;
+  readonly reception: ReceiverState<View>;
   /** Woken when `stopped` or `turns` changes, or the stream is to be closed. */
   readonly waiting: Waiting;
   /** Whether this side has stopped. */

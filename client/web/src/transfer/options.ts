@@ -4,7 +4,7 @@ import type { Ended } from "../planning/plan";
 import type { Sink } from "./receiver-state";
 import type { SocketClass } from "./socket";
 import type { Store } from "./store";
-import type { Pauses, Road, Transport } from "./transports";
+import type { Pauses, Transport, UsedTransport } from "./transports";
 
 /** What a stream is doing. */
 export type Phase = "idle" | "connecting" | "streaming" | "reconnecting" | "ended";
@@ -13,7 +13,7 @@ export type Phase = "idle" | "connecting" | "streaming" | "reconnecting" | "ende
 export interface StreamState {
   readonly phase: Phase;
   /** The transport in use: a WebSocket, HTTP Range, or a file of this machine. */
-  readonly transport: Road | "file";
+  readonly transport: UsedTransport | "file";
   /** While reconnecting: what became of the last connection, and the seconds until the next attempt. */
   readonly problem?: string;
   readonly pause?: number;
@@ -23,7 +23,7 @@ export interface StreamState {
 
 /** How far a stream has come. */
 export interface Progress {
-  /** Bytes of the surface that are held, and that the target needs; undefined until that is known. */
+  /** Bytes of the surface that are cached, and that the target needs; undefined until that is known. */
   readonly received: number;
   readonly planned: number | undefined;
   /** Bytes of the container, once they are known. */
@@ -56,7 +56,7 @@ export interface PlainStreamOptions {
   readonly window?: number | undefined;
   /** Give only the newest view to whoever is slower than the stream, which then does not wait. */
   readonly latest?: boolean | undefined;
-  /** SHA-256 and size of the container that bytes are held of. */
+  /** SHA-256 and size of the container that bytes are cached of. */
   readonly container?: string | undefined;
   readonly size?: number | undefined;
   /** Seconds between attempts. */
@@ -71,7 +71,7 @@ export interface StreamOptions extends PlainStreamOptions {
   readonly onProgress?: ((progress: Progress) => void) | undefined;
   /** Called with bytes of the container that had not come before; by then it is known which container it is. */
   readonly onBytes?: Sink | undefined;
-  /** Bytes that are held already, and where others are kept. */
+  /** Bytes that are cached already, and where others are kept. */
   readonly store?: Store | undefined;
   /** What tells the version of the file that they belong to: its entity tag, or else its date. */
   readonly version?: string | undefined;

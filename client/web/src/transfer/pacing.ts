@@ -26,7 +26,7 @@ export class Link {
     if (!(rate > 0)) throw new OptionError(`expected a positive rate, got ${rate}`);
   }
 
-  /** Bytes of a piece that arrives at once: a twentieth of a second's. */
+  /** Bytes that arrive at once: a twentieth of a second's. */
   get portion(): number {
     return Math.max(Math.round(this.rate / 20), PORTION_LEAST);
   }

@@ -24,7 +24,7 @@ export function pricesOf(index: Index): Price[] {
     rms: errors.rms,
     maxError: errors.maximum,
   }));
-  if (index.exactness !== null) {
+  if (index.residual !== null) {
     const { rms, maximum } = index.levels[index.levels.length - 1]!.errors;
     prices.push({ bytes: index.surfaceEnd, level: index.header.levels, rms, maxError: maximum });
   }
@@ -92,13 +92,13 @@ async function bounded(response: Response): Promise<string> {
   let text = "";
   let left = LONGEST;
   for (;;) {
-    const piece = (await reader?.read())?.value;
-    if (piece === undefined) return text + decoder.decode();
-    left -= piece.length;
+    const slice = (await reader?.read())?.value;
+    if (slice === undefined) return text + decoder.decode();
+    left -= slice.length;
     if (left < 0) {
       await reader?.cancel();
       throw new RemoteProtocolError(`expected an answer of at most ${LONGEST} bytes, got more`);
     }
-    text += decoder.decode(piece, { stream: true });
+    text += decoder.decode(slice, { stream: true });
   }
 }

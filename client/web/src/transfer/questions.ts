@@ -18,7 +18,7 @@ export interface Kept {
   /** What tells this version of a file on a web server from others: its entity tag, or else its date. */
   readonly version: string | undefined;
   /** Runs of its bytes, by where they begin, in any order. */
-  readonly pieces: readonly (readonly [offset: number, data: Uint8Array])[];
+  readonly slices: readonly (readonly [offset: number, data: Uint8Array])[];
 }
 
 /** What is known of a surface before its values. */

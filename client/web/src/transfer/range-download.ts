@@ -10,12 +10,12 @@ import { RemoteError, RemoteProtocolError, TruncatedStreamError } from "../error
 import { type Place, RangeSet } from "../planning/byte-ranges";
 import { MAX_CREDIT, MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
-import type { Reception } from "./receiver-state";
+import type { ReceiverState } from "./receiver-state";
 import { inFileOrder } from "./safe-prefix";
 
 // The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
-// pictures come with them, and more where it is known that more is wanted. The last ones, some and a share of the file,
-// hold index and metadata of most. Where they do not, one more request brings the rest.
+// reconstructions come with them, and more where it is known that more is wanted. The last ones, some and a share of
+// the file, hold index and metadata of most. Where they do not, one more request brings the rest.
 const HEAD = 4096;
 const FIRST = MIN_WINDOW;
 const FIRST_MOST = MAX_CREDIT;
@@ -24,7 +24,7 @@ const TAIL_LEAST = 2048;
 const TAIL_MOST = 64 * 1024;
 
 /** The most requests under way at once: while one answer arrives, the next one is on its way. */
-export const MOST_PARTS = 2;
+export const MOST_REQUESTS = 2;
 
 const CONTENT_RANGE = /^\s*bytes\s+(\d{1,15})-(\d{1,15})\/(\d{1,15})\s*$/;
 const CONTAINER_TAG = /^"([0-9a-f]{64})"$/;
@@ -34,14 +34,14 @@ export interface AnswerHeaders {
   get(name: string): string | null;
 }
 
-/** One request for a range of the file, and its answer: `answer`, then `receive` for each piece, then `finish`. */
-export class Part {
+/** One request for a range of the file, and its answer: `answer`, then `receive` for its bytes, then `finish`. */
+export class RangeRequest {
   /** The range; the file may end before. */
   readonly offset: number;
   readonly length: number;
   /** Headers of the request. */
   readonly headers: Readonly<Record<string, string>>;
-  /** Where the next piece of the body stands in the file. */
+  /** Where the next bytes of the body stand in the file. */
   position: number;
   answeredAt: number | undefined;
 
@@ -69,7 +69,7 @@ export class Part {
 
 /** What `request` gives: a request to make, if there is one now, and views that follow from what has arrived. */
 export interface Asked<View> {
-  readonly part: Part | undefined;
+  readonly request: RangeRequest | undefined;
   readonly views: View[];
 }
 
@@ -77,8 +77,8 @@ export interface Asked<View> {
  * Receiving a surface over HTTP Range: requests out, parts of the file in.
  *
  * The caller makes the request that `request` gives, passes status and headers of its answer to `answer` and its body,
- * in pieces of any size, to `receive`, then calls `finish`. It may ask for another request while up to `MOST_PARTS`
- * are under way. With no request under way and none given, the reception has ended. If a connection breaks, the caller
+ * cut anywhere, to `receive`, then calls `finish`. It may ask for another request while up to `MOST_REQUESTS`
+ * are under way. With no request under way and none given, the stream has ended. If a connection breaks, the caller
  * calls `leave`, and continues with the next `request`.
  */
 export class RangeDownload<View extends ViewInfo> {
@@ -88,11 +88,11 @@ export class RangeDownload<View extends ViewInfo> {
   private etag: string | undefined;
   private needed: Place | undefined;
   private gap = MIN_WINDOW;
-  private readonly parts = new Set<Part>();
+  private readonly underWay = new Set<RangeRequest>();
 
-  /** @param version See `version`, of a file of which something is held. */
+  /** @param version See `version`, of a file of which something is cached. */
   constructor(
-    readonly reception: Reception<View>,
+    readonly reception: ReceiverState<View>,
     version?: string,
   ) {
     this.validator = version;
@@ -106,7 +106,7 @@ export class RangeDownload<View extends ViewInfo> {
   }
 
   /**
-   * The next request, if one can be made now; with none under way and none made, the reception has ended.
+   * The next request, if one can be made now; with none under way and none made, the stream has ended.
    *
    * @param now Seconds of any clock that does not go back. The measured round-trip time and rate decide which slices
    * are requested together.
@@ -116,24 +116,24 @@ export class RangeDownload<View extends ViewInfo> {
    */
   request(now?: number): Asked<View> {
     const views: View[] = [];
-    if (this.reception.ended !== undefined || this.parts.size >= MOST_PARTS) return { part: undefined, views };
+    if (this.reception.ended !== undefined || this.underWay.size >= MOST_REQUESTS) return { request: undefined, views };
     let place: Place | undefined;
     if (this.reception.plan === undefined) {
       place = this.first();
-      if (place === undefined && this.endsHeld()) {
+      if (place === undefined && this.endsCached()) {
         views.push(...this.readIndex());
         place = this.first();
       }
     }
     if (this.reception.plan !== undefined) {
       place = this.nextSlices();
-      if (place === undefined && this.parts.size === 0) this.reception.end(this.reception.plan.ended);
+      if (place === undefined && this.underWay.size === 0) this.reception.end(this.reception.plan.ended);
     }
-    if (place === undefined) return { part: undefined, views };
-    const part = new Part(place, this.etag, now);
-    this.parts.add(part);
+    if (place === undefined) return { request: undefined, views };
+    const request = new RangeRequest(place, this.etag, now);
+    this.underWay.add(request);
     this.requests += 1;
-    return { part, views };
+    return { request, views };
   }
 
   /**
@@ -142,11 +142,13 @@ export class RangeDownload<View extends ViewInfo> {
    * @throws RemoteProtocolError if the server does not support Range, or the answer does not match the request.
    * @throws RemoteError with the code `other-container` if the file has changed.
    */
-  answer(part: Part, status: number, headers: AnswerHeaders, now?: number): void {
-    part.answeredAt = now;
+  answer(request: RangeRequest, status: number, headers: AnswerHeaders, now?: number): void {
+    request.answeredAt = now;
     this.checkSame(headers, status);
     if (status === 416) {
-      throw new TruncatedStreamError(`expected a container of at least ${part.offset + 1} bytes, got a shorter file`);
+      throw new TruncatedStreamError(
+        `expected a container of at least ${request.offset + 1} bytes, got a shorter file`,
+      );
     }
     if (status !== 206) {
       throw new RemoteProtocolError(
@@ -160,40 +162,40 @@ export class RangeDownload<View extends ViewInfo> {
     }
     const told = headers.get("content-range");
     const found = CONTENT_RANGE.exec(told ?? "");
-    if (found === null || Number(found[1]) !== part.offset) {
+    if (found === null || Number(found[1]) !== request.offset) {
       const hidden = told === null ? " (a server of another site has to expose this header to pages)" : "";
       throw new RemoteProtocolError(
-        `expected Content-Range to be bytes ${part.offset}-..., got ${told === null ? "none" : printable(told)}${hidden}`,
+        `expected Content-Range to be bytes ${request.offset}-..., got ${told === null ? "none" : printable(told)}${hidden}`,
       );
     }
     const size = Number(found[3]);
-    if (Number(found[2]) !== Math.min(part.end, size) - 1) {
+    if (Number(found[2]) !== Math.min(request.end, size) - 1) {
       throw new RemoteProtocolError(
-        `expected ${part.length} bytes from ${part.offset} on, got bytes ${printable(found[0])}`,
+        `expected ${request.length} bytes from ${request.offset} on, got bytes ${printable(found[0])}`,
       );
     }
     this.reception.identify(CONTAINER_TAG.exec(this.etag ?? "")?.[1], size);
   }
 
   /**
-   * Take a piece of the body of an answer; returns the views that it completes.
+   * Take more of the body of an answer; returns the views that it completes.
    *
    * @throws CorruptStreamError if the bytes of the container are damaged.
    * @throws RemoteProtocolError if there are more bytes than requested.
    */
-  receive(part: Part, chunk: Uint8Array): View[] {
-    this.reception.wireBytes += chunk.length;
-    const start = part.position;
-    part.position += chunk.length;
-    if (part.position > part.end) {
-      throw new RemoteProtocolError(`expected ${part.length} bytes of the file, got more`);
+  receive(request: RangeRequest, data: Uint8Array): View[] {
+    this.reception.wireBytes += data.length;
+    const start = request.position;
+    request.position += data.length;
+    if (request.position > request.end) {
+      throw new RemoteProtocolError(`expected ${request.length} bytes of the file, got more`);
     }
     const views: View[] = [];
     // Until the index is known everything may be of use; then what lies between two slices is not kept.
     const places: Iterable<Place> =
-      this.reception.plan === undefined ? [[start, chunk.length]] : this.reception.wanted(start, chunk.length);
+      this.reception.plan === undefined ? [[start, data.length]] : this.reception.wanted(start, data.length);
     for (const [offset, length] of [...places]) {
-      views.push(...this.reception.take(offset, chunk.subarray(offset - start, offset - start + length)));
+      views.push(...this.reception.take(offset, data.subarray(offset - start, offset - start + length)));
     }
     return views;
   }
@@ -203,19 +205,19 @@ export class RangeDownload<View extends ViewInfo> {
    *
    * @throws TruncatedStreamError if the body was shorter than announced; the next `request` asks for the rest.
    */
-  finish(part: Part, now?: number): void {
-    this.parts.delete(part);
-    const expected = Math.min(part.length, (this.reception.size ?? 0) - part.offset);
-    const got = part.position - part.offset;
+  finish(request: RangeRequest, now?: number): void {
+    this.underWay.delete(request);
+    const expected = Math.min(request.length, (this.reception.size ?? 0) - request.offset);
+    const got = request.position - request.offset;
     if (got < expected) {
-      throw new TruncatedStreamError(`expected ${expected} bytes of the file from ${part.offset} on, got ${got}`);
+      throw new TruncatedStreamError(`expected ${expected} bytes of the file from ${request.offset} on, got ${got}`);
     }
-    this.measure(part, got, now);
+    this.measure(request, got, now);
   }
 
   /** Declare that the rest of an answer is not read. */
-  leave(part: Part): void {
-    this.parts.delete(part);
+  leave(request: RangeRequest): void {
+    this.underWay.delete(request);
   }
 
   /** Stop; the caller closes the connections. `why`: stopped or seconds. */
@@ -226,11 +228,11 @@ export class RangeDownload<View extends ViewInfo> {
   }
 
   /** Bytes that come in one round trip: skipping fewer would cost more than taking them. */
-  private measure(part: Part, got: number, now: number | undefined): void {
-    if (now === undefined || part.askedAt === undefined || part.answeredAt === undefined) return;
-    const roundTrip = part.answeredAt - part.askedAt;
+  private measure(request: RangeRequest, got: number, now: number | undefined): void {
+    if (now === undefined || request.askedAt === undefined || request.answeredAt === undefined) return;
+    const roundTrip = request.answeredAt - request.askedAt;
     if (got < MIN_WINDOW || roundTrip <= 0) return;
-    const rate = got / Math.max(now - part.answeredAt, roundTrip);
+    const rate = got / Math.max(now - request.answeredAt, roundTrip);
     this.gap = Math.round(Math.min(Math.max(rate * roundTrip, MIN_WINDOW), MAX_CREDIT));
   }
 
@@ -248,16 +250,16 @@ export class RangeDownload<View extends ViewInfo> {
     this.validator = validator ?? this.validator;
   }
 
-  /** What is neither held nor under way of a range, in order. */
+  /** What is neither cached nor under way of a range, in order. */
   private *open(offset: number, length: number): Generator<Place> {
-    const coming = new RangeSet([...this.parts].map((part) => [part.position, part.left] as const));
-    for (const gap of this.reception.held.missing(offset, length)) yield* coming.missing(...gap);
+    const coming = new RangeSet([...this.underWay].map((request) => [request.position, request.left] as const));
+    for (const gap of this.reception.cached.missing(offset, length)) yield* coming.missing(...gap);
   }
 
   /** What to ask for before the index can be looked for. */
   private first(): Place | undefined {
     // How long the file is, the first answer tells.
-    if (this.reception.size === undefined) return this.parts.size === 0 ? [0, this.beginning()] : undefined;
+    if (this.reception.size === undefined) return this.underWay.size === 0 ? [0, this.firstBytes()] : undefined;
     for (const place of this.ends(this.reception.size)) for (const gap of this.open(...place)) return gap;
     return undefined;
   }
@@ -272,15 +274,15 @@ export class RangeDownload<View extends ViewInfo> {
     return this.needed === undefined ? places : [...places, this.needed];
   }
 
-  private endsHeld(): boolean {
-    const { size, held } = this.reception;
-    return size !== undefined && this.ends(size).every((place) => held.covers(...place));
+  private endsCached(): boolean {
+    const { size, cached } = this.reception;
+    return size !== undefined && this.ends(size).every((place) => cached.covers(...place));
   }
 
   /** How many bytes to ask for first, of a file of which nothing is known. */
-  private beginning(): number {
-    const { target, held } = this.reception;
-    if (!inFileOrder(target) || held.total > 0) return HEAD;
+  private firstBytes(): number {
+    const { target, cached } = this.reception;
+    if (!inFileOrder(target) || cached.total > 0) return HEAD;
     if (target.maxBytes !== undefined) return Math.min(Math.max(target.maxBytes, HEAD), FIRST_MOST);
     const limited = target.untilRms ?? target.untilMax ?? target.seconds;
     return limited === undefined ? FIRST_MOST : FIRST;
@@ -292,7 +294,7 @@ export class RangeDownload<View extends ViewInfo> {
     return "views" in found ? found.views : [];
   }
 
-  /** The next slice that is missing, with those after it that are near and nothing between that is held. */
+  /** The next slice that is missing, with those after it that are near and nothing between that is cached. */
   private nextSlices(): Place | undefined {
     let start = -1;
     let end = -1;

@@ -3,34 +3,34 @@
 import { LodestreamError, SilenceError, TruncatedStreamError, UnreachableError } from "../errors";
 import { sameOrigin } from "./addresses";
 import { fromResponse } from "./problems";
-import type { AnswerHeaders, Part } from "./range-download";
+import type { AnswerHeaders, RangeRequest } from "./range-download";
 
-/** The answer to a request for a part. */
-export interface PartAnswer {
+/** The answer to a request for a range. */
+export interface RangeAnswer {
   readonly status: number;
   readonly headers: AnswerHeaders;
-  /** The next piece of the body, undefined at its end. */
+  /** The next bytes of the body, undefined at its end. */
   read(): Promise<Uint8Array | undefined>;
 }
 
 /** What gives parts of a file. Aborting the signal ends a request at any time. */
-export interface PartSource {
+export interface RangeSource {
   /**
-   * Ask for a part.
+   * Ask for a range.
    *
    * @param patience Gives the seconds without data after which an answer counts as lost.
    * @throws LodestreamError if it is refused or there is no answer.
    */
-  ask(part: Part, patience: () => number, signal: AbortSignal): Promise<PartAnswer>;
+  ask(request: RangeRequest, patience: () => number, signal: AbortSignal): Promise<RangeAnswer>;
 }
 
 /** Statuses of answers that say something of the file asked for; with others, the body says what is wrong. */
-const PARTS = new Set([200, 206, 416]);
+const ABOUT_FILE = new Set([200, 206, 416]);
 
 const LONGEST_PROBLEM = 64 * 1024;
 
 /** A container on a server of Lodestream or on any web server that knows Range. */
-export class HttpParts implements PartSource {
+export class HttpRanges implements RangeSource {
   private address: string;
 
   /**
@@ -46,9 +46,9 @@ export class HttpParts implements PartSource {
     this.address = url;
   }
 
-  async ask(part: Part, patience: () => number, signal: AbortSignal): Promise<PartAnswer> {
+  async ask(request: RangeRequest, patience: () => number, signal: AbortSignal): Promise<RangeAnswer> {
     const timer = new Patience(patience, signal);
-    const headers: Record<string, string> = { ...part.headers };
+    const headers: Record<string, string> = { ...request.headers };
     if (this.token !== undefined && sameOrigin(this.address, this.home)) headers.Authorization = `Bearer ${this.token}`;
     const asked = this.address;
     // No cache comes between: browsers lock an address in theirs while one part of it is under way.
@@ -60,7 +60,7 @@ export class HttpParts implements PartSource {
       if (value === undefined) timer.end();
       return value;
     };
-    if (!PARTS.has(response.status)) {
+    if (!ABOUT_FILE.has(response.status)) {
       const body = await textOf(read);
       timer.end();
       throw fromResponse(response.status, response.statusText, body, asked);
@@ -119,32 +119,32 @@ async function textOf(read: () => Promise<Uint8Array | undefined>): Promise<stri
   const decoder = new TextDecoder();
   let text = "";
   for (let left = LONGEST_PROBLEM; left > 0; ) {
-    const piece = await read();
-    if (piece === undefined) break;
-    text += decoder.decode(piece.subarray(0, left), { stream: true });
-    left -= piece.length;
+    const slice = await read();
+    if (slice === undefined) break;
+    text += decoder.decode(slice.subarray(0, left), { stream: true });
+    left -= slice.length;
   }
   return text;
 }
 
-// A piece that is decoded before the next one is read.
-const PIECE = 64 * 1024;
+// Bytes that are decoded before more are read.
+const SLICE = 64 * 1024;
 
 /** A `File` or `Blob`, which answers like a server. */
-export class BlobParts implements PartSource {
+export class BlobRanges implements RangeSource {
   constructor(private readonly blob: Blob) {}
 
-  async ask(part: Part, _patience: () => number, signal: AbortSignal): Promise<PartAnswer> {
+  async ask(request: RangeRequest, _patience: () => number, signal: AbortSignal): Promise<RangeAnswer> {
     const { size } = this.blob;
-    const last = Math.min(part.end, size) - 1;
-    const headers = new Map([["content-range", `bytes ${part.offset}-${last}/${size}`]]);
-    let position = part.offset;
+    const last = Math.min(request.end, size) - 1;
+    const headers = new Map([["content-range", `bytes ${request.offset}-${last}/${size}`]]);
+    let position = request.offset;
     const read = async (): Promise<Uint8Array | undefined> => {
       if (position > last || signal.aborted) return undefined;
-      const piece = this.blob.slice(position, Math.min(position + PIECE, last + 1));
+      const slice = this.blob.slice(position, Math.min(position + SLICE, last + 1));
       let data: ArrayBuffer;
       try {
-        data = await piece.arrayBuffer();
+        data = await slice.arrayBuffer();
       } catch (error) {
         // A file that was changed or removed since it was chosen.
         throw new UnreachableError(`the file cannot be read: ${(error as Error).message}`);
@@ -153,7 +153,7 @@ export class BlobParts implements PartSource {
       return new Uint8Array(data);
     };
     return {
-      status: last < part.offset ? 416 : 206,
+      status: last < request.offset ? 416 : 206,
       headers: { get: (name) => headers.get(name.toLowerCase()) ?? null },
       read,
     };

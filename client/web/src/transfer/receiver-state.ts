@@ -1,8 +1,8 @@
 /**
- * Reception of a surface over one or several connections.
+ * What has come of a surface over one or several connections.
  *
  * Bytes of the container go in, views come out. A `Download` or a `RangeDownload` is one connection and ends with it.
- * The reception is handed to the next connection, so that bytes that have arrived are not requested again.
+ * The state is handed to the next connection, so that bytes that have arrived are not requested again.
  */
 
 import { Capacity } from "../container/capacity";
@@ -24,8 +24,8 @@ import { MemoryStore, type Store } from "./store";
 /** Called with bytes of the container that had not come before, as they come; by then it is known which container. */
 export type Sink = (offset: number, data: Uint8Array) => void;
 
-/** What may be given to a reception beside its target and decoder. */
-export interface ReceptionOptions {
+/** What may be given to a receiver state beside its target and decoder. */
+export interface ReceiverStateOptions {
   /** All received bytes are stored here too, and bytes that it has are not requested. */
   readonly store?: Store | undefined;
   /** SHA-256 and size of the container, if they are known. */
@@ -34,20 +34,20 @@ export interface ReceptionOptions {
   readonly sink?: Sink | undefined;
 }
 
-// What is kept for a piece beside its bytes.
-const PIECE = 256;
+// What is kept for a slice beside its bytes.
+const SLICE = 256;
 
 // Whoever reads a container's index reads its first bytes too.
 const HEAD = 4096;
 
 /** One surface being received. */
-export class Reception<View extends ViewInfo> {
+export class ReceiverState<View extends ViewInfo> {
   /** What to receive, where to stop, and in which order; changed by `focus` and `retarget`. */
   target: Target;
   /** Decodes what has arrived so far. */
   readonly decoder: StreamDecoder<View>;
   /** Bytes of the container that have arrived or were in the store. */
-  readonly held: RangeSet;
+  readonly cached: RangeSet;
   /** SHA-256 of the container, once it is known. */
   container: string | undefined;
   /** Its size in bytes, once it is known. */
@@ -58,9 +58,9 @@ export class Reception<View extends ViewInfo> {
   index: Index | undefined;
   /** The slices that the target needs, once the index is known. */
   plan: Plan | undefined;
-  /** Bytes of the surface that are held. */
+  /** Bytes of the surface that are cached. */
   received = 0;
-  /** Bytes of the container received, including bytes that were held already. */
+  /** Bytes of the container received, including bytes that were cached already. */
   dataBytes = 0;
   /** Bytes of all messages and answers received. */
   wireBytes = 0;
@@ -81,12 +81,12 @@ export class Reception<View extends ViewInfo> {
   private deadline: number | undefined;
   private kept = 0;
 
-  constructor(target: Target, decoder: StreamDecoder<View>, options: ReceptionOptions = {}) {
+  constructor(target: Target, decoder: StreamDecoder<View>, options: ReceiverStateOptions = {}) {
     this.target = target;
     this.decoder = decoder;
     this.store = options.store;
     this.sink = options.sink;
-    this.held = options.store === undefined ? new RangeSet() : options.store.ranges.copy();
+    this.cached = options.store === undefined ? new RangeSet() : options.store.ranges.copy();
     this.container = options.container;
     this.size = options.size;
     if (target.first !== undefined) decoder.focus(target.first);
@@ -197,19 +197,19 @@ export class Reception<View extends ViewInfo> {
     }
     this.dataBytes += data.length;
     const views: View[] = [];
-    for (const [start, length] of [...this.held.missing(offset, data.length)]) {
-      const piece = data.subarray(start - offset, start - offset + length);
-      this.kept += length + PIECE;
+    for (const [start, length] of [...this.cached.missing(offset, data.length)]) {
+      const slice = data.subarray(start - offset, start - offset + length);
+      this.kept += length + SLICE;
       const most = this.decoder.capacity.bytes;
       if (this.kept > most) throw new TooLargeError(`expected at most ${most} bytes of a container, got more`);
-      this.held.add(start, length);
+      this.cached.add(start, length);
       this.count(start, length);
-      this.sink?.(start, piece);
-      if (this.store !== undefined) this.store.write(start, piece.slice());
+      this.sink?.(start, slice);
+      if (this.store !== undefined) this.store.write(start, slice.slice());
       else {
-        this.copy(start, piece);
+        this.copy(start, slice);
         this.fed.add(start, length);
-        views.push(...this.decoder.feedAt(start, piece));
+        views.push(...this.decoder.feedAt(start, slice));
         if (this.index === undefined && this.decoder.index !== null) this.makePlan(this.decoder.index);
       }
     }
@@ -219,10 +219,10 @@ export class Reception<View extends ViewInfo> {
 
   /** The bytes that are still to come, in order; once the index is known. */
   *missing(): Generator<Place> {
-    for (const place of this.order ?? []) yield* this.held.missing(...place);
+    for (const place of this.order ?? []) yield* this.cached.missing(...place);
   }
 
-  /** The parts of a range that the target needs, held or not; before that is known, the whole range. */
+  /** The parts of a range that the target needs, cached or not; before that is known, the whole range. */
   wanted(offset: number, length: number): Iterable<Place> {
     return this.wantedSet === undefined ? [[offset, length]] : this.wantedSet.overlap(offset, length);
   }
@@ -275,7 +275,7 @@ export class Reception<View extends ViewInfo> {
   private follow(surface: readonly Place[], before: readonly Place[], after: readonly Place[]): void {
     this.surface = new RangeSet(surface);
     this.received = 0;
-    for (const place of this.held) this.count(...place);
+    for (const place of this.cached) this.count(...place);
     const all = [...before, ...surface, ...after];
     this.wantedSet = new RangeSet(all);
     if (this.store !== undefined) this.order = all.flatMap((place) => [...this.fed.missing(...place)]);

@@ -12,7 +12,7 @@ import type { Target, ViewInfo } from "../types";
 import type { StreamDecoder } from "./decoding";
 
 const LONGEST_START = 10;
-const BEGINNING: readonly number[] = [KIND.header, KIND.masks, KIND.keptMasks, KIND.layer];
+const PREFIX_KINDS: readonly number[] = [KIND.header, KIND.masks, KIND.keptMasks, KIND.layer];
 
 /** Whether what the target needs is a prefix of the file, and its metadata. */
 export function inFileOrder(target: Target): boolean {
@@ -40,7 +40,7 @@ export function sure(
   if (position === 0) return run >= SIGNATURE_LENGTH ? SIGNATURE_LENGTH : 0;
   const start = read(position, Math.min(run, LONGEST_START));
   const extent = sectionExtent(start, position);
-  if (extent === null || run < extent.end || !BEGINNING.includes(start[0]!)) return 0;
+  if (extent === null || run < extent.end || !PREFIX_KINDS.includes(start[0]!)) return 0;
   return start[0] === KIND.layer && met(target, decoder, position + extent.end) ? 0 : extent.end;
 }
 

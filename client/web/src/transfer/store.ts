@@ -19,7 +19,7 @@ export class MemoryStore implements Store {
   readonly ranges = new RangeSet();
   // By where they begin; they do not overlap.
   private readonly starts: number[] = [];
-  private readonly pieces: Uint8Array[] = [];
+  private readonly slices: Uint8Array[] = [];
   private readonly done = new RangeSet();
 
   constructor(private readonly keepAll = false) {}
@@ -28,7 +28,7 @@ export class MemoryStore implements Store {
     const found = new Uint8Array(length);
     const end = offset + length;
     for (let number = this.before(offset); number < this.starts.length && this.starts[number]! < end; number++) {
-      const [start, data] = [this.starts[number]!, this.pieces[number]!];
+      const [start, data] = [this.starts[number]!, this.slices[number]!];
       const first = Math.max(start, offset);
       const last = Math.min(start + data.length, end);
       if (first < last) found.set(data.subarray(first - start, last - start), first - offset);
@@ -40,7 +40,7 @@ export class MemoryStore implements Store {
     this.ranges.add(offset, data.length);
     const number = bisectRight(this.starts, offset);
     this.starts.splice(number, 0, offset);
-    this.pieces.splice(number, 0, data);
+    this.slices.splice(number, 0, data);
   }
 
   used(offset: number, length: number): void {
@@ -48,18 +48,18 @@ export class MemoryStore implements Store {
     this.done.add(offset, length);
     const first = this.before(offset);
     for (let number = bisectLeft(this.starts, offset + length) - 1; number >= first; number--) {
-      if (!this.done.covers(this.starts[number]!, this.pieces[number]!.length)) continue;
+      if (!this.done.covers(this.starts[number]!, this.slices[number]!.length)) continue;
       this.starts.splice(number, 1);
-      this.pieces.splice(number, 1);
+      this.slices.splice(number, 1);
     }
   }
 
   /** Everything that is stored, as [offset, bytes] by rising offsets. */
   all(): (readonly [offset: number, data: Uint8Array])[] {
-    return this.starts.map((start, number) => [start, this.pieces[number]!] as const);
+    return this.starts.map((start, number) => [start, this.slices[number]!] as const);
   }
 
-  /** The last piece that begins at an offset or before it; the first one if there is none. */
+  /** The last slice that begins at an offset or before it; the first one if there is none. */
   private before(offset: number): number {
     return Math.max(bisectRight(this.starts, offset) - 1, 0);
   }

@@ -9,17 +9,17 @@ import type { Ended } from "../planning/plan";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Target, ViewInfo } from "../types";
 import { containerUrl } from "./addresses";
-import { PartsRoad } from "./by-ranges";
-import { SocketRoad } from "./by-socket";
+import { RangeTransport } from "./by-ranges";
+import { SocketTransport } from "./by-socket";
 import type { StreamDecoder } from "./decoding";
 import type { Journey } from "./journey";
 import type { Progress, StreamOptions, StreamState } from "./options";
 import { Link, windowFor } from "./pacing";
 import { fromCode } from "./problems";
-import { BlobParts, HttpParts } from "./range-sources";
-import { Reception } from "./receiver-state";
+import { BlobRanges, HttpRanges } from "./range-sources";
+import { ReceiverState } from "./receiver-state";
 import { platformSocket } from "./socket";
-import { type Road, Roads } from "./transports";
+import { Transports, type UsedTransport } from "./transports";
 import { seconds, Waiting } from "./waiting";
 
 /**
@@ -29,15 +29,15 @@ import { seconds, Waiting } from "./waiting";
  * stay usable, and `ended` is truncated.
  */
 export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View>, Journey<View> {
-  readonly reception: Reception<View>;
+  readonly reception: ReceiverState<View>;
   readonly waiting = new Waiting();
   stopped = false;
   turns = 0;
 
-  private readonly roads: Roads | undefined;
-  private readonly socket: SocketRoad<View> | undefined;
-  private readonly parts: () => PartsRoad<View>;
-  private made: PartsRoad<View> | undefined;
+  private readonly transports: Transports | undefined;
+  private readonly socket: SocketTransport<View> | undefined;
+  private readonly makeRanges: () => RangeTransport<View>;
+  private made: RangeTransport<View> | undefined;
   private link: Link | undefined;
   private readonly silence: number;
   private readonly closeTimeout: number;
@@ -69,15 +69,15 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       const sockets = options.WebSocket ?? platformSocket();
       const transport = options.transport ?? "auto";
       const own = sockets === undefined && transport === "auto" ? "http" : transport;
-      const roads = new Roads(source, own, options.deadline ?? 60, options.pauses);
+      const transports = new Transports(source, own, options.deadline ?? 60, options.pauses);
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
-      const http = new HttpParts(containerUrl(roads.url), roads.url, token, fetch);
-      this.parts = () => new PartsRoad(this, http, options.version);
+      const http = new HttpRanges(containerUrl(transports.url), transports.url, token, fetch);
+      this.makeRanges = () => new RangeTransport(this, http, options.version);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
-      this.socket = new SocketRoad(this, roads.url, { token, window }, sockets);
-      this.roads = roads;
-    } else this.parts = () => new PartsRoad(this, new BlobParts(source));
-    this.reception = new Reception(target, decoder, {
+      this.socket = new SocketTransport(this, transports.url, { token, window }, sockets);
+      this.transports = transports;
+    } else this.makeRanges = () => new RangeTransport(this, new BlobRanges(source));
+    this.reception = new ReceiverState(target, decoder, {
       store: options.store,
       container: options.container,
       size: options.size,
@@ -88,7 +88,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
 
   /** The URL of the surface or file; undefined for a file of this machine. */
   get url(): string | undefined {
-    return this.roads?.url;
+    return this.transports?.url;
   }
 
   /** What tells this version of a file from others, as far as its server says: its entity tag, or else its date. */
@@ -119,8 +119,8 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   }
 
   /** The transport in use. */
-  get transport(): Road | "file" {
-    return this.roads?.road ?? "file";
+  get transport(): UsedTransport | "file" {
+    return this.transports?.current ?? "file";
   }
 
   [Symbol.asyncIterator](): this {
@@ -213,7 +213,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.waiting.wake();
   }
 
-  // What the roads need.
+  // What the transports need.
 
   patience(): number {
     return this.closeBy === undefined ? this.silence : this.parting();
@@ -226,7 +226,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
 
   met(): void {
     this.connections += 1;
-    if (this.roads !== undefined) this.roads.met = true;
+    if (this.transports !== undefined) this.transports.met = true;
     if (this.current.phase !== "streaming") this.tell({ phase: "streaming" });
   }
 
@@ -300,24 +300,24 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   }
 
   private async travel(): Promise<void> {
-    const { roads, reception } = this;
+    const { transports, reception } = this;
     this.tell({ phase: "connecting" });
-    roads?.start(seconds());
+    transports?.start(seconds());
     while (reception.ended === undefined) {
-      const before = reception.held.total;
+      const before = reception.cached.total;
       try {
-        if (this.socket !== undefined && roads?.road === "ws") await this.socket.travel();
+        if (this.socket !== undefined && transports?.current === "ws") await this.socket.travel();
         else {
-          this.made ??= this.parts();
+          this.made ??= this.makeRanges();
           await this.made.travel();
         }
       } catch (error) {
         this.socket?.hangUp();
         if (this.over()) return;
-        if (roads === undefined || !(error instanceof LodestreamError)) throw error;
-        const pause = roads.failed(error, seconds(), reception.held.total > before);
+        if (transports === undefined || !(error instanceof LodestreamError)) throw error;
+        const pause = transports.failed(error, seconds(), reception.cached.total > before);
         const left = reception.tick(seconds());
-        const phase = roads.met ? "reconnecting" : "connecting";
+        const phase = transports.met ? "reconnecting" : "connecting";
         this.tell({ phase, problem: error.message, pause });
         const until = seconds() + Math.min(pause, left ?? pause);
         while (!this.over() && seconds() < until) await this.waiting.woken(until - seconds());

@@ -12,7 +12,7 @@ import { NoStreamError, passes } from "./problems";
 export type Transport = "auto" | "ws" | "http";
 
 /** A transport. */
-export type Road = "ws" | "http";
+export type UsedTransport = "ws" | "http";
 
 /** Seconds between attempts: at random within twice as long each time, so that clients do not return all at once. */
 export interface Pauses {
@@ -25,16 +25,16 @@ const PAUSES: Pauses = { first: 0.2, longest: 5 };
 const FIRST_ATTEMPTS = 3;
 
 /** The transports to one URL. */
-export class Roads {
+export class Transports {
   readonly url: string;
   /** The transport of the next attempt. */
-  road: Road;
+  current: UsedTransport;
   /**
    * Whether the server has answered as expected. Before that there are only three attempts, because a wrong URL should
    * be reported soon.
    */
   met = false;
-  private readonly allowed: readonly Road[];
+  private readonly allowed: readonly UsedTransport[];
   private blocked: LodestreamError | undefined; // what became of its WebSocket
   private attempts = 0;
   private since = 0;
@@ -60,7 +60,7 @@ export class Roads {
       }
       this.allowed = ["http"];
     } else this.allowed = transport === "auto" ? ["ws", "http"] : [transport];
-    this.road = this.allowed[0]!;
+    this.current = this.allowed[0]!;
   }
 
   /** Begin the first attempt. */
@@ -77,17 +77,17 @@ export class Roads {
    */
   failed(error: LodestreamError, now: number, progressed: boolean): number {
     if (progressed) this.start(now);
-    if (this.road === "ws" && this.allowed.includes("http") && error instanceof NoStreamError && !this.met) {
-      this.road = "http";
+    if (this.current === "ws" && this.allowed.includes("http") && error instanceof NoStreamError && !this.met) {
+      this.current = "http";
       this.blocked = error;
       return 0;
     }
-    // A wrong address is one by either road.
-    if (this.road === "http" && this.blocked !== undefined && !this.met && !(error instanceof NotFoundError)) {
+    // A wrong address is one by either transport.
+    if (this.current === "http" && this.blocked !== undefined && !this.met && !(error instanceof NotFoundError)) {
       error.message = `${error.message} (and by WebSocket: ${this.blocked.message})`;
     }
     if (!passes(error) || (!this.met && this.attempts >= FIRST_ATTEMPTS - 1)) throw error;
-    if (!progressed) this.road = this.allowed[this.road === this.allowed[0] ? this.allowed.length - 1 : 0]!;
+    if (!progressed) this.current = this.allowed[this.current === this.allowed[0] ? this.allowed.length - 1 : 0]!;
     const pause = this.pause();
     if (now + pause >= this.since + this.deadline) throw error;
     return pause;

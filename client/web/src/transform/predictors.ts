@@ -4,8 +4,8 @@ import type { Grid, Layout } from "../grid/layout";
 
 /** A coefficient has at most so many magnitude bits. */
 export const COEFFICIENT_BITS = 28;
-/** Beside axis 0 and axis 1 of the parts: the axis of the curves. */
-export const CURVES = 2;
+/** Beside axis 0 and axis 1 of the patches: the axis of the interfaces. */
+export const INTERFACES = 2;
 /** Nodes that an axis needs for an (a, b) of its own. */
 const FIT_NODES = 24;
 const AXES = 3;
@@ -15,7 +15,7 @@ export type Predictor = readonly [a: number, b: number];
 
 const FOUR_POINT: Predictor = [16, 0];
 
-/** A step with an (a, b) of its own: from level + 1 to `level`, along axis 0 or 1 of the parts, or of the curves (2). */
+/** A step with an (a, b) of its own: from level + 1 to `level`, along axis 0 or 1 of patches, or of interfaces (2). */
 export interface FittedStep {
   readonly level: number;
   readonly axis: number;
@@ -32,7 +32,7 @@ export function fittedSteps(layout: Layout): FittedStep[] {
     const fitted = [false, false, false];
     layout.grids.forEach((grid, number) => {
       layout.steps(number, level + 1).forEach((step, axis) => {
-        if (isFitted(step)) fitted[grid.curve ? CURVES : axis] = true;
+        if (isFitted(step)) fitted[grid.interface ? INTERFACES : axis] = true;
       });
     });
     fitted.forEach((is, axis) => {
@@ -60,7 +60,7 @@ export class Predictors {
   /** The (a, b) of a grid's step along an axis from `level` to the level below. */
   of(grid: Grid, step: AxisStep, level: number, axis: number): Predictor {
     if (!isFitted(step)) return FOUR_POINT;
-    const place = ((level - 1) * AXES + (grid.curve ? CURVES : axis)) * 2;
+    const place = ((level - 1) * AXES + (grid.interface ? INTERFACES : axis)) * 2;
     return [this.values[place]!, this.values[place + 1]!];
   }
 }

@@ -94,7 +94,8 @@ export function toEighths(arena: Arena, plane: Plane): void {
  * Turn coefficients into the grids of `level`, in place, in the first rows and columns of the planes.
  *
  * Details of the levels up to `whole` count lattice steps, those above eighths of them; so does the result where `whole`
- * is less than `level`. Of a channel that is no `coordinate` no side comes from a curve, and curves mean nothing.
+ * is less than `level`. Of a channel that is no `coordinate` no side comes from an interface, and interfaces mean
+ * nothing.
  */
 export function inverse(
   arena: Arena,
@@ -109,7 +110,7 @@ export function inverse(
   if (coordinate) sides.takeNodes();
   for (let finer = 1; finer <= level; finer++) {
     for (const [number, grid] of layout.grids.entries()) {
-      if (grid.curve && !coordinate) continue;
+      if (grid.interface && !coordinate) continue;
       const plane = planes[number]!;
       if (finer === whole + 1) toEighths(arena, corner(plane, layout.shape(number, whole)));
       if (coordinate) sides.takeDetails(number, finer);
@@ -124,7 +125,7 @@ export function inverse(
   }
 }
 
-/** What curves and parts take from other curves. */
+/** What interfaces and patches take from other interfaces. */
 class Sides {
   readonly #arena: Arena;
   readonly #planes: readonly Plane[];
@@ -138,7 +139,7 @@ class Sides {
     this.#predictors = predictors;
   }
 
-  /** Level 0 of what comes from curves: their common ends first, then the sides of parts. */
+  /** Level 0 of what comes from interfaces: their common ends first, then the sides of patches. */
   takeNodes(): void {
     if (!this.#layout.shared) return;
     for (const [number, grid] of this.#layout.grids.entries()) {
@@ -148,7 +149,7 @@ class Sides {
       for (const [side, source] of grid.sources.entries()) {
         if (source === null) continue;
         const points = this.#points(source, 0);
-        if (grid.curve) {
+        if (grid.interface) {
           words[at + (side === 0 ? 0 : rows - 1) * plane.pitch] = points[0]!;
           continue;
         }
@@ -159,12 +160,12 @@ class Sides {
     }
   }
 
-  /** The details along a part's sides that come from curves, which are at `level` already. */
-  takeDetails(part: number, level: number): void {
-    const grid = this.#layout.grids[part]!;
-    if (grid.curve) return;
-    const steps = this.#layout.steps(part, level);
-    const plane = this.#planes[part]!;
+  /** The details along a patch's sides that come from interfaces, which are at `level` already. */
+  takeDetails(patch: number, level: number): void {
+    const grid = this.#layout.grids[patch]!;
+    if (grid.interface) return;
+    const steps = this.#layout.steps(patch, level);
+    const plane = this.#planes[patch]!;
     for (const [side, source] of grid.sources.entries()) {
       const axis = side < 2 ? 1 : 0;
       const step = steps[axis];
@@ -178,7 +179,7 @@ class Sides {
     }
   }
 
-  /** Points of a curve at a level, in the order of the side, or the curve's end, that takes them. */
+  /** Points of an interface at a level, in the order of the side, or the interface's end, that takes them. */
   #points(source: Source, level: number): Int32Array {
     const plane = this.#planes[source.grid]!;
     const { words, at } = numbersOf(this.#arena, plane);

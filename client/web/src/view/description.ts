@@ -1,7 +1,8 @@
 /** What is known of a surface beside its stream: metadata and price list, which a container has at its end. */
 
+import { Capacity } from "../container/capacity";
 import type { Header } from "../container/header";
-import { indexFrom, readMetadata } from "../container/reader";
+import { INDEX_GROWTH, indexFrom, readMetadata } from "../container/reader";
 import { FOOTER_LENGTH, type Metadata, parseFooter } from "../container/sections";
 import { containerUrl, isSurface } from "../transfer/addresses";
 import { attributeNames } from "./grids";
@@ -39,20 +40,28 @@ export async function describe(url: string, token: string | null, header: Promis
 }
 
 function fromServer({ metadata, layers, bytes }: Record<string, unknown>): Description {
-  const prices = (layers ?? null) as readonly Price[] | null;
+  const prices = Array.isArray(layers) && layers.every(isPrice) ? layers : null;
   return { metadata: (metadata ?? {}) as Metadata, prices, size: typeof bytes === "number" ? bytes : 0 };
+}
+
+function isPrice(value: unknown): value is Price {
+  const { bytes, level, rms, max } = (value ?? {}) as Record<string, unknown>;
+  return [bytes, level, rms, max].every((number) => typeof number === "number");
 }
 
 async function fromTail(url: string, headers: Record<string, string>, header: Header): Promise<Description> {
   const part = async (first: number, past: number): Promise<{ data: Uint8Array; size: number }> => {
     const range = { range: `bytes=${first}-${past - 1}` };
     const answer = await fetch(url, { headers: { ...headers, ...range }, cache: "no-store" });
-    if (answer.status !== 206) throw new Error(`expected a part of the container, got ${answer.status}`);
-    const size = Number(/\/(\d+)$/.exec(answer.headers.get("content-range") ?? "")?.[1] ?? Number.NaN);
-    return { data: new Uint8Array(await answer.arrayBuffer()), size };
+    const size = Number(/\/(\d{1,15})$/.exec(answer.headers.get("content-range") ?? "")?.[1] ?? Number.NaN);
+    if (answer.status !== 206 || Number.isNaN(size)) {
+      void answer.body?.cancel();
+      throw new Error(`expected a part of the container, got ${answer.status}`);
+    }
+    return { data: await bytesOf(answer, past - first), size };
   };
   const { size } = await part(0, 1);
-  let first = Math.max(0, size - TAIL - Math.ceil(size / 512));
+  let first = Math.max(0, size - Math.min(TAIL + Math.ceil(size / 512), LARGEST_TAIL));
   let { data } = await part(first, size);
   const footer = parseFooter(data.subarray(data.length - FOOTER_LENGTH), size - FOOTER_LENGTH);
   // The metadata stand right before the index and have at most 64 KiB.
@@ -65,6 +74,10 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
     }
     return data.subarray(offset - first, offset - first + length);
   };
+  // A header of a few bytes can announce any number of tiles, all of which an index lists.
+  const capacity = new Capacity();
+  capacity.promise(0, [], { masked: 0, tables: header.tables });
+  capacity.take(INDEX_GROWTH * footer.index.length);
   const index = indexFrom(await read(footer.index.offset, footer.index.length), footer.index.offset, header);
   const metadata = readMetadata(await read(index.metadata.offset, index.metadata.length), index.metadata.offset);
   const last = index.layers.at(-1);
@@ -74,11 +87,30 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
     rms: errors.rms,
     max: errors.maximum,
   }));
-  if (index.exactness !== null && last !== undefined) {
+  if (index.residual !== null && last !== undefined) {
     const { errors, level } = index.levels.at(-1)!;
     prices.push({ bytes: index.surfaceEnd, level, rms: errors.rms, max: errors.maximum });
   }
   return { metadata, prices, size };
+}
+
+/** The body of an answer. @throws Error if it is not of this length: what is longer is not read. */
+async function bytesOf(answer: Response, length: number): Promise<Uint8Array> {
+  const data = new Uint8Array(length);
+  const reader = answer.body?.getReader();
+  let at = 0;
+  for (;;) {
+    const { value } = (await reader?.read()) ?? {};
+    if (value === undefined) break;
+    if (value.length > length - at) {
+      void reader?.cancel();
+      throw new Error(`expected ${length} bytes of the container, got more`);
+    }
+    data.set(value, at);
+    at += value.length;
+  }
+  if (at < length) throw new Error(`expected ${length} bytes of the container, got ${at}`);
+  return data;
 }
 
 /** The description of a surface for those who look at it. */

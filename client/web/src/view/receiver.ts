@@ -184,7 +184,8 @@ export class Receiver {
   /** Tells of what has come. */
   private look(): void {
     const header = this.decoder?.header;
-    if (header) this.headerCame(header);
+    // An index is not read before the masks are known, which tell how long its lists are.
+    if (header && !header.awaitsMasks) this.headerCame(header);
     this.tell();
   }
 

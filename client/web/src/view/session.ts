@@ -35,7 +35,7 @@ export class Session {
   private readonly picks = new Map<number, (hit: Hit | null) => void>();
   private chosen: number | null = null;
   private shown: { moment: Moment; level: number; window: DetailWindow | null } | null = null;
-  private awaited: ((patches: Patches) => void) | null = null;
+  private awaited: { take(patches: Patches): void; fail(error: Error): void } | null = null;
   private wanted: number | null = null;
   private region: Region | null = null;
   private pixels = 0;
@@ -57,7 +57,7 @@ export class Session {
   ) {
     this.triangles = triangles;
     this.worker.onmessage = ({ data }: MessageEvent<FromGeometry>) => this.take(data);
-    this.worker.onerror = (event) => events.failed(event.message || "the geometry worker could not be started");
+    this.worker.onerror = (event) => this.failed(event.message || "the geometry worker could not be started");
     this.post({ kind: "most", triangles });
     source.start({
       info: (info) => {
@@ -197,8 +197,8 @@ export class Session {
     try {
       const grids = await this.source.grids(moment.number, level, window);
       if (this.closed) return;
-      const came = new Promise<Patches>((resolve) => {
-        this.awaited = resolve;
+      const came = new Promise<Patches>((take, fail) => {
+        this.awaited = { take, fail };
       });
       const buffers = grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
         [points, mask, rowsAt, columnsAt, ...attributes.map(({ values }) => values)].flatMap((array) =>
@@ -236,7 +236,7 @@ export class Session {
     switch (message.kind) {
       case "patches":
         if (message.fresh) {
-          this.awaited?.(message);
+          this.awaited?.take(message);
           this.awaited = null;
         } else if (this.shown !== null) {
           this.stage.show(message.patches, false, false, () => {});
@@ -256,9 +256,16 @@ export class Session {
         this.picks.delete(message.id);
         break;
       case "failed":
-        this.events.failed(message.detail);
+        this.failed(message.detail);
         break;
     }
+  }
+
+  /** Says so, and waits no longer for a picture that does not come: the next moment may do. */
+  private failed(detail: string): void {
+    if (this.awaited === null) this.events.failed(detail);
+    else this.awaited.fail(new Error(detail));
+    this.awaited = null;
   }
 
   /** Asks for what is in the view before the rest, once the view rests and is another than before. */

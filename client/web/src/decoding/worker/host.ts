@@ -34,10 +34,10 @@ export function serveDecoder(port: Port): void {
 function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): Surface | null {
   switch (call.do) {
     case "feed":
-      decoder.feed(call.chunk);
+      decoder.feed(call.data);
       return null;
     case "feedAt":
-      decoder.feedAt(call.offset, call.chunk);
+      decoder.feedAt(call.offset, call.data);
       return null;
     case "focus":
       decoder.focus(call.region);

@@ -1,7 +1,7 @@
 /**
  * What is posted between a `RemoteDecoder` and the worker that decodes for it.
  *
- * Requests have a number, which their answer repeats; answers come in the order of the requests. Chunks of bytes and the
+ * Requests have a number, which their answer repeats; answers come in the order of the requests. Bytes and the
  * arrays of surfaces are transferred, not copied.
  */
 import type { Metadata } from "../../container/sections";
@@ -12,8 +12,8 @@ import type { DecoderOptions } from "../decoder";
 /** What a decoder is asked to do. Views are named by their number among all so far, from 0 on. */
 export type Call =
   | { readonly do: "open"; readonly options: DecoderOptions; readonly module: WebAssembly.Module }
-  | { readonly do: "feed"; readonly chunk: Uint8Array }
-  | { readonly do: "feedAt"; readonly offset: number; readonly chunk: Uint8Array }
+  | { readonly do: "feed"; readonly data: Uint8Array }
+  | { readonly do: "feedAt"; readonly offset: number; readonly data: Uint8Array }
   | { readonly do: "focus"; readonly region: Region | null }
   | { readonly do: "finish" }
   | { readonly do: "surface"; readonly view: number; readonly level: number | null }

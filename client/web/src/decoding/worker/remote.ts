@@ -47,17 +47,17 @@ export class RemoteDecoder {
     return this.layers.at(-1)?.complete ?? false;
   }
 
-  /** As `Decoder.feed`; the chunk's memory is given away. */
-  async feed(chunk: Uint8Array): Promise<RemoteView[]> {
+  /** As `Decoder.feed`; the memory of `data` is given away. */
+  async feed(data: Uint8Array): Promise<RemoteView[]> {
     const before = this.layers.length;
-    await this.#call({ do: "feed", chunk }, chunk);
+    await this.#call({ do: "feed", data }, data);
     return this.layers.slice(before);
   }
 
-  /** As `Decoder.feedAt`; the chunk's memory is given away. */
-  async feedAt(offset: number, chunk: Uint8Array): Promise<RemoteView[]> {
+  /** As `Decoder.feedAt`; the memory of `data` is given away. */
+  async feedAt(offset: number, data: Uint8Array): Promise<RemoteView[]> {
     const before = this.layers.length;
-    await this.#call({ do: "feedAt", offset, chunk }, chunk);
+    await this.#call({ do: "feedAt", offset, data }, data);
     return this.layers.slice(before);
   }
 
@@ -79,15 +79,15 @@ export class RemoteDecoder {
     this.#waiting.clear();
   }
 
-  #call(call: Call, chunk?: Uint8Array): Promise<Answer> {
+  #call(call: Call, data?: Uint8Array): Promise<Answer> {
     if (this.#closed) return Promise.reject(closed());
     const id = this.#next++;
     const request: Request = { id, call };
     return new Promise((resolve, reject) => {
       this.#waiting.set(id, { resolve, reject });
       // Memory that others see too cannot be given away; it is copied.
-      const own = chunk?.buffer instanceof ArrayBuffer && chunk.byteLength === chunk.buffer.byteLength;
-      this.#port.postMessage(request, own ? [chunk.buffer as ArrayBuffer] : []);
+      const own = data?.buffer instanceof ArrayBuffer && data.byteLength === data.buffer.byteLength;
+      this.#port.postMessage(request, own ? [data.buffer as ArrayBuffer] : []);
     });
   }
 
