@@ -52,7 +52,7 @@ it("names only what the package exports", () => {
     found[1]!.split(", "),
   );
   const called = ["coordinatesOf", "placementOf", "readIndex", "serveDecoder", "Stream"];
-  const errors = [...PAGE.matchAll(/`(\w+Error)`/g)].map((found) => found[1]!);
+  const errors = [...PAGE.matchAll(/`([A-Z]\w*Error)`/g)].map((found) => found[1]!);
   expect(errors.length).toBeGreaterThan(4);
   for (const name of called) expect(PAGE).toContain(`\`${name}`);
   for (const name of [...imported, ...called, ...errors]) expect(api, name).toHaveProperty(name);

@@ -259,10 +259,11 @@ export class LodestreamView extends HTMLElement {
     this.colour();
     this.canvas.dataset.triangles = String(patches.triangles);
     this.refresh();
-    if (patches.fresh)
-      this.dispatchEvent(
-        new CustomEvent("lodestream-drawn", { detail: { moment, level: patches.level, triangles: patches.triangles } }),
-      );
+    if (!patches.fresh) return;
+    this.probe.again(session);
+    this.dispatchEvent(
+      new CustomEvent("lodestream-drawn", { detail: { moment, level: patches.level, triangles: patches.triangles } }),
+    );
   }
 
   /** Places the camera: to see all, or where it was if it has been moved. */

@@ -13,6 +13,7 @@ export class Probe {
   /** The last place that was found, in the surface's coordinates. */
   at: readonly [number, number, number] | null = null;
   private waiting: Ray | null = null;
+  private last: Ray | null = null;
   private busy = false;
 
   /**
@@ -36,10 +37,16 @@ export class Probe {
   /** Shows what a ray meets; null: nothing. */
   point(session: Session, ray: Ray | null): void {
     this.waiting = ray;
+    this.last = ray;
     if (ray !== null && !this.busy) void this.ask(session);
     if (ray !== null) return;
     this.at = null;
     this.changed();
+  }
+
+  /** Reads the same place again, where one is shown: the surface that is drawn has changed. */
+  again(session: Session): void {
+    if (this.at !== null) this.point(session, this.last);
   }
 
   private async ask(session: Session): Promise<void> {
