@@ -9,9 +9,8 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
-# No deadline: the first call of a kernel compiles it, and no test here is about time. The same examples in every run,
-# so that a change is judged by what it changes; HYPOTHESIS_PROFILE=torture tries others, and many, for as long as
-# it takes.
+# No deadline: no test here is about time. The same examples in every run, so that a change is judged by what it
+# changes; HYPOTHESIS_PROFILE=torture tries others, and many, for as long as it takes.
 settings.register_profile(
     "default",
     deadline=None,

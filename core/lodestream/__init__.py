@@ -1,7 +1,7 @@
 """Lodestream: progressive transmission of structured quadrilateral surfaces.
 
-Names are loaded when they are first used, so that importing this package loads neither the compiler of the kernels nor
-any reader of files.
+Names are loaded when they are first used, so that importing this package loads neither numpy, nor the kernels, nor any
+reader of files.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
+from lodestream.page import assets
 
 from .. import sync
 from ..terminal.output import cell, console, human_size, note, print_json, progress_bar
@@ -84,11 +85,11 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
     file = folder / "terrain.npy"
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar())
-        task = bar.add_task("starting a server (the first time this compiles, for a minute)", total=None, figures="")
+        task = bar.add_task("starting a server", total=None, figures="")
         url = stack.enter_context(own_server())
         bar.remove_task(task)
         heights = _made(shape, file, bar)
-        ls.decode(ls.encode(heights[:16, :16]))  # compiles the decoder before the clock runs
+        ls.decode(ls.encode(heights[:16, :16]))  # loads the decoder before the clock runs
         surface = _uploaded(url, file, bar)
         whole = int(surface.details["levels"][-1]["bytes"])
         arrivals = _streamed(surface, bar)
@@ -106,7 +107,8 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
     if drawn is not None:
         paths.append(drawn)
     out.print(cell(f"Written: {', '.join(map(str, paths))}"))
-    out.print(cell(f"See it come into focus in a browser: lodestream view {file}"))
+    before = "" if assets() else "make page, and then "
+    out.print(cell(f"See it come into focus in a browser: {before}lodestream view {file}"))
     if as_json:
         print_json(
             {

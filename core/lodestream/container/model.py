@@ -246,7 +246,7 @@ class Header:
         """For each block which points are valid: bool, shape (row, column) of the block; None: all."""
         if not self.masked:
             return (None,) * len(self.blocks)
-        from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
+        from ..entropy.mask import decode_mask  # only where there is one: it loads the kernels
 
         return tuple(
             decode_mask(data, shape, self.length) if data else None
@@ -264,7 +264,7 @@ class Header:
         """
         if not any(self.kept):
             return (None,) * len(self.blocks)
-        from ..entropy.mask import decode_mask  # only where there is one: it needs the compiler
+        from ..entropy.mask import decode_mask  # only where there is one: it loads the kernels
 
         found: list[NDArray[np.bool_] | None] = []
         for mask, count, data, (shape, _) in zip(self.masks, self.kept, self.kept_data, self.blocks, strict=True):

@@ -153,7 +153,7 @@ class ReceiverState:
         sink: Sink | None = None,
         max_vertices: int | None = None,
     ) -> None:
-        # The decoder brings the compiler of the kernels: whoever only imports this module does not pay for it.
+        # The decoder loads the kernels: whoever only imports this module does not pay for it.
         from ..decoding.decoder import Decoder
         from ..planning.selection import selection_of
 

@@ -1,9 +1,9 @@
 import { describe, expect, it } from "vitest";
-import { ArtificialSource, type ArtificialSurface, BLOCKS, MOUNTAINS, SPHERE, TORUS } from "../../src/view/artificial";
 import { NO_VALUE } from "../../src/view/fields";
 import { Geometry } from "../../src/view/geometry";
 import type { Eye, PatchBuffers } from "../../src/view/geometry-messages";
 import type { Grid } from "../../src/view/source";
+import { ArtificialSource, type ArtificialSurface, BLOCKS, MOUNTAINS, SPHERE, TORUS } from "./artificial";
 import { areaOf, edgesOf, eulerNumber, openEdges } from "./meshes";
 
 /** A view from a place in drawn coordinates that sees everything, or nothing but a narrow cone. */

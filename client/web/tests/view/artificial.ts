@@ -11,7 +11,7 @@ import type {
   SourceEvents,
   SurfaceInfo,
   Target,
-} from "./source";
+} from "../../src/view/source";
 
 /** How the points of a surface follow from where they are on it. */
 export interface ArtificialSurface {
@@ -234,12 +234,4 @@ export const BLOCKS: ArtificialSurface = {
     const length = 0.6 * Math.hypot(...point) + 0.4;
     return point.map((value) => value / length) as [number, number, number];
   },
-};
-
-/** Sources by the name that `src="artificial:NAME"` has in development. */
-export const ARTIFICIAL: Readonly<Record<string, ArtificialSurface>> = {
-  mountains: MOUNTAINS,
-  torus: TORUS,
-  sphere: SPHERE,
-  blocks: BLOCKS,
 };
