@@ -73,7 +73,7 @@ def precision_of(array: Array) -> float:
 
 
 def layers_of(container: bytes) -> Sequence[Mark]:
-    """States on the way through a container: after each layer and, if there is such a section, the exactness."""
+    """States on the way through a container: after each layer and, if there is such a section, the residual."""
     return plan(read_index(lambda offset, length: container[offset : offset + length], len(container))).marks
 
 

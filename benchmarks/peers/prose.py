@@ -48,4 +48,4 @@ LOSSLESS = """
 Every value comes back bit for bit. *Ours* is what a receiver gets until then; the whole file also has metadata and the
 index. A dash: the peer cannot, since the values lie on no lattice of 16 bits. What loses here, apart from what the
 cells below say: of bijou's float64 values 98 % are float32 numbers, the rest are not, and pcodec finds that out while
-our exactness does not."""
+our residual does not."""
