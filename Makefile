@@ -144,10 +144,15 @@ $(STAMP): pyproject.toml
 	@$(BIN)/python -m pip install --quiet --editable '.[all]' --group dev
 	@touch $@
 
-# An environment of its own: nothing else needs what it needs.
+# An environment of its own: nothing else needs what it needs. The newest peers need Python 3.12 or newer, so one is
+# looked for, also among pyenv's (whose commands of that name may refuse to run), unless PYTHON= names another.
+NEWER = $(if $(filter file,$(origin PYTHON)),$(shell \
+	for python in python3.13 python3.12 $(foreach v,3.13 3.12,$(wildcard $(HOME)/.pyenv/versions/$v.*/bin/python)); do \
+		if $$python -c 'import venv' 2> /dev/null; then echo $$python; break; fi; \
+	done))
 $(PEERS)/.installed: pyproject.toml benchmarks/peers/requirements.txt
 	@echo "Installing into $(PEERS); this happens once and takes a minute or two" >&2
-	@$(PYTHON) -m venv $(PEERS)
+	@$(or $(NEWER),$(PYTHON)) -m venv --clear $(PEERS)
 	@$(PEERS)/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
-	@$(PEERS)/bin/python -m pip install --quiet --editable '.[formats]' --requirement benchmarks/peers/requirements.txt
+	@$(PEERS)/bin/python -m pip install --quiet --editable '.[server,formats]' --requirement benchmarks/peers/requirements.txt
 	@touch $@

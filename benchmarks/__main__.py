@@ -9,13 +9,29 @@ import platform
 import sys
 from importlib.metadata import version
 
-SECTIONS = ("start", "transform", "solver", "rate", "windows", "coder", "memory", "meshes", "blocks", "formats")
+SECTIONS = (
+    "start",
+    "transform",
+    "solver",
+    "rate",
+    "windows",
+    "coder",
+    "throughput",
+    "prefix",
+    "seconds",
+    "memory",
+    "meshes",
+    "blocks",
+    "formats",
+)
 
-# Before numpy is loaded: every figure is of one core.
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+# Before numpy is loaded: every figure is of one core, but where another number of threads is named.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LODESTREAM_THREADS"):
     os.environ[_variable] = "1"
 
 import lodestream  # noqa: E402 - see above
+
+from .measure import gates  # noqa: E402
 
 
 def processor() -> str:
@@ -28,7 +44,7 @@ def processor() -> str:
 
 
 def main() -> int:
-    """Print one table for each section."""
+    """Print the tables of each section, and then all gates."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("section", nargs="*", help=f"of {', '.join(SECTIONS)}; all when none is named")
     chosen = parser.parse_args().section
@@ -41,6 +57,7 @@ def main() -> int:
     for section in SECTIONS:
         if not chosen or section in chosen:
             importlib.import_module(f"benchmarks.{section}").main()
+    gates()
     return 0
 
 

@@ -1,8 +1,7 @@
-"""Samples a second: the coder by itself, the whole of encode and decode, and a prefix beside the inverse transform."""
+"""Samples a second: the coder by itself, and the whole of encode and decode at 16 and 18 bits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,13 +15,11 @@ from lodestream.entropy.tiles import Tiles, TileTable, gather
 from lodestream.grid.layout import Layout
 from lodestream.transform import pyramid
 
-from .arrays import Array, load
+from .arrays import load
 from .measure import medians, note, table
-from .rate import layers_of, off_lattice, precision_of
+from .rate import off_lattice, precision_of
 
 NAMES = ("bigtujunga", "jacksboro", "smooth", "knot")
-SMOOTH = ("smooth", "knot")
-PREFIX = 1e-4
 TILE = (7, 7)
 NO_COSTS = np.empty(0)
 
@@ -126,57 +123,3 @@ def main() -> None:
             "and once with all of them large but the coarsest level's. `encode` also finds the lattice, transforms, "
             "assigns coding passes to layers, and measures the error of every layer and level."
         )
-    _prefixes()
-
-
-def _prefixes() -> None:
-    """Print what a prefix of a smooth surface costs, beside undoing the transform and nothing else."""
-    rows = []
-    for array in (*(array for array in load() if array.name in SMOOTH), Array("hills 2049 x 2049", hills(2049))):
-        container = lodestream.encode(array.points)
-        mark = next(mark for mark in layers_of(container) if mark.rms <= PREFIX * array.extent)
-        prefix = container[: mark.bytes]
-        planes = np.atleast_3d(array.points)
-        inverses = [_inverse(planes[..., channel], array.step) for channel in range(planes.shape[2])]
-
-        def alone(inverses: list[Callable[[], None]] = inverses) -> None:
-            for inverse in inverses:
-                inverse()
-
-        seconds = medians({"prefix": partial(_decode, prefix), "inverse": alone}, rounds=21)
-        spent, least = seconds["prefix"], seconds["inverse"]
-        cells = [f"{mark.bytes:,}", f"{mark.rms / array.extent:.1e}", f"{1e3 * spent:.1f}", f"{1e3 * least:.1f}"]
-        rows.append([array.name, *cells, f"{spent / least:.2f}"])
-    table("Decoding a prefix", ["array", "bytes", "RMS / extent", "decode, ms", "inverse, ms", "times"], rows)
-    note(
-        f"Time to decode the exact stream up to the first layer with an RMS error of at most {PREFIX:.0e} of the "
-        "extent, from bytes to points, and time of the inverse integer transform alone (all levels and channels, with "
-        "copying the coefficients). Aim: at most twice."
-    )
-
-
-def hills(side: int) -> NDArray[np.float32]:
-    """A smooth surface of any size, on no lattice."""
-    y, x = np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side), indexing="ij")
-    return (np.sin(9 * x + 4 * y) + np.cos(7 * y - 5 * x) + 0.1 * np.sin(31 * x * y)).astype(np.float32)
-
-
-def _decode(prefix: bytes) -> NDArray[Any]:
-    decoder = lodestream.Decoder()
-    decoder.feed(prefix)
-    points: NDArray[Any] = decoder.view().points
-    return points
-
-
-def _inverse(plane: NDArray[Any], step: float) -> Callable[[], None]:
-    layout = Layout.single((plane.shape[0], plane.shape[1]), (False, False), TILE)
-    work = pyramid.allocate(layout.grids[0].shape)
-    work[...] = np.rint((plane.astype(np.float64) - float(plane.mean())) / step)
-    predictors = pyramid.forward([work], layout, True)
-    coefficients = np.array(work)
-
-    def undo() -> None:
-        work[...] = coefficients
-        pyramid.inverse([work], layout, predictors, layout.levels)
-
-    return undo

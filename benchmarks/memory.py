@@ -21,11 +21,10 @@ import lodestream
 from lodestream_client import sync
 
 from .arrays import ROOT, fractal
-from .measure import memory, note, table
+from .measure import STATUS, Peak, memory, note, table
 
 CHUNK = 1 << 16
 STREAMS = (0, 16, 64)
-STATUS = Path("/proc/self/status")
 
 
 def main() -> None:
@@ -70,26 +69,17 @@ def _decoder_row(name: str, points: NDArray[Any], container: Path) -> list[str]:
 def decode(container: Path) -> None:
     """Print the peak memory of feeding a container, and of making its surface; runs in a process of its own."""
     lodestream.decode(lodestream.encode(np.arange(289.0).reshape(17, 17) % 7))  # loads the kernels
-    before = psutil.Process().memory_info().rss
+    peak = Peak()
     decoder = lodestream.Decoder()
     with container.open("rb") as file:
-        _forget_peak()
+        peak.forget()
         while chunk := file.read(CHUNK):
             decoder.feed(chunk)
         decoder.finish()
-    print(_peak() - before)
+    print(peak.above())
     surface = decoder.surface()
-    print(_peak() - before)
+    print(peak.above())
     assert surface.points.size
-
-
-def _forget_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-def _peak() -> int:
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith("VmHWM"))
-    return 1024 * int(line.split()[1])
 
 
 def _server_rows(folder: Path, points: NDArray[Any]) -> Iterator[list[str]]:

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 import msgpack
 
-from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, Open
+from lodestream.protocol.messages import BASE_CREDIT, SUBPROTOCOL, Bye, Credit, Open
 from lodestream.protocol.wire import serialize
 
 _BINARY, _CLOSE, _PING, _PONG = 2, 8, 9, 10
@@ -69,7 +69,7 @@ class _Stream(_Way):
             f"GET {parts.path}/stream HTTP/1.1\r\nHost: {parts.netloc}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
             f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: {SUBPROTOCOL}\r\n\r\n"
         ).encode()
-        self.request = _frame(serialize(Open(credit=MAX_CREDIT)))
+        self.request = _frame(serialize(Open(credit=BASE_CREDIT)))
         self._data = bytearray()
         self._ungranted = 0
 
@@ -104,7 +104,7 @@ class _Stream(_Way):
             if kind == "segments":
                 self.keep(message["data"])
                 self._ungranted += len(message["data"])
-                if self._ungranted * 4 >= MAX_CREDIT:
+                if self._ungranted * 4 >= BASE_CREDIT:
                     granted, self._ungranted = self._ungranted, 0
                     return _frame(serialize(Credit(granted)))
             elif kind == "end":

@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 
 import lodestream as ls
-from lodestream.protocol.messages import MAX_CREDIT
+from lodestream.protocol.messages import BASE_CREDIT
 from lodestream_client import aio, sync
 from lodestream_server import running_server
 from tests.links import Fault, Link
@@ -70,7 +70,7 @@ def stop_table(served: Served) -> None:
     """What comes after a stop, which is called when the stream has run for two seconds."""
     rows = []
     for name, rate in RATES.items():
-        for window in (None, MAX_CREDIT):
+        for window in (None, BASE_CREDIT):
             credit, after, seconds, before = asyncio.run(stopped(served, rate, window))
             rows.append(
                 [

@@ -1,7 +1,9 @@
 """The browser's side: its decoder beside Python's, first pictures over a slow link, `lodestream view`, the bundle.
 
-Times of decoding are processor times of Node's process, with one worker in it, and of this one. First pictures are seen
-in Chromium, which draws with the processor here; needs ``make page`` and Chromium.
+Times of decoding are processor times of Node's process, with one worker in it, and of this one: the least of several
+decodings in turns, since a busy machine only ever adds to them. First pictures are seen in Chromium, which draws with
+the processor here, and are times of the clock, which other work lengthens; so the load is told. Needs ``make page`` and
+Chromium.
 """
 
 from __future__ import annotations
@@ -34,17 +36,17 @@ from .arrays import ROOT, fractal, load
 from .measure import note, table
 
 WEB = ROOT / "client" / "web"
-ROUNDS = 9
+ROUNDS = 25
+PICTURES = 5
 ROUND_TRIP = 0.1
 RATE = 125_000.0
 MOST_BUNDLE = 260_000
 
 # Of what JavaScript and C call by different names.
 KERNELS = {
-    "coding passes": ("passes", ("passes",)),
-    "inverse lifting": ("lift", ("lift",)),
-    "coefficients": ("spread", ("spread",)),
-    "SHA-256": ("sha256", ()),
+    "coding passes": ("passes", "passes"),
+    "inverse lifting": ("lift", "lift"),
+    "coefficients": ("dequantize", "spread"),
 }
 
 # When the page's script began and when the first picture was drawn, in milliseconds since the page was asked for.
@@ -64,12 +66,18 @@ _TIMES = """() => window.firstDrawn === null ? null : [
 
 def main() -> None:
     """Print all tables."""
+    tell_load()
     bundle_table()
     with tempfile.TemporaryDirectory() as given:
         folder = Path(given)
         decode_tables(folder)
         first_picture_table(folder)
         view_table(folder)
+    tell_load()
+
+
+def tell_load() -> None:
+    note(f"Load of this machine: {os.getloadavg()[0]:.0f} for {os.cpu_count()} processors.")
 
 
 def verdict(met: bool) -> str:
@@ -132,22 +140,31 @@ def decode_tables(folder: Path) -> None:
             start = time.process_time()
             ls.decode(data)
             python.append(time.process_time() - start)
-        here, there = statistics.median(ours), statistics.median(python)
+        here, there = min(ours), min(python)
         count = points.shape[0] * points.shape[1]
         if there / here < 0.5:
             missed.append(name)
-        rows.append(
-            [name, f"{len(data):,}", f"{count / here / 1e6:.1f}", f"{count / there / 1e6:.1f}", f"{there / here:.2f}"]
-        )
+        both = [f"{count / seconds / 1e6:.1f}" for seconds in (here, there)]
+        medians = statistics.median(python) / statistics.median(ours)
+        rows.append([name, f"{len(data):,}", *both, f"{there / here:.2f}", f"{medians:.2f}"])
         if not inner:
             inner = kernel_rows(worker, data)
         worker.close()
-    head = ["lossless", "bytes", "worker, million points/s", "Python, million points/s", "worker / Python"]
+    head = [
+        "lossless",
+        "bytes",
+        "worker, million points/s",
+        "Python, million points/s",
+        "worker / Python",
+        "of medians",
+    ]
     table("One worker beside Python's library", head, rows)
-    note("Both check the SHA-256 of what they have decoded. Aim: at least 0.50: " + (
-        f"missed for {', '.join(missed)}." if missed else "met."))  # fmt: skip
+    note(
+        f"Least processor time of {ROUNDS} decodings of each, in turns. Both check the SHA-256 of what they have "
+        "decoded. Aim: at least 0.50: " + (f"missed for {', '.join(missed)}." if missed else "met.")
+    )
     table(f"Kernels alone, {rows[0][0]}", ["kernel", "WebAssembly, ms", "C, ms", "speed"], inner)
-    note("Times of the clock within the kernels of one decoding, the least of five.")
+    note(f"Processor time within the kernels of one decoding, the least of {ROUNDS}.")
 
 
 def rough() -> Any:
@@ -156,28 +173,27 @@ def rough() -> Any:
 
 
 def kernel_rows(worker: Worker, data: bytes) -> list[list[str]]:
-    ours = [worker.decode(inside=True)["kernels"] for _ in range(5)]
-    python = [inside_python(data) for _ in range(5)]
+    ours = [worker.decode(inside=True)["kernels"] for _ in range(ROUNDS)]
+    python = [inside_python(data) for _ in range(ROUNDS)]
     rows = []
     for name, (own, others) in KERNELS.items():
         here = 1000 * min(spent.get(own, 0.0) for spent in ours)
-        named = [[seconds for kernel, seconds in spent.items() if kernel in others] for spent in python]
-        there = 1000 * min(map(sum, named))
-        rows.append([name, f"{here:.1f}", f"{there:.1f}" if there else "", f"{there / here:.2f}" if there else ""])
+        there = 1000 * min(spent.get(others, 0.0) for spent in python)
+        rows.append([name, f"{here:.1f}", f"{there:.1f}", f"{there / here:.2f}"])
     return rows
 
 
 def inside_python(data: bytes) -> dict[str, float]:
-    """Seconds within each kernel of the library."""
+    """Seconds of processor time within each kernel of the library."""
     spent: dict[str, float] = {}
     call = kernels.Kernel.__call__
 
     def timed(kernel: kernels.Kernel, *values: Any) -> int:
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             return call(kernel, *values)
         finally:
-            spent[kernel.name] = spent.get(kernel.name, 0.0) + time.perf_counter() - began
+            spent[kernel.name] = spent.get(kernel.name, 0.0) + time.process_time() - began
 
     with patch.object(kernels.Kernel, "__call__", timed):
         ls.decode(data)
@@ -190,25 +206,27 @@ def first_picture_table(folder: Path) -> None:
 
     aim = 5 * ROUND_TRIP + 0.4
     rows = []
-    met = True
+    most = {"least": 0.0, "median": 0.0}
     with running_server(folder / "data", workers=1) as server, chromium() as browser:
         for name, points in (("250 x 250", rough()[:250, :250]), ("1025 x 1025", fractal(1025).astype(np.float32))):
             surface = sync.upload(server, ls.Surface(points))
             with linked(server, Fault(delay=ROUND_TRIP / 2, rate=RATE)) as link:
                 found = []
-                for _ in range(3):
+                for _ in range(PICTURES):
                     with tab(browser, Heard()) as shown:
                         shown.page.add_init_script(_WATCH)
                         shown.go(f"{link.url}/#s={surface.id}")
                         shown.until(lambda shown=shown: shown.page.evaluate(_TIMES))  # type: ignore[misc]
                         found.append([value / 1000 for value in shown.page.evaluate(_TIMES)])
             ready, drawn = (statistics.median(times) for times in zip(*found, strict=True))
-            seconds = statistics.median(last - first for first, last in found)
-            met &= seconds <= aim
-            rows.append([name, f"{ready:.2f}", f"{drawn:.2f}", f"{1000 * seconds:.0f}"])
-    head = ["surface", "script ready, s", "first picture, s", "between, ms"]
-    table("First picture, 100 ms round trip, 1 Mbit/s, median of three", head, rows)
-    note(f"Aim: five round trips and 400 ms after the script is ready, {1000 * aim:.0f} ms: {verdict(met)}.")
+            between = [last - first for first, last in found]
+            spent = {"least": min(between), "median": statistics.median(between)}
+            most = {kind: max(most[kind], spent[kind]) for kind in most}
+            rows.append([name, f"{ready:.2f}", f"{drawn:.2f}", *(f"{1000 * spent[kind]:.0f}" for kind in most)])
+    head = ["surface", "script ready, s", "first picture, s", *(f"between, {kind}, ms" for kind in most)]
+    table(f"First picture, 100 ms round trip, 1 Mbit/s, medians of {PICTURES}", head, rows)
+    found_for = ", ".join(f"{verdict(seconds <= aim)} by the {kind}" for kind, seconds in most.items())
+    note(f"Aim: five round trips and 400 ms after the script is ready, {1000 * aim:.0f} ms: {found_for}.")
 
 
 def view_table(folder: Path) -> None:

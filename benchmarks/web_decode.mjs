@@ -6,8 +6,13 @@ import { isMainThread, parentPort, Worker, workerData } from "node:worker_thread
 
 const [library, container] = isMainThread ? process.argv.slice(2) : workerData;
 
-/** Seconds within each kernel: every export is timed. */
+/** Seconds of processor time within each kernel: every export is timed. */
 const spent = {};
+
+function used() {
+  const { user, system } = process.cpuUsage();
+  return (user + system) / 1e6;
+}
 
 function timed() {
   const Instance = WebAssembly.Instance;
@@ -19,9 +24,9 @@ function timed() {
         typeof value !== "function"
           ? value
           : (...given) => {
-              const began = performance.now();
+              const before = used();
               const result = value(...given);
-              spent[name] = (spent[name] ?? 0) + (performance.now() - began) / 1000;
+              spent[name] = (spent[name] ?? 0) + used() - before;
               return result;
             };
     }
@@ -37,10 +42,9 @@ async function work() {
     for (const name of Object.keys(spent)) delete spent[name];
     WebAssembly.Instance = usual;
     if (inside) timed();
-    const before = process.cpuUsage();
-    const { points } = decode(await loadKernels(), data).blocks[0];
-    const { user, system } = process.cpuUsage(before);
-    parentPort.postMessage({ seconds: (user + system) / 1e6, points: points.values.length, kernels: { ...spent } });
+    const before = used();
+    const { points } = (await decode(await loadKernels(), data)).blocks[0];
+    parentPort.postMessage({ seconds: used() - before, points: points.values.length, kernels: { ...spent } });
   });
 }
 

@@ -16,8 +16,13 @@ __all__ = ["Fault", "Link", "faults_of", "linked"]
 _CHUNK = 64 * 1024
 _PACKET = 1400
 
-# What a router keeps before it stops taking more.
+# On a fast link packets go together: each costs this program as much as many bytes.
+_PACKET_SECONDS = 0.002
+
+# What a router keeps before it stops taking more, beside what is on its way.
 _BUFFER = 64 * 1024
+# Seconds of a link without a rate that may be on their way.
+_UNLIMITED = 1e9
 
 
 @dataclass(frozen=True)
@@ -146,6 +151,8 @@ async def _pipe(
     loop = asyncio.get_running_loop()
     queue: deque[tuple[float, bytes]] = deque()
     queued = 0
+    buffer = _BUFFER + round((rate or _UNLIMITED) * fault.delay)
+    packet = _CHUNK if rate is None else max(_PACKET, round(rate * _PACKET_SECONDS))
     room, news = asyncio.Event(), asyncio.Event()
     ended = False
 
@@ -154,7 +161,7 @@ async def _pipe(
         free = 0.0
         try:
             while data := await reader.read(_CHUNK):
-                step = fault.pieces or (_PACKET if rate is not None else _CHUNK)
+                step = fault.pieces or packet
                 for start in range(0, len(data), step):
                     piece = data[start : start + step]
                     now = loop.time()
@@ -163,7 +170,7 @@ async def _pipe(
                     queue.append((max(free, now) + fault.delay, piece))
                     queued += len(piece)
                     news.set()
-                while queued > _BUFFER:
+                while queued > buffer:
                     room.clear()
                     await room.wait()
         finally:

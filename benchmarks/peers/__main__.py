@@ -7,6 +7,7 @@ it is named, or where it is this project.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import platform
@@ -21,12 +22,15 @@ from typing import Any
 
 from ..__main__ import processor
 from ..arrays import ROOT
-from . import report
+from ..measure import gates, keep
+from . import links, report
+from .curves import Results
 from .registry import OURS, PEERS, versions
+from .seconds import gates as gates_of
 from .surfaces import BUILD, catalogue, prepare, specimen
 
 RESULTS = ROOT / "build" / "peers.json"
-LIMIT = 1200.0  # seconds for one coder on one surface
+LIMIT = 600.0  # seconds for one coder on one surface, by the clock
 
 
 def main() -> int:
@@ -36,21 +40,29 @@ def main() -> int:
     parser.add_argument("--surfaces", help="surfaces whose name contains one of these, separated by commas")
     parser.add_argument("--again", action="store_true", help="measure again what is known")
     parser.add_argument("--tables", action="store_true", help="write the tables and figures of what is known")
+    parser.add_argument("--links", action="store_true", help="measure streams over emulated links only")
     options = parser.parse_args()
-    results = _known()
+    results = known()
     if not options.tables:
         try:
-            _measure(results, options)
+            if not options.links:
+                _measure(results, options)
+            if options.links or not (options.only or options.surfaces):
+                _measure_links(results)
         except KeyboardInterrupt:
             print("stopped; what was measured is kept")
             return 130
     if options.tables or not (options.only or options.surfaces):
         for path in report.write(results):
             print(f"wrote {path.relative_to(ROOT)}")
+        for one in gates_of(Results(results)):
+            keep(one)
+        gates()
     return 0
 
 
-def _known() -> dict[str, Any]:
+def known() -> dict[str, Any]:
+    """What was measured before."""
     if RESULTS.exists():
         known: dict[str, Any] = json.loads(RESULTS.read_text())
         return known
@@ -106,6 +118,16 @@ def _measure(results: dict[str, Any], options: argparse.Namespace) -> None:
     _keep(results, finished)
 
 
+def _measure_links(results: dict[str, Any]) -> None:
+    start = time.perf_counter()
+    if not links.chosen(Results(results), links.SURFACE):
+        print(f"no streams over links: nothing was measured of {links.SURFACE}")
+        return
+    found = links.measure(Results(results)) | {"date": date.today().isoformat()}
+    print(f"{time.perf_counter() - start:6.0f} s  streams over emulated links")
+    _keep(results, lambda results: results.update(links=found))
+
+
 def _add(results: dict[str, Any], name: str, facts: dict[str, Any], key: str, run: dict[str, Any]) -> None:
     results["surfaces"][name] = facts
     results["runs"][key] = run
@@ -126,19 +148,24 @@ def _run(surface: str, coder: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.peers.worker", surface, coder, str(out)]
     try:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT)
+        failure = None
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or ["no message"])[-1][:200]
+            failure = f"failed with exit code {done.returncode}: {last}"
     except subprocess.TimeoutExpired:
-        return {"rows": [], "notes": [f"not done after {LIMIT:.0f} s"], "seconds": LIMIT}
-    if done.returncode or not out.exists():
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1][:200]
-        return {"rows": [], "notes": [f"failed with exit code {done.returncode}: {last}"], "seconds": 0.0}
-    result: dict[str, Any] = json.loads(out.read_text())
-    out.unlink()
+        failure = f"ended after {LIMIT:.0f} s"
+    result: dict[str, Any] = {"rows": [], "notes": [], "moments": [], "seconds": 0.0}
+    with contextlib.suppress(OSError, json.JSONDecodeError):  # nothing, or cut short
+        result = json.loads(out.read_text())
+    out.unlink(missing_ok=True)
+    if failure is not None:
+        result["notes"].append(failure)
     return result
 
 
 def _keep(results: dict[str, Any], change: Callable[[dict[str, Any]], None]) -> None:
     """Change what is known, in memory and in the file, which another run may have added to meanwhile."""
-    results.update(_known())
+    results.update(known())
     change(results)
     part = Path(f"{RESULTS}.{os.getpid()}")
     part.write_text(json.dumps(results))

@@ -105,6 +105,11 @@ class Results:
         ends = [max(rows, key=lambda row: int(row["bytes"])) for name, rows in found.items() if name != "exact"]
         return {**found, EACH: ends} if ends else found
 
+    def moments(self, surface: str) -> list[dict[str, Any]]:
+        """What a receiver of our exact stream computes until each error, see `ours.moments`."""
+        found: list[dict[str, Any]] = self.data["runs"].get(f"{surface}|{OURS}", {}).get("moments", [])
+        return found
+
     def cells(self, surfaces: Sequence[str], kind: str) -> list[Cell]:
         """Every error on every surface where both ours and a peer were measured."""
         found = []

@@ -11,7 +11,7 @@ import numpy as np
 import pywt
 from numpy.typing import NDArray
 
-from .trial import SIDE, Trial, decades
+from .trial import SIDE, THREADS, Trial, decades, stacked
 
 #: SPERR's own header of a plane, which says shape and type.
 _SPERR_HEADER = 10
@@ -42,8 +42,8 @@ def zfp(trial: Trial) -> None:
 
 def _zfp_encode(plane: NDArray[Any], bound: float) -> bytes:
     if not bound:
-        return bytes(imagecodecs.zfp_encode(plane, mode="reversible", numthreads=1))
-    return bytes(imagecodecs.zfp_encode(plane, level=bound, mode="accuracy", numthreads=1))
+        return bytes(imagecodecs.zfp_encode(plane, mode="reversible", numthreads=THREADS))
+    return bytes(imagecodecs.zfp_encode(plane, level=bound, mode="accuracy", numthreads=THREADS))
 
 
 def _bounded(trial: Trial, encode: Any, decode: Any) -> None:
@@ -58,7 +58,7 @@ def _bounded(trial: Trial, encode: Any, decode: Any) -> None:
     trial.case(
         "lossless",
         lambda: [encode(plane, 0.0) for plane in planes],
-        lambda streams: np.stack([decode(data, like) for data, like in zip(streams, planes, strict=True)], -1),
+        lambda streams: stacked([decode(data, like) for data, like in zip(streams, planes, strict=True)]),
     )
     if trial.lattice is not None and trial.lattice.longest < 1 << 22:
         lattice = trial.lattice
@@ -66,20 +66,19 @@ def _bounded(trial: Trial, encode: Any, decode: Any) -> None:
         trial.case(
             "whole numbers, error 0.49",
             lambda: [encode(plane, 0.49) for plane in whole],
-            lambda streams: lattice.points(
-                np.rint(np.stack([decode(data, like) for data, like in zip(streams, whole, strict=True)], -1))
-            ),
+            lambda streams: stacked([decode(data, like) for data, like in zip(streams, whole, strict=True)]),
             SIDE,
+            lambda numbers: lattice.points(np.rint(numbers)),
         )
 
 
 def _sperr_encode(plane: NDArray[Any], level: float, mode: Any) -> bytes:
-    return bytes(imagecodecs.sperr_encode(plane, level=level, mode=mode, header=False, numthreads=1))
+    return bytes(imagecodecs.sperr_encode(plane, level=level, mode=mode, header=False, numthreads=THREADS))
 
 
 def _sperr_decode(trial: Trial, data: bytes) -> NDArray[Any]:
     return np.asarray(
-        imagecodecs.sperr_decode(data, header=False, shape=trial.surface.shape, dtype=np.float32, numthreads=1)
+        imagecodecs.sperr_decode(data, header=False, shape=trial.surface.shape, dtype=np.float32, numthreads=THREADS)
     )
 
 
@@ -118,18 +117,20 @@ def sperr_psnr(trial: Trial) -> None:
 def sperr_prefix(trial: Trial) -> None:
     """One stream of each channel, cut where a stream of the error asked for would end."""
     planes = trial.surface.floats
-    whole, encode_seconds, encode_peak = trial.timed(
+    whole, seconds, peak = trial.timed(
         lambda: [_sperr_at(trial, plane, number, 10**-6.5) for number, plane in enumerate(planes)]
     )
+    encoding = (seconds, peak)
     for rms in _sperr_errors(trial):
         lengths = [len(_sperr_at(trial, plane, number, rms)) for number, plane in enumerate(planes)]
         cut = [stream[:length] for stream, length in zip(whole, lengths, strict=True)]
-        decoded, decode_seconds, decode_peak = trial.timed(
-            lambda cut=cut: np.stack([_sperr_decode(trial, data) for data in cut], -1)  # type: ignore[misc]
+        trial.decoded(
+            f"prefix for RMS {rms:.1e}",
+            cut,
+            lambda streams: stacked([_sperr_decode(trial, data) for data in streams]),
+            encoding,
+            _sperr_header(trial),
         )
-        size = sum(map(len, cut)) + _sperr_header(trial)
-        seconds, peaks = (encode_seconds, decode_seconds), (encode_peak, decode_peak)
-        trial.add(f"prefix for RMS {rms:.1e}", size, decoded, seconds, peaks)
 
 
 def sperr_bound(trial: Trial) -> None:
@@ -148,8 +149,9 @@ def sperr_bound(trial: Trial) -> None:
         trial.case(
             "whole numbers, error 0.49",
             lambda: [_sperr_encode(plane, 0.49, "pwe") for plane in whole],
-            lambda streams: lattice.points(np.rint(np.stack([_sperr_decode(trial, data) for data in streams], -1))),
+            lambda streams: stacked([_sperr_decode(trial, data) for data in streams]),
             SIDE,
+            lambda numbers: lattice.points(np.rint(numbers)),
         )
 
 

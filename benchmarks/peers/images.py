@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from .trial import SIDE, Trial
+from .trial import SIDE, THREADS, Restore, Trial, stacked
 
 _Encode = Callable[[NDArray[Any]], Any]
 _Decode = Callable[[bytes], NDArray[Any]]
+_Setting = tuple[str, Callable[[], NDArray[Any]], Restore]
 
 
 def htj2k(trial: Trial) -> None:
@@ -30,8 +32,9 @@ def htj2k(trial: Trial) -> None:
         trial.case(
             f"9/7, level {level:.1e}",
             encode,
-            lambda streams: trial.restored(np.stack([_htj2k_decode(data) for data in streams], -1), step),
+            lambda streams: stacked([_htj2k_decode(data) for data in streams]),
             SIDE,
+            lambda numbers: trial.restored(numbers, step),
         )
 
 
@@ -39,32 +42,41 @@ def _htj2k_decode(data: bytes) -> NDArray[Any]:
     return np.asarray(imagecodecs.htj2k_decode(data))
 
 
+#: Lossless at efforts 9 and 10. More samples than these are tried at 9 alone: 10 takes several times as long.
+_FAST, _BEST = 9, 10
+_BEST_SAMPLES = 1_000_000
+#: Quantised values are tried at effort 10 too where there are at most so many samples.
+_QUANTISED_SAMPLES = 200_000
+
+
 def jpegxl(trial: Trial) -> None:
-    """Lossless, effort 9 (7 where a large one is quantised); float32 as such where there are no 16 bits of numbers."""
+    """Lossless, efforts 9 and 10 (7 where a large one is quantised); float32 as such where 16 bits are not enough."""
     surface, lattice = trial.surface, trial.lattice
-    first = 7 if surface.large else 9
-    _planes(trial, lambda plane: _jpegxl_encode(plane, first), _jpegxl_decode)
-    if lattice is not None and lattice.longest <= 65535:
-        if surface.large:
-            whole = lattice.numbers.astype(np.uint16)
-            trial.case(
-                "lossless, effort 9",
-                lambda: [_jpegxl_encode(_plane(whole, i), 9) for i in _all(whole)],
-                lambda streams: lattice.points(np.stack([_jpegxl_decode(data) for data in streams], -1)),
-                SIDE,
+    samples = surface.points.size
+    efforts = (_FAST, _BEST) if samples <= _BEST_SAMPLES else (_FAST,)
+    whole = [setting for setting in _sixteen_bits(trial) if setting[0] == "lossless"]
+    quantised = [setting for setting in _sixteen_bits(trial) if setting[0] != "lossless"]
+    for effort in efforts:
+        _planes_of(trial, whole, partial(_jpegxl_encode, effort=effort), _jpegxl_decode, f", effort {effort}")
+    if (lattice is None or lattice.longest > 65535) and all(
+        np.array_equal(plane, single) for plane, single in zip(surface.channels, surface.floats, strict=True)
+    ):
+        for effort in efforts:
+            trial.each_channel(
+                f"lossless float32, effort {effort}",
+                lambda plane, _, effort=effort: _jpegxl_encode(plane, effort),  # type: ignore[misc]
+                lambda data, _: _jpegxl_decode(data),
             )
-    elif all(np.array_equal(plane, single) for plane, single in zip(surface.channels, surface.floats, strict=True)):
-        trial.each_channel(
-            "lossless float32", lambda plane, _: _jpegxl_encode(plane, 9), lambda data, _: _jpegxl_decode(data)
-        )
+    for effort in (7,) if surface.large else efforts if samples <= _QUANTISED_SAMPLES else (_FAST,):
+        _planes_of(trial, quantised, partial(_jpegxl_encode, effort=effort), _jpegxl_decode, f", effort {effort}")
 
 
 def _jpegxl_encode(plane: NDArray[Any], effort: int) -> bytes:
-    return bytes(imagecodecs.jpegxl_encode(plane, lossless=True, effort=effort, numthreads=1))
+    return bytes(imagecodecs.jpegxl_encode(plane, lossless=True, effort=effort, numthreads=THREADS))
 
 
 def _jpegxl_decode(data: bytes) -> NDArray[Any]:
-    return np.asarray(imagecodecs.jpegxl_decode(data, numthreads=1))
+    return np.asarray(imagecodecs.jpegxl_decode(data, numthreads=THREADS))
 
 
 def jpegxl_lossy(trial: Trial) -> None:
@@ -79,7 +91,7 @@ def jpegxl_lossy(trial: Trial) -> None:
             return [
                 bytes(
                     imagecodecs.jpegxl_encode(
-                        _plane(numbers, i), lossless=False, distance=distance, effort=7, numthreads=1
+                        _plane(numbers, i), lossless=False, distance=distance, effort=7, numthreads=THREADS
                     )
                 )
                 for i in _all(numbers)
@@ -88,8 +100,9 @@ def jpegxl_lossy(trial: Trial) -> None:
         trial.case(
             f"distance {distance}",
             encode,
-            lambda streams: trial.restored(np.stack([_jpegxl_decode(data) for data in streams], -1), step),
+            lambda streams: stacked([_jpegxl_decode(data) for data in streams]),
             SIDE,
+            lambda numbers: trial.restored(numbers, step),
         )
 
 
@@ -105,7 +118,7 @@ def pcodec(trial: Trial) -> None:
     trial.case(
         "lossless, as it is",
         lambda: [bytes(imagecodecs.pcodec_encode(_coded(plane), level=12)) for plane in surface.channels],
-        lambda streams: np.stack([_pcodec_decode(data, surface.shape, as_coded) for data in streams], -1),
+        lambda streams: stacked([_pcodec_decode(data, surface.shape, as_coded) for data in streams]),
         SIDE,
     )
     _planes(
@@ -122,10 +135,9 @@ def pcodec(trial: Trial) -> None:
                 bytes(imagecodecs.pcodec_encode(_plane(lattice.numbers, i).astype(wide), level=12))
                 for i in _all(lattice.numbers)
             ],
-            lambda streams: lattice.points(
-                np.stack([_pcodec_decode(data, surface.shape, wide) for data in streams], -1)
-            ),
+            lambda streams: stacked([_pcodec_decode(data, surface.shape, wide) for data in streams]),
             SIDE,
+            lattice.points,
         )
 
 
@@ -156,26 +168,31 @@ def meshoptimizer(trial: Trial) -> None:
         trial.case(
             setting,
             lambda numbers=numbers: [encode(numbers())],  # type: ignore[misc]
-            lambda streams, back=back: back(decode(streams[0])),  # type: ignore[misc]
+            lambda streams: decode(streams[0]),
             SIDE,
+            back,
         )
 
 
 def _planes(trial: Trial, encode: _Encode, decode: _Decode) -> None:
     """A coder of planes of 16 bits."""
-    for setting, numbers, back in _sixteen_bits(trial):
+    _planes_of(trial, _sixteen_bits(trial), encode, decode)
+
+
+def _planes_of(trial: Trial, settings: list[_Setting], encode: _Encode, decode: _Decode, suffix: str = "") -> None:
+    for setting, numbers, back in settings:
 
         def encode_all(numbers: Callable[[], NDArray[Any]] = numbers) -> list[bytes]:
             whole = numbers()
             return [bytes(encode(_plane(whole, i))) for i in _all(whole)]
 
-        def decode_all(streams: Any, back: Callable[[NDArray[Any]], NDArray[Any]] = back) -> NDArray[Any]:
-            return back(np.stack([decode(data) for data in streams], -1))
-
-        trial.case(setting, encode_all, decode_all, SIDE)
-
-
-_Setting = tuple[str, Callable[[], NDArray[Any]], Callable[[NDArray[Any]], NDArray[Any]]]
+        trial.case(
+            f"{setting}{suffix}",
+            encode_all,
+            lambda streams: stacked([decode(data) for data in streams]),
+            SIDE,
+            back,
+        )
 
 
 def _sixteen_bits(trial: Trial) -> list[_Setting]:
@@ -183,14 +200,14 @@ def _sixteen_bits(trial: Trial) -> list[_Setting]:
     found: list[_Setting] = []
     lattice = trial.lattice
     if lattice is None:
-        trial.notes.append("lossless in 16 bits: the values lie on no lattice")
+        trial.note("lossless in 16 bits: the values lie on no lattice")
     elif lattice.longest > 65535:
-        trial.notes.append(f"lossless in 16 bits: the lattice has {lattice.longest + 1} steps")
+        trial.note(f"lossless in 16 bits: the lattice has {lattice.longest + 1} steps")
     else:
         found.append(("lossless", lambda: lattice.numbers.astype(np.uint16), lattice.points))
     for setting, step in trial.steps():
         if float(trial.surface.sides.max()) / step > 65535:
-            trial.notes.append(f"{setting}: needs more than 16 bits")
+            trial.note(f"{setting}: needs more than 16 bits")
             continue
         found.append(
             (

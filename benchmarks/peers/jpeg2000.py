@@ -12,7 +12,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from .trial import SIDE, Trial
+from .trial import SIDE, THREADS, Trial, stacked
 
 _SOT, _SOD, _COD, _PLT, _EOC = b"\xff\x90", b"\xff\x93", b"\xff\x52", b"\xff\x58", b"\xff\xd9"
 
@@ -34,14 +34,17 @@ def reversible(trial: Trial) -> None:
         trial.case(
             "lossless, one layer",
             lambda: [_lossless(lattice.numbers[..., i], bits) for i in range(lattice.numbers.shape[2])],
-            lambda streams: lattice.points(np.stack([np.asarray(imagecodecs.jpeg2k_decode(s)) for s in streams], -1)),
+            lambda streams: stacked([_decode(data) for data in streams]),
             SIDE,
+            lattice.points,
         )
 
 
 def _lossless(numbers: NDArray[np.int64], bits: int) -> bytes:
     plane = np.ascontiguousarray(numbers.astype(np.uint32))
-    return bytes(imagecodecs.jpeg2k_encode(plane, reversible=True, codecformat="j2k", bitspersample=bits, numthreads=1))
+    return bytes(
+        imagecodecs.jpeg2k_encode(plane, reversible=True, codecformat="j2k", bitspersample=bits, numthreads=THREADS)
+    )
 
 
 def _step(trial: Trial) -> float:
@@ -76,17 +79,22 @@ def _layers(trial: Trial, numbers: NDArray[np.int64], wavelet97: bool) -> None:
             )
             return path.read_bytes()
 
-    stream, encode_seconds, encode_peak = trial.timed(encode)
+    stream, seconds, peak = trial.timed(encode)
     codestream = _Codestream.parse(stream, len(ratios))
     lattice = trial.lattice if not wavelet97 and trial.lattice and numbers is trial.lattice.numbers else None
     for layer in range(len(ratios)):
-        cut = codestream.prefix(layer + 1)
-        decoded, decode_seconds, decode_peak = trial.timed(
-            lambda cut=cut: np.asarray(imagecodecs.jpeg2k_decode(cut, numthreads=1))  # type: ignore[misc]
+        trial.decoded(
+            f"{layer + 1} of {len(ratios)} layers",
+            [codestream.prefix(layer + 1)],
+            lambda streams: _decode(streams[0]),
+            (seconds, peak),
+            SIDE,
+            lattice.points if lattice else lambda decoded: trial.restored(decoded.astype(np.float64), _step(trial)),
         )
-        values = lattice.points(decoded) if lattice else trial.restored(decoded.astype(np.float64), _step(trial))
-        seconds, peaks = (encode_seconds, decode_seconds), (encode_peak, decode_peak)
-        trial.add(f"{layer + 1} of {len(ratios)} layers", len(cut) + SIDE, values, seconds, peaks)
+
+
+def _decode(data: bytes) -> NDArray[Any]:
+    return np.asarray(imagecodecs.jpeg2k_decode(data, numthreads=THREADS))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -13,10 +15,14 @@ from lodestream.container import read_index
 from lodestream.planning.plan import Mark
 from lodestream.planning.planner import plan
 
+from .seconds import ERRORS
 from .trial import TARGETS, Trial
 
 #: Of a stream made for one error, layers count whose error is at most this many times the one it is made for.
 _BESIDE = 10.0
+#: Times that a stream is fed, until they have taken so many seconds together.
+_FED = 5
+_FED_SECONDS = 3.0
 #: Chance puts the RMS a little above or below what an even spread foretells.
 _JUST_BELOW = 0.999
 #: What large surfaces are tried at, as peers are tried at fewer settings there; and with a precision only at the last.
@@ -81,6 +87,8 @@ def _stream(
     container, encode_seconds, encode_peak = trial.timed(lambda: lodestream.encode(surface, precision, rms=rms))
     decoded, whole_seconds, decode_peak = trial.timed(lambda: lodestream.decode(container).points)
     marks = plan(read_index(lambda offset, length: container[offset : offset + length], len(container))).marks
+    if made_for is None:
+        trial.moments += moments(container, marks, trial.surface.extent)
     near = min(range(len(marks)), key=lambda number: abs(math.log(max(marks[number].rms, 1e-300) / _near(trial))))
     decoder, held = lodestream.Decoder(), 0
     for number, mark in enumerate(marks):
@@ -99,6 +107,37 @@ def _stream(
         )
         _check(trial, mark, reconstruction)
     return float(trial.rows[-1][made_for[0]]) if made_for is not None else 0.0
+
+
+def moments(container: bytes, marks: Sequence[Mark], extent: float) -> list[dict[str, Any]]:
+    """What a receiver of the exact stream computes until each error that is asked for.
+
+    For each: ``target``, ``bytes`` at the end of each layer until then, ``feed_s`` for that layer, and ``picture_s``
+    for the points, in seconds of the processor; each the least of several times.
+    """
+    found = []
+    for target in ERRORS:
+        needed = next((number for number, mark in enumerate(marks) if mark.rms <= target * extent), None)
+        if needed is None or (target == 0 and marks[needed].max_error):
+            continue
+        fed, picture, spent = [math.inf] * (needed + 1), math.inf, 0.0
+        for _ in range(_FED):
+            start = process_time()
+            decoder, held = lodestream.Decoder(), 0
+            for number, mark in enumerate(marks[: needed + 1]):
+                before = process_time()
+                decoder.feed(container[held : mark.bytes])
+                held = mark.bytes
+                fed[number] = min(fed[number], process_time() - before)
+            before = process_time()
+            _ = decoder.view().points
+            picture = min(picture, process_time() - before)
+            spent += process_time() - start
+            if spent > _FED_SECONDS:
+                break
+        ends = [mark.bytes for mark in marks[: needed + 1]]
+        found.append({"target": target, "bytes": ends, "feed_s": fed, "picture_s": picture})
+    return found
 
 
 def _far(mark: Mark, made_for: tuple[str, float], trial: Trial) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["GATES", "LOSSLESS", "MEMORY", "RULES", "SPEED"]
+__all__ = ["GATES", "LINKS", "LOSSLESS", "MEMORY", "NOT_MEASURED", "RULES", "SECONDS", "SPEED"]
 
 RULES = """\
 - A cell is one error on one surface. Errors are relative to the range of heights or to the diagonal of the box, of
@@ -25,6 +25,43 @@ RULES = """\
 - A ratio below 1 says that ours needs fewer bytes; **bold**: it loses. Means are geometric, over cells where the best
   peer needs 4 KB or more."""
 
+SECONDS = """\
+How long a receiver waits for points with an RMS error, or for every value: the bytes over the link, and decoding them,
+on one core. The link is one in figures: no handshake, no round trip, nothing lost.
+
+- *Ours* is the one exact stream, made without naming an error, decoded layer by layer as it arrives: a layer when it
+  has come and the ones before are decoded. At the first layer with the error the points are made, once. So what is
+  counted after the last byte is that layer, the points, and whatever the decoder had left until points are asked for.
+- *A peer* sends the stream that meets the error, and it is decoded when it is there. Each coder has all its settings
+  and what lies between two of them; the best of all coders is taken in each cell. What turns whole numbers back into
+  values is not counted, where a coder has whole numbers; ours gives values.
+- Seconds of decoding are those of the processor, the least of several times: the machine may be shared.
+- A ratio below 1 says that ours is there first. Means are geometric, over all cells. **Bold**: a mean or a worst cell
+  that misses its aim, or a cell above 1.
+- `by the script`: the mean as `../shared/bench/time_to_error.py` counts, with its fewer peers, nothing between their
+  settings, and as if all our decoding happened while bytes arrive. The aims are held against the stricter figure before
+  it."""
+
+LINKS = """\
+Seconds by the clock from the connection to the points, over links that a proxy emulates: so many bits a second towards
+the client, half the round trip either way, without TCP's handshake and slow start. Nothing is reckoned here.
+
+- *Ours* comes from `lodestream serve` by the Python client over WebSocket, one exact stream in the server's default
+  form, stopped at the error.
+- Each peer's file is its smallest that was found to meet the error, by HTTP from Python's own server, decoded by the
+  same process once it is there. Its coder needs to know the error beforehand; ours is one stream for all.
+- `raw`: the array's own bytes by HTTP; they are exact, whatever the error.
+- Server, proxy and client share the machine, so speeds of links above what it can carry are not reached, and whatever
+  else it does counts. `of processors`: what the client's own process computed.
+- At 1 Mbit/s all was received once, else medians of three are told, in which all take turns."""
+
+NOT_MEASURED = """\
+- **Intra frames of AV1, HEVC and VVC** at 10 to 12 bits: they need 0.7 to 1.2 of our bytes at an RMS error of 1e-2 of
+  terrain. Their streams have one error; they cannot be refined.
+- **HPEZ**: for some maximum errors it needs 0.8 to 0.9 of the bytes of the best other coder. Neither can it be refined.
+
+These two figures were found elsewhere, and not by this program: no package brings either to it."""
+
 GATES = """\
 Means, worst ratios and the aims are of cells of 4 KB or more, and the aims are for the best setting. Bold here: worse
 than the aim, or than 1 where there is none (means), or than 1 (worst). No cell should lie above 1.03, and none below
@@ -34,14 +71,13 @@ SPEED = """
 MB are those of the samples as float32, whatever their type; geometric means over the surfaces, without the tiny ones;
 one core. *At 1e-4*: the setting whose RMS error is nearest, where one is within a factor of 3; for streams of layers or
 prefixes encoding is that of the whole stream. Ours is the exact stream: encoding measures the errors of every layer
-and level, decoding at 1e-4 is that of a prefix. Times are the best of three where they are short, else single. A
-coder is measured again only where it changed, and this machine is shared: ours was last measured at another hour than
-most peers, with two to four times as many busy processes as cores, so our speeds are lower here than on an idle machine
-(those of [measurements.md](measurements.md) are of one run). Bytes and memory know nothing of that."""
+and level, decoding at 1e-4 is that of a prefix. Times are those of the processor, the best of three
+where they are short, else single, without the way from whole numbers back to values. A coder is measured again only
+where it changed, maybe at another hour; others who use the machine slow its processors down too."""
 
 MEMORY = """
 Peak above what the process held with the surface loaded, largest over the settings, as a multiple of the samples as
-float32. The way from values to whole numbers and back, as float64, is the peer's where it is needed. What a process had
+float32. The way from values to whole numbers, by float64, is the peer's where it is needed. What a process had
 freed before and kept may hide a part of a peak."""
 
 LOSSLESS = """

@@ -12,12 +12,15 @@ import lodestream
 from ..arrays import ROOT
 from . import figures
 from .curves import Cell, Results, geometric_mean
-from .prose import GATES, LOSSLESS, MEMORY, RULES, SPEED
-from .registry import OURS, PEERS
+from .linked import linked
+from .prose import GATES, LOSSLESS, MEMORY, NOT_MEASURED, RULES, SPEED
+from .registry import OURS, PEERS, old
 from .remarks import REMARKS, TERRACES, remark_of
 from .speed import memory_table, speed_table
 from .surfaces import GROUPS
+from .tables import bold, number, table
 from .trial import TARGETS
+from .waiting import waiting
 
 __all__ = ["write"]
 
@@ -37,6 +40,10 @@ def write(data: dict[str, Any]) -> list[Path]:
 
 def _page(results: Results, drawn: dict[str, Path]) -> Iterator[str]:
     yield from _head(results)
+    yield "\n## Seconds until the error\n"
+    yield from waiting(results)
+    yield "\n## Over emulated links\n"
+    yield from linked(results)
     for kind, title in KINDS.items():
         yield f"\n## {title}\n"
         yield from _summary(results, kind)
@@ -50,12 +57,14 @@ def _page(results: Results, drawn: dict[str, Path]) -> Iterator[str]:
     yield "\n## Lossless\n"
     yield from _lossless(results)
     yield "\n## Speed\n"
-    yield from _table(*speed_table(results))
+    yield from table(*speed_table(results))
     yield SPEED
     yield "\n## Memory\n"
-    yield from _table(*memory_table(results))
+    yield from table(*memory_table(results))
     yield MEMORY
     yield from _losses(results)
+    yield "## Not measured\n"
+    yield NOT_MEASURED
     yield from _left_out(results)
 
 
@@ -64,15 +73,18 @@ def _head(results: Results) -> Iterator[str]:
     runs = results.data["runs"].values()
     dates = sorted({run["date"] for run in runs})
     took = sum(run["seconds"] for run in runs)
-    yield "# Bytes, speed and memory beside the peers\n"
+    yield "# Seconds, bytes, speed and memory beside the peers\n"
     yield "This page and its figures are written by\n"
     yield "    make bench-peers\n"
     yield "in an environment of its own (layers of JPEG 2000 need Debian's OpenJPEG: `apt-get install libopenjp2-7`),"
     name = machine.get("processor", "an unknown processor").strip()
-    yield f"which took {took / 60:.0f} minutes of measuring, on one core of {name} "
+    yield f"which took {took / 60:.0f} minutes of processor time, on one core of {name} "
     when = " to ".join(sorted({dates[0], dates[-1]}))
     yield f"({machine.get('system', '')}, Python {machine.get('python', '')}), {when}.\n"
     yield f"Lodestream {lodestream.__version__}; {', '.join(results.data.get('versions', []))}.\n"
+    outdated = old(results.data.get("versions", []))
+    if outdated:
+        yield f"**Old**: {', '.join(outdated)}. Newer ones, with JPEG XL 0.12 and SZ3 3.4, need Python 3.12 or newer.\n"
     yield RULES
     yield "\n| surface | group | size | type | closed | from |"
     yield "| --- | --- | --- | --- | --- | --- |"
@@ -104,14 +116,14 @@ def _summary(results: Results, kind: str) -> Iterator[str]:
                 [
                     f"{group}, {target:.0e}",
                     f"{len(large)} of {len(at)}",
-                    _bold(mean, aim or 1.0),
+                    bold(mean, aim or 1.0),
                     f"{aim}" if aim else "",
-                    _bold(worst, 1.0),
+                    bold(worst, 1.0),
                     str(sum(cell.ratio > GATE for cell in large)),
                     "" if math.isnan(over) else f"{over:+,.0f}",
                     str(lost),
-                    _bold(alone, aim or 1.0),
-                    _bold(alone_worst, 1.0),
+                    bold(alone, aim or 1.0),
+                    bold(alone_worst, 1.0),
                 ]
             )
     head = [
@@ -126,7 +138,7 @@ def _summary(results: Results, kind: str) -> Iterator[str]:
         "one exact stream: mean ratio",
         "worst",
     ]
-    yield from _table(head, rows)
+    yield from table(head, rows)
     if kind == "rms":
         yield "\n" + GATES
         yield from _without_terraces(results)
@@ -139,8 +151,8 @@ def _without_terraces(results: Results) -> Iterator[str]:
         return
     cells = [cell for cell in results.cells(names, "rms") if cell.counts]
     at = [[cell for cell in cells if cell.target == target] for target in TARGETS]
-    best = ", ".join(_number(geometric_mean([cell.ratio for cell in some])) for some in at)
-    alone = ", ".join(_number(geometric_mean([cell.exact_ratio for cell in some])) for some in at)
+    best = ", ".join(number(geometric_mean([cell.ratio for cell in some])) for some in at)
+    alone = ", ".join(number(geometric_mean([cell.exact_ratio for cell in some])) for some in at)
     yield f"\nRough terrain without {', '.join(TERRACES)} (terraces, see the cells that lose): means of"
     yield f"{best} at the best setting, of {alone} with one exact stream."
 
@@ -152,21 +164,21 @@ def _cells(cells: Sequence[Cell]) -> Iterator[str]:
             cell.peer,
             f"{cell.peer_bytes:,.0f}",
             f"{cell.ours:,.0f}",
-            _bold(cell.ratio, 1.0),
+            bold(cell.ratio, 1.0),
             cell.stream,
             f"{cell.exact:,.0f}",
-            _bold(cell.exact_ratio, 1.0),
+            bold(cell.exact_ratio, 1.0),
         ]
         for cell in cells
     ]
-    yield from _table(
+    yield from table(
         ["surface, error", "best peer", "bytes", "ours, best setting", "ratio", "setting", "one exact stream", "ratio"],
         rows,
     )
 
 
 def _lossless(results: Results) -> Iterator[str]:
-    gates = ("JPEG XL, effort 9", "pcodec", "SZ3")
+    gates = ("JPEG XL, efforts 9 and 10", "pcodec", "SZ3")
     rows: list[list[str]] = []
     ratios: dict[str, dict[str, list[float]]] = {}
     without = f"the same heights without {', '.join(TERRACES)}"
@@ -181,7 +193,7 @@ def _lossless(results: Results) -> Iterator[str]:
         cells = []
         for peer in gates:
             ratio = ours["bytes"] / found[peer] if peer in found else math.nan
-            cells += [f"{found[peer]:,}" if peer in found else "-", _bold(ratio, 1.0)]
+            cells += [f"{found[peer]:,}" if peer in found else "-", bold(ratio, 1.0)]
             xyz = facts["shape"][2:] == [3]
             kind = "float32 x, y, z" if xyz else "heights of at most 16 bits"
             fits = facts["dtype"] == "float32" if xyz else _sixteen_bits(results, name)
@@ -190,7 +202,7 @@ def _lossless(results: Results) -> Iterator[str]:
                 ratios[kind].setdefault(peer, []).append(ratio)
                 if name not in TERRACES and not xyz:
                     ratios[without].setdefault(peer, []).append(ratio)
-        last = [best, f"{found[best]:,}", _bold(ours["bytes"] / found[best], 1.0)] if best else ["-", "-", ""]
+        last = [best, f"{found[best]:,}", bold(ours["bytes"] / found[best], 1.0)] if best else ["-", "-", ""]
         rows.append([name, f"{ours['bytes']:,}", f"{ours['file']:,}", *cells, *last])
     head = [
         "surface",
@@ -201,11 +213,11 @@ def _lossless(results: Results) -> Iterator[str]:
         "bytes",
         "ratio",
     ]
-    yield from _table(head, rows)
+    yield from table(head, rows)
     yield ""
     for kind, by_peer in ratios.items():
         means = ", ".join(
-            f"{_bold(geometric_mean(values), 1.0)} of {peer} ({len(values)})" for peer, values in by_peer.items()
+            f"{bold(geometric_mean(values), 1.0)} of {peer} ({len(values)})" for peer, values in by_peer.items()
         )
         yield f"- {kind}, larger than 64 x 64, geometric means (surfaces): {means or 'nothing measured'}."
     yield LOSSLESS
@@ -213,7 +225,7 @@ def _lossless(results: Results) -> Iterator[str]:
 
 def _sixteen_bits(results: Results, surface: str) -> bool:
     """Whether JPEG XL could be given whole numbers, of which it has 16 bits."""
-    row = results.lossless(surface, "JPEG XL, effort 9")
+    row = results.lossless(surface, "JPEG XL, efforts 9 and 10")
     return row is not None and "float32" not in row["setting"]
 
 
@@ -239,7 +251,7 @@ def _losses(results: Results) -> Iterator[str]:
 
 
 def _left_out(results: Results) -> Iterator[str]:
-    yield "## Left out\n"
+    yield "\n## Left out\n"
     for note in results.data.get("skipped", []):
         yield f"- {note}"
     told: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
@@ -252,19 +264,3 @@ def _left_out(results: Results) -> Iterator[str]:
     for note, (coders, surfaces) in sorted(told.items()):
         where = f"{len(surfaces)} surfaces" if len(surfaces) > 4 else ", ".join(surfaces)
         yield f"- {', '.join(coders)}: {note} ({where})"
-
-
-def _bold(value: float, limit: float) -> str:
-    text = _number(value)
-    return f"**{text}**" if value > limit else text
-
-
-def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.3f}"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(head)} |"
-    yield f"| --- |{' ---: |' * (len(head) - 1)}"
-    for row in rows:
-        yield f"| {' | '.join(row)} |"

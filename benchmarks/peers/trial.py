@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,55 +13,39 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..measure import Peak
 from .surfaces import Specimen
 
-__all__ = ["SIDE", "TARGETS", "Peak", "Trial", "decades"]
+__all__ = ["SIDE", "TARGETS", "THREADS", "Restore", "Streams", "Trial", "decades", "stacked"]
 
 TARGETS = (1e-2, 1e-3, 1e-4, 1e-5)
 
 #: Bytes counted on top of a stream that does not itself say shape, type, and how its numbers become values.
 SIDE = 32
 
+#: Processor seconds after which no further setting of a coder is tried on a surface.
+BUDGET = 30.0
+
+#: Threads of the peers that have any: one for all figures but those that name another number.
+THREADS = int(os.environ.get("LODESTREAM_THREADS") or os.cpu_count() or 1)
+
 Streams = Sequence[bytes]
+Restore = Callable[[NDArray[Any]], NDArray[Any]]
 _T = TypeVar("_T")
-_STATUS = Path("/proc/self/status")
-
-
-class Peak:
-    """Peak memory of this process; None everywhere on a system that does not tell."""
-
-    def __init__(self) -> None:
-        self.base = self._read("VmRSS")
-
-    def forget(self) -> None:
-        """Start anew."""
-        if self.base is not None:
-            Path("/proc/self/clear_refs").write_text("5")
-
-    def above(self) -> int | None:
-        """Bytes above what the process held when this object was made."""
-        peak = self._read("VmHWM")
-        return None if peak is None or self.base is None else max(0, peak - self.base)
-
-    @staticmethod
-    def _read(field: str) -> int | None:
-        try:
-            line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field))
-        except (OSError, StopIteration):
-            return None
-        return 1024 * int(line.split()[1])
 
 
 class Trial:
-    """Collects the rows of a coder."""
+    """Collects the rows of a coder, in a file too, so that they stay if the process ends."""
 
-    def __init__(self, surface: Specimen) -> None:
+    def __init__(self, surface: Specimen, out: Path | None = None) -> None:
         self.surface = surface
         self.rows: list[dict[str, Any]] = []
         self.notes: list[str] = []
+        self.moments: list[dict[str, Any]] = []
         self.lattice = surface.lattice
         _ = surface.floats, surface.reference, surface.low, surface.sides  # held before memory is counted
         self.peak = Peak()
+        self._out, self._start = out, time.process_time()
 
     def case(
         self,
@@ -67,16 +53,48 @@ class Trial:
         encode: Callable[[], Streams],
         decode: Callable[[Streams], NDArray[Any]],
         side: int = 0,
+        restore: Restore | None = None,
     ) -> None:
-        """Measure a setting; one that fails is a note."""
-        try:
-            streams, encode_seconds, encode_peak = self.timed(encode)
-            decoded, decode_seconds, decode_peak = self.timed(lambda: decode(streams))
-        except Exception as error:  # whatever a peer raises, the others go on
-            self.notes.append(f"{setting}: {type(error).__name__}: {error}"[:160])
+        """Measure a setting; one that fails is a note.
+
+        What ``decode`` gives becomes values by ``restore``, which is not timed: coders of whole numbers are not charged
+        for it.
+        """
+        if time.process_time() - self._start > BUDGET:
+            self.note(f"after {BUDGET:.0f} s no further setting was tried")
             return
+        try:
+            streams, seconds, peak = self.timed(encode)
+            self.decoded(setting, streams, decode, (seconds, peak), side, restore)
+        except Exception as error:  # whatever a peer raises, the others go on
+            self.note(f"{setting}: {type(error).__name__}: {error}"[:160])
+
+    def decoded(
+        self,
+        setting: str,
+        streams: Streams,
+        decode: Callable[[Streams], NDArray[Any]],
+        encoding: tuple[float, int | None],
+        side: int = 0,
+        restore: Restore | None = None,
+    ) -> None:
+        """Decode streams that took so many seconds and so much memory, and add the row."""
+        numbers, seconds, peak = self.timed(lambda: decode(streams))
+        values = numbers if restore is None else restore(numbers)
         size = sum(len(stream) for stream in streams) + side
-        self.add(setting, size, decoded, (encode_seconds, decode_seconds), (encode_peak, decode_peak))
+        self.add(setting, size, values, (encoding[0], seconds), (encoding[1], peak))
+
+    def note(self, text: str) -> None:
+        """Say something once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def write(self) -> None:
+        """Write the rows so far, if there is a file for them."""
+        if self._out is not None:
+            seconds = time.process_time() - self._start
+            found = {"rows": self.rows, "notes": self.notes, "moments": self.moments, "seconds": seconds}
+            self._out.write_text(json.dumps(found))
 
     def add(
         self,
@@ -106,15 +124,16 @@ class Trial:
                 "decode_peak": peaks[1],
             }
         )
+        self.write()
 
     def timed(self, work: Callable[[], _T]) -> tuple[_T, float, int | None]:
-        """Result, seconds (the best of three where that takes no time), and peak memory."""
+        """Result, seconds of the processor (the best of three where that takes no time), and peak memory."""
         self.peak.forget()
         best, spent = math.inf, 0.0
         for _ in range(3):
-            start = time.perf_counter()
+            start = time.process_time()
             result = work()
-            best = min(best, time.perf_counter() - start)
+            best = min(best, time.process_time() - start)
             spent += best
             if spent > 0.1:
                 break
@@ -131,7 +150,7 @@ class Trial:
         self.case(
             setting,
             lambda: [bytes(encode(plane, number)) for number, plane in enumerate(self.surface.floats)],
-            lambda streams: np.stack([decode(stream, number) for number, stream in enumerate(streams)], -1),
+            lambda streams: stacked([decode(stream, number) for number, stream in enumerate(streams)]),
             side,
         )
 
@@ -155,6 +174,11 @@ class Trial:
     def restored(self, numbers: NDArray[Any], step: float) -> NDArray[np.float64]:
         """Values of such numbers."""
         return numbers.reshape(self.surface.reference.shape) * step + self.surface.low
+
+
+def stacked(planes: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Rows, columns, channels of planes; nothing is copied of a single one."""
+    return planes[0][..., None] if len(planes) == 1 else np.stack(planes, -1)
 
 
 def decades(first: float, last: float, each: int) -> list[float]:

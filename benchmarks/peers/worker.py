@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-import time
 from pathlib import Path
 
 # Before numpy is loaded: every figure is of one core.
-_THREADS = ("OMP", "OPENBLAS", "MKL", "OPJ")
+_THREADS = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "OPJ_NUM", "LODESTREAM")
 for _name in _THREADS:
-    os.environ[f"{_name}_NUM_THREADS"] = "1"
+    os.environ[f"{_name}_THREADS"] = "1"
 
 from .registry import function_of  # noqa: E402 - see above
 from .surfaces import specimen  # noqa: E402
@@ -21,12 +19,10 @@ from .trial import Trial  # noqa: E402
 def main() -> None:
     """Write the rows as JSON."""
     name, peer, out = sys.argv[1:]
-    start = time.perf_counter()
     run = function_of(peer)
-    trial = Trial(specimen(name))
+    trial = Trial(specimen(name), Path(out))
     run(trial)
-    result = {"rows": trial.rows, "notes": trial.notes, "seconds": time.perf_counter() - start}
-    Path(out).write_text(json.dumps(result))
+    trial.write()
 
 
 if __name__ == "__main__":

@@ -36,15 +36,15 @@ struct rule {
     int32_t unit;
 };
 
-/* Some rows of a band, where they are known and where they go. */
+/* A band where it is known, and where its rows from `first` to `last` - 1 go. */
 struct places {
     const int32_t *magnitudes;
     const int8_t *signs;
     const uint8_t *early;
     int64_t stride;
-    int32_t *out;
+    int32_t *out; /* of row `first` */
     int64_t pitch;
-    int64_t rows, columns;
+    int64_t first, last, columns;
 };
 
 LODE_INLINE int32_t plus(int32_t a, int32_t b) {
@@ -103,40 +103,44 @@ LODE_INLINE void spread_row(const int32_t *restrict magnitudes, const int8_t *re
 }
 
 static void spread_band(struct places at, struct rule rule) {
-    for (int64_t i = 0; i < at.rows; i++) {
+    for (int64_t i = at.first; i < at.last; i++, at.out += at.pitch) {
+        const int32_t *magnitudes = at.magnitudes + i * at.stride;
+        const int8_t *signs = at.signs + i * at.stride;
+        const uint8_t *early = at.early + i * at.stride;
         if (rule.half && rule.step > 1)
-            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, true, true);
+            spread_row(magnitudes, signs, early, at.out, at.columns, rule, true, true);
         else if (rule.half)
-            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, true, false);
+            spread_row(magnitudes, signs, early, at.out, at.columns, rule, true, false);
         else if (rule.step > 1)
-            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, false, true);
+            spread_row(magnitudes, signs, early, at.out, at.columns, rule, false, true);
         else
-            spread_row(at.magnitudes, at.signs, at.early, at.out, at.columns, rule, false, false);
-        at.magnitudes += at.stride, at.signs += at.stride, at.early += at.stride, at.out += at.pitch;
+            spread_row(magnitudes, signs, early, at.out, at.columns, rule, false, false);
     }
 }
 
 /* A band of indices that are known: the trellis follows them in raster order of blocks, as they were coded. */
-static void spread_trellis(struct places at, struct rule rule) {
+static void spread_trellis(struct places at, int64_t rows, struct rule rule) {
     int32_t less = (rule.step + 1) / 2;
-    for (int64_t top = 0; top < at.rows; top += BLOCK) {
+    for (int64_t top = at.first / BLOCK * BLOCK; top < at.last; top += BLOCK) {
         unsigned state = 0;
         for (int64_t left = 0; left < at.columns; left += BLOCK)
-            for (int64_t i = top; i < top + BLOCK && i < at.rows; i++)
+            for (int64_t i = top; i < top + BLOCK && i < rows; i++)
                 for (int64_t j = left; j < left + BLOCK && j < at.columns; j++) {
                     int32_t magnitude = at.magnitudes[i * at.stride + j];
                     int32_t value = plus(times(least(magnitude, rule.most), rule.step), -less * ODD[state]);
                     value = least(magnitude != 0 ? value : 0, rule.limit);
-                    at.out[i * at.pitch + j] = times(times(at.signs[i * at.stride + j], value), rule.unit);
                     state = TRANSITIONS[state][magnitude & 1];
+                    if (i >= at.first && i < at.last)
+                        at.out[(i - at.first) * at.pitch + j] =
+                            times(times(at.signs[i * at.stride + j], value), rule.unit);
                 }
     }
 }
 
 static void clear(struct places at) {
-    for (int64_t i = 0; i < at.rows; i++)
+    for (int64_t i = at.first; i < at.last; i++, at.out += at.pitch)
         for (int64_t j = 0; j < at.columns; j++)
-            at.out[i * at.pitch + j] = 0;
+            at.out[j] = 0;
 }
 
 int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
@@ -147,7 +151,7 @@ int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sig
                     int64_t first_column) {
     if (sign_count != known_count || early_count != known_count || bands_count != steps_count * BAND_FIELDS ||
         origins_count != steps_count * ORIGIN_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
-        first_column < 0)
+        first_row > INT32_MAX || first_column < 0)
         return LODE_REFUSED;
     for (int64_t i = 0; i < numbers_count; i++) {
         if (numbers[i] < 0 || numbers[i] >= steps_count)
@@ -155,20 +159,23 @@ int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sig
         const int64_t *band = bands + numbers[i] * BAND_FIELDS, *origin = origins + numbers[i] * ORIGIN_FIELDS;
         int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = origin[0];
         int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
-        if (origin[1] < first_row || origin[2] < first_column || height < 0 || width < 0 || height > INT32_MAX ||
-            stride < width || stride < 1 || stride > INT32_MAX || offset < 0 || offset > known_count - width ||
-            (height - 1) * stride > known_count - width - offset || tile < 0 || tile >= state_count ||
-            state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
+        if (origin[1] < 0 || origin[1] > INT32_MAX || origin[2] < first_column || height < 0 || width < 0 ||
+            height > INT32_MAX || stride < width || stride < 1 || stride > INT32_MAX || offset < 0 ||
+            offset > known_count - width || (height - 1) * stride > known_count - width - offset || tile < 0 ||
+            tile >= state_count || state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
             return LODE_REFUSED;
         int64_t top = origin[1] - first_row, left = origin[2] - first_column;
-        if (top > rows - height || left > columns - width)
+        if (left > columns - width)
             return LODE_REFUSED;
-        struct places at = {known + offset,           sign + offset, early + offset, stride,
-                            out + top * pitch + left, pitch,         height,         width};
+        int64_t first = top < 0 ? -top : 0, last = height < rows - top ? height : rows - top;
+        if (first >= last)
+            continue;
+        struct places at = {known + offset, sign + offset, early + offset, stride, out + (top + first) * pitch + left,
+                            pitch,          first,         last,           width};
         if (state[tile] >= LODE_UNANNOUNCED)
             clear(at);
         else if (step > 0 && state[tile] == 0)
-            spread_trellis(at, rule_of(0, step, tile >= finer));
+            spread_trellis(at, height, rule_of(0, step, tile >= finer));
         else
             spread_band(at, rule_of(state[tile], step, tile >= finer));
     }

@@ -51,6 +51,7 @@ struct bundle {
     const int64_t *table; /* where details beyond the ends come from, and with which sign */
     int32_t a, b;
     int32_t *nodes, *details; /* where number 0 of each stands */
+    bool bare;                /* all details are 0, whatever stands in their places */
 };
 
 LODE_INLINE int32_t plus(int32_t a, int32_t b) {
@@ -95,7 +96,9 @@ static void move(const struct bundle *w, bool loads, int64_t sample, int32_t *bu
     for (int64_t k = 0; k < rows; k++) {
         int32_t *outside = x + k * w->along, *inside = buffer + k * w->gap;
         ask(w, sample + k + AHEAD);
-        if (loads)
+        if (loads && width == STRIP) /* a call of memcpy takes as long as the copy */
+            memcpy(inside, outside, STRIP * sizeof *x);
+        else if (loads)
             memcpy(inside, outside, (size_t)width * sizeof *x);
         else
             memcpy(outside, inside, (size_t)width * sizeof *x);
@@ -421,15 +424,23 @@ static void forward_chunk(const struct bundle *w, int64_t from, int64_t to) {
     }
 }
 
+/* Details `from` to `to` - 1 into the buffer. */
+static void load_details(const struct bundle *w, int64_t from, int64_t to) {
+    if (w->bare && to > from)
+        memset(w->details + from * w->gap, 0, (size_t)((to - from) * w->gap) * sizeof *w->details);
+    else
+        move(w, true, w->length - w->midpoints + from, w->details + from * w->gap, to - from);
+}
+
 /* The step undone, for details `from` to `to` - 1 and what they complete; all nodes have been loaded. */
 static void inverse_chunk(const struct bundle *w, int64_t from, int64_t to) {
-    int64_t gap = w->gap, run = w->run, midpoints = w->midpoints, details = w->length - midpoints;
+    int64_t gap = w->gap, run = w->run, midpoints = w->midpoints;
     bool first = from == 0, last = to == run, closed = wraps(w);
     int64_t predicted = last ? midpoints : to, updated = last ? run : to - (REACH - 1);
-    move(w, true, details + from, w->details + from * gap, predicted - from);
+    load_details(w, from, predicted);
     surplus(w, from, predicted, true);
     if (first && closed && !last) {
-        move(w, true, details + midpoints - REACH, w->details + (midpoints - REACH) * gap, REACH);
+        load_details(w, midpoints - REACH, midpoints);
         surplus(w, midpoints - REACH, midpoints, true);
     }
     if (first)
@@ -507,7 +518,7 @@ int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64
     int64_t shift = (int64_t)(-(uintptr_t)work / sizeof *work % ALIGNED);
     int32_t *nodes = work + shift + BEFORE * gap;
     struct bundle w = {.along = along_rows ? 1 : pitch, .length = length, .midpoints = midpoints, .run = run};
-    w.table = table, w.a = (int32_t)a, w.b = (int32_t)b;
+    w.bare = inverse == LODE_LIFT_BARE, w.table = table, w.a = (int32_t)a, w.b = (int32_t)b;
     w.nodes = nodes, w.details = nodes + (run + AFTER + REACH) * gap;
     int64_t end = across > gap ? run : from + AT_ONCE / gap, reached = run;
     for (int64_t i = 0; i < across; i += w.width) {

@@ -34,11 +34,13 @@ LODE_API int lode_runs_v3(void);
 /* lifting.c ------------------------------------------------------------------------------------------------------ */
 
 #define LODE_LIFT_STRIP 64
+#define LODE_LIFT_BARE 2
 
 /* One step of the lifting along an axis of a plane, or its inverse, in place: samples on one side, on the other nodes
  * of the coarser level and behind them the details. Exact for samples within +-2^27 and for coefficients below 2^29;
  * what is larger gives numbers without a meaning. The inverse leaves samples within +-2^27.
  *
+ * inverse:   0; 1 for the inverse; LODE_LIFT_BARE for the inverse where all details are 0, whatever stands there.
  * axis:      0 along columns, 1 along rows.
  * midpoints: details, at least 1; `run`: nodes that alternate with them, `midpoints` where the axis wraps, else one
  *            more. A sample that the axis has beyond these is a node by itself.
@@ -289,7 +291,8 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
  * steps:   of each band its quantiser's step, below 2^26; 0 where there is none, and `known` are no indices.
  * state:   passes that remain of each tile, or LODE_UNANNOUNCED, which gives zeros.
  * finer:   coefficients of the tiles from this one on are multiplied by 8.
- * out:     begins at `first_row` and `first_column` of all coefficients; the bands lie inside.
+ * out:     begins at `first_row` and `first_column` of all coefficients. Its columns hold those of the bands; rows of
+ *          bands that lie above or below are left out.
  */
 LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
                              const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,

@@ -13,6 +13,7 @@
 
 #include "copying.h"
 #include "lodestream.h"
+#include "whole_distances.h"
 
 enum {
     TOGETHER = 512,   /* values worked on together */
@@ -330,6 +331,41 @@ static void part_figures(const struct comparison *c, int64_t top, int64_t bottom
         }
 }
 
+#define ADD_ROW(type)                                                                                                  \
+    case NUMBER_##type:                                                                                                \
+        add_row_##type(coordinates, (const type##_t *)c->points + at, c->counted ? c->counted + at : 0, count, rule,   \
+                       figures);                                                                                       \
+        break;
+
+/* `part_figures` in integers. */
+static void whole_part_figures(const struct comparison *c, const struct whole_rule *rule, int64_t top, int64_t bottom,
+                               int64_t left, int64_t columns, double *found) {
+    struct whole_figures parts[SIDE_BY_SIDE] = {{0, 0}};
+    for (int64_t row = top; row < bottom; row++)
+        for (int64_t start = 0; start < columns; start += LODE_PART_COLUMNS) {
+            const int32_t *coordinates = c->coordinates + row * c->pitch + left + start;
+            int64_t at = row * c->columns + left + start, count = least(columns - start, LODE_PART_COLUMNS);
+            struct whole_figures *figures = parts + start / LODE_PART_COLUMNS;
+            switch (c->type) {
+                ADD_ROW(int8)
+                ADD_ROW(int16)
+                ADD_ROW(uint8)
+                ADD_ROW(uint16)
+            }
+        }
+    for (int64_t k = 0; k * LODE_PART_COLUMNS < columns; k++) {
+        found[2 * k] = (double)parts[k].sum;
+        found[2 * k + 1] = (double)parts[k].worst;
+    }
+}
+
+/* Whether a comparison is one of integers of one channel on a lattice of whole numbers, and that. */
+static bool compares_whole(const struct comparison *c, struct whole_rule *rule) {
+    const double *numbers = c->rules;
+    return c->channels == 1 && TYPE[c->type].size <= 2 && numbers[0] == 0 &&
+           whole_rule_of(numbers[1], numbers[2], numbers[3], TYPE[c->type].low, TYPE[c->type].high, rule);
+}
+
 int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, const int32_t *coordinates,
                               int64_t coordinates_count, const double *rules, int64_t rules_count,
                               const uint8_t *counted, int64_t counted_count, double *figures, int64_t figures_count,
@@ -352,12 +388,17 @@ int64_t lode_square_distances(const void *points, int64_t points_count, int64_t 
     struct comparison comparison = {points,      coordinates, rules,    counted_count ? counted : 0,
                                     points_type, columns,     channels, channel,
                                     compared,    height,      pitch};
+    struct whole_rule whole = {0};
+    bool is_whole = compares_whole(&comparison, &whole);
     for (int64_t part = first; part < last;) {
         int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
         int64_t parts =
             least(least(across - part % across, last - part), kinds > 1 ? SIDE_BY_SIDE / MOST_KINDS : SIDE_BY_SIDE);
-        part_figures(&comparison, top, least(top + LODE_PART_ROWS, rows), left,
-                     least(columns - left, parts * LODE_PART_COLUMNS), figures + 2 * kinds * part);
+        int64_t bottom = least(top + LODE_PART_ROWS, rows), width = least(columns - left, parts * LODE_PART_COLUMNS);
+        if (is_whole)
+            whole_part_figures(&comparison, &whole, top, bottom, left, width, figures + 2 * part);
+        else
+            part_figures(&comparison, top, bottom, left, width, figures + 2 * kinds * part);
         part += parts;
     }
     return 0;

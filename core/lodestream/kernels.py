@@ -271,6 +271,7 @@ _F32, _F64 = np.float32, np.float64
 
 # lifting.c
 LIFT_STRIP = 64
+LIFT_BARE = 2
 lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
 
 # mask.c

@@ -32,7 +32,8 @@ import json, os, socket, subprocess, sys, mmap, threading
 from pathlib import Path
 from lodestream.confinement import Rights, confine
 asked = json.loads(sys.argv[1])
-held = confine(Rights(tuple(map(Path, asked["read"])), tuple(map(Path, asked["write"])), asked["processes"]))
+paths = [tuple(map(Path, asked[name])) for name in ("read", "write")]
+held = confine(Rights(*paths, asked["processes"], asked["threads"]))
 found = []
 for text in asked["tried"]:
     try:
@@ -45,7 +46,7 @@ print(json.dumps({"held": held, "found": found}))
 
 def confined(tried: list[str], **rights: Any) -> dict[str, Any]:
     """What comes of some expressions in a confined process."""
-    asked = {"read": [], "write": [], "processes": False, **rights, "tried": tried}
+    asked = {"read": [], "write": [], "processes": False, "threads": False, **rights, "tried": tried}
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", _PROGRAM, json.dumps(asked)],
@@ -149,6 +150,24 @@ def test_calls_that_no_reader_needs_are_refused(tmp_path: Path) -> None:
 
 
 @has_seccomp
+@has_landlock
+def test_threads_may_be_allowed_without_processes(tmp_path: Path) -> None:
+    (tmp_path / "other").write_text("x")
+    pool = "__import__('concurrent.futures').futures.ThreadPoolExecutor"
+    told = confined(
+        [
+            "(lambda made: (made.start(), made.join(), 'ran')[2])(threading.Thread(target=int))",
+            "os.fork()",
+            "subprocess.run([sys.executable, '-c', ''])",
+            f"{pool}(1).submit(open, {str(tmp_path / 'other')!r}).result()",
+        ],
+        threads=True,
+    )
+    refused = "PermissionError 1"
+    assert told["found"] == ["'ran'", refused, refused, "PermissionError 13"]
+
+
+@has_seccomp
 @pytest.mark.parametrize("processes", [False, True])
 def test_nothing_is_changed_of_other_processes(processes: bool) -> None:
     # Whoever may lower a limit of another process, or choose the signal that a pipe sends it, can end it.
@@ -205,13 +224,15 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     # The kernel's machine for it has few instructions: here the filters of both architectures run on it.
     architecture, calls = seccomp._MACHINES[machine]
     filters = {
-        processes: b"".join(seccomp._program(architecture, calls, 77, processes=processes))
-        for processes in (False, True)
+        rights: b"".join(seccomp._program(architecture, calls, 77, processes=rights[0], threads=rights[1]))
+        for rights in ((False, False), (False, True), (True, False))
     }
 
-    def verdict(name: str | int, *arguments: int, processes: bool = False, other: int = 0) -> str:
+    def verdict(
+        name: str | int, *arguments: int, processes: bool = False, threads: bool = False, other: int = 0
+    ) -> str:
         number = calls[name] if isinstance(name, str) else name
-        return _run(filters[processes], number, other or architecture, arguments)
+        return _run(filters[processes, threads], number, other or architecture, arguments)
 
     assert verdict("socket") == "error 1"
     assert verdict("socket", other=0x40000003) == "kill"
@@ -219,6 +240,9 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     assert [verdict(number) for number in (425, 435, 437, 500, 439, 446)] == ["error 38"] * 4 + ["allow"] * 2
     assert [verdict("clone", 17), verdict("clone", 17, processes=True)] == ["error 1", "allow"]
     assert verdict("clone", 0x10000000 | 17, processes=True) == "error 1"
+    thread = 0x3D0F00  # what the C library asks for
+    assert [verdict("clone", thread), verdict("clone", thread, threads=True)] == ["error 1", "allow"]
+    assert [verdict("clone", 17, threads=True), verdict("execve", threads=True)] == ["error 1", "error 1"]
     assert [verdict("execve"), verdict("execve", processes=True)] == ["error 1", "allow"]
     for name in ("kill", "tgkill", "tkill"):
         assert [verdict(name, 77), verdict(name, 78)] == ["allow", "error 1"]

@@ -177,9 +177,16 @@ def _more_than_one(rule: str, expected: str, found: Mapping[T, Operation]) -> It
 
 def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
     steps: dict[Subject, list[Step]] = {subject: [] for subject in surfaces.ids}
+    shared: set[tuple[Subject, int]] = set()
     for operation in history.operations:
         if operation.subject is not None:
             steps.setdefault(operation.subject, []).extend(_steps(operation, history))
+            for subject in _sharing(operation, steps):
+                # One is enough between what is restored and what is restored next: nothing else makes bytes missing.
+                restored = sum(mark.kind == "restored" and mark.moment <= operation.begun for mark in history.marks)
+                if (subject, restored) not in shared:
+                    shared.add((subject, restored))
+                    steps[subject].append(Step("shared", operation.begun, operation=operation))
         elif operation.answer is not None and operation.answer.status == 200:
             listed = {seen.id: seen.state for seen in operation.answer.seen}
             for subject, ids in surfaces.ids.items():
@@ -189,6 +196,14 @@ def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
         found = unexplained(own, history.marks)
         if found is not None:
             yield _out_of_order(subject, found, own)
+
+
+def _sharing(operation: Operation, subjects: Iterable[Subject]) -> list[Subject]:
+    """Whose bytes an upload brings too, if they are missing. At which start they are found is open."""
+    if operation.kind != "upload":
+        return []
+    own = operation.subject
+    return [other for other in subjects if own is not None and other != own and other.sha256 == own.sha256]
 
 
 def _steps(operation: Operation, history: History) -> Iterator[Step]:

@@ -10,6 +10,9 @@ answer, or another one, asks for it.
 
 A backup is not a moment: files are copied one after another. It holds what the surface was at any moment of it, and if
 the surface was deleted or uploaded meanwhile, perhaps half of it.
+
+Uploads of the same bytes are stored once. What is missing is found again at any later start, once another owner has
+uploaded it.
 """
 
 from __future__ import annotations
@@ -48,7 +51,8 @@ class Step:
 
     Attributes
     ----------
-    kind : "read", "upload", "delete" or "retry"
+    kind : "read", "upload", "delete", "retry" or "shared"
+        "shared": another owner's upload of the same bytes.
     begun : float
     ended : float or None
         When its answer had come. None: it may have happened or not.
@@ -60,7 +64,7 @@ class Step:
         Where it comes from.
     """
 
-    kind: Literal["read", "upload", "delete", "retry"]
+    kind: Literal["read", "upload", "delete", "retry", "shared"]
     begun: float
     ended: float | None = None
     latest: float | None = None
@@ -108,10 +112,12 @@ def apply(step: Step, states: States) -> States:
 
 
 def _taken_up(kind: str, state: str) -> States:
-    if state == "failed":
+    if state == "failed" and kind != "shared":
         return frozenset({"failed", "queued"})
     if kind == "upload" and state in (ABSENT, "missing"):
         return frozenset({"queued"})
+    if kind == "shared" and state == "missing":
+        return frozenset({"missing", "queued"})
     return frozenset({state})
 
 
@@ -213,6 +219,8 @@ def _distinct(pending: frozenset[int], steps: Sequence[Step]) -> Iterator[int]:
 
 
 def _happened(way: _Way, number: int, steps: Sequence[Step]) -> _Way | None:
+    if steps[number].kind == "shared" and steps[number].ended is None and "missing" not in way.states:
+        return None  # it would change nothing, and may come later or never
     states = apply(steps[number], way.states)
     if not states:
         return None

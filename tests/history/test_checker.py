@@ -397,6 +397,21 @@ def test_what_is_missing_stays_so_until_it_is_pushed_again(story: Story) -> None
     assert story.rules == ["order"]
 
 
+def test_what_is_missing_is_there_again_once_another_owner_has_pushed_it(story: Story) -> None:
+    backup(story, "delete")
+    story.end()
+    story.mark("restored")
+    story.look(state="missing")
+    story.upload(BEN)
+    story.look(state="missing")
+    story.end()
+    story.look(state="queued")
+    story.look()
+    assert story.findings == []
+    story.look(state="missing")
+    assert story.rules == ["went back"]
+
+
 def test_nothing_is_restored_without_a_backup(story: Story) -> None:
     story.upload()
     story.mark("restored")

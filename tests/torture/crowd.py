@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from lodestream.protocol.messages import MAX_CREDIT, Open
+from lodestream.protocol.messages import BASE_CREDIT, Open
 from lodestream.protocol.wire import serialize
 from tests.server.connections.sockets import (
     CHUNKS,
@@ -125,7 +125,7 @@ class _Client:
         head = b""
         while not head.endswith(b"\r\n\r\n"):
             head += await self.receive(1)
-        await self.send(frame(serialize(Open(credit=MAX_CREDIT))))
+        await self.send(frame(serialize(Open(credit=BASE_CREDIT))))
 
     async def __aenter__(self) -> _Client:
         return self
@@ -165,7 +165,7 @@ async def garbage(client: _Client) -> None:
     if kind:
         await client.send(handshake(client.place))
         await client.receive(4096)
-    opened = frame(serialize(Open(credit=MAX_CREDIT)))
+    opened = frame(serialize(Open(credit=BASE_CREDIT)))
     await client.send((noise, noise, frame(noise), opened + frame(noise))[kind])
     while await client.receive(65536):
         pass
@@ -305,7 +305,7 @@ async def _honest(place: Place, sha256: str, count: int) -> tuple[str, ...]:
             return f"expected the whole surface, got {reader.size} bytes, end {reader.ended}, close {reader.closed}"
         return None
 
-    windows = [(4096, 30_000, MAX_CREDIT)[number % 3] for number in range(count)]
+    windows = [(4096, 30_000, BASE_CREDIT)[number % 3] for number in range(count)]
     return tuple(wrong for wrong in await asyncio.gather(*map(read, windows)) if wrong)
 
 

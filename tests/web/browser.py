@@ -43,9 +43,14 @@ _ARGUMENTS = (
 # Statuses as they are shown, one after the other.
 _STATUSES = """
 window.statuses = [];
+window.beside = [];
 setInterval(() => {
-  const text = document.querySelector("lodestream-view")?.shadowRoot?.querySelector(".status")?.textContent;
+  const root = document.querySelector("lodestream-view")?.shadowRoot;
+  const text = root?.querySelector(".status")?.textContent;
   if (text && text !== window.statuses.at(-1)) window.statuses.push(text);
+  const errors = [...root?.querySelectorAll(".figures dd") ?? []].map(({ textContent }) => textContent);
+  const both = [text, ...errors].join(" | ");
+  if (text && both !== window.beside.at(-1)) window.beside.push(both);
 }, 20);
 """
 
@@ -154,6 +159,11 @@ class Tab:
     def statuses(self) -> list[str]:
         """The statuses that were shown so far."""
         return list(self.page.evaluate("window.statuses"))
+
+    @property
+    def beside(self) -> list[list[str]]:
+        """The statuses that were shown so far, each with RMS and maximum error as they stood beside it."""
+        return [text.split(" | ") for text in self.page.evaluate("window.beside")]
 
     @property
     def moments(self) -> list[dict[str, Any]]:

@@ -73,14 +73,28 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shelf]:
 
 
 @pytest.fixture(scope="session")
-def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """A server that wants a token, and a token."""
+def restricted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, str]]:
+    """A server that wants a token, a token for everything, and one that allows to read only."""
     from lodestream_server.access.tokens import TokenFile
 
     folder = tmp_path_factory.mktemp("closed") / "data"
-    token, _ = TokenFile(folder / "tokens.json").create("tests", ("read", "write"))
+    tokens = TokenFile(folder / "tokens.json")
+    token, _ = tokens.create("tests", ("read", "write"))
+    reader, _ = tokens.create("reader", ("read",))
     with program(folder) as started:
-        yield started.url, token
+        yield started.url, token, reader
+
+
+@pytest.fixture(scope="session")
+def closed(restricted: tuple[str, str, str]) -> tuple[str, str]:
+    """A server that wants a token, and a token."""
+    return restricted[0], restricted[1]
+
+
+@pytest.fixture(scope="session")
+def reader(restricted: tuple[str, str, str]) -> str:
+    """A token of that server that allows to read only."""
+    return restricted[2]
 
 
 @pytest.fixture

@@ -22,7 +22,8 @@ def surface(name: str) -> ls.Surface:
     """One of the surfaces that are made here.
 
     ``terrain``: 200 x 250 heights in m, float32. ``holes``: the same without its middle. ``attribute``: with a
-    temperature that is the number of the column. ``torus``: closed both ways, float32.
+    temperature that is the number of the column. ``torus``: closed both ways, float32. ``wind``: with a vector of the
+    numbers of row and column. ``line``: 1 x 250 heights. ``halves``: 150 x 600 heights, the right half even.
     """
     heights = terrain((200, 250), 1).astype(np.float32)
     metadata = {"name": name, "unit": "m"}
@@ -35,6 +36,14 @@ def surface(name: str) -> ls.Surface:
     if name == "attribute":
         columns = np.broadcast_to(np.arange(250.0, dtype=np.float32), heights.shape)
         return ls.Surface(heights, attributes={"temperature": columns}, metadata=metadata)
+    if name == "wind":
+        wind = np.moveaxis(np.indices(heights.shape, np.float32), 0, 2)
+        return ls.Surface(heights, attributes={"wind": np.ascontiguousarray(wind)}, metadata=metadata)
+    if name == "line":
+        return ls.Surface(heights[100:101], metadata=metadata)
+    if name == "halves":
+        rough = terrain((150, 600), 2).astype(np.float32)
+        return ls.Surface(np.where(np.arange(600) < 256, rough, rough[:, 256:257]), metadata=metadata)
     assert name == "torus"
     return ls.Surface(torus(96, 64), (True, True), metadata={"name": name})
 

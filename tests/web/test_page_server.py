@@ -34,7 +34,7 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
     tab.everything()
     values = tab.point(0.5, 0.55)
     heights = np.load(file)
-    assert float(values["height"]) == pytest.approx(float(heights[int(values["row"]), int(values["column"])]), rel=1e-8)
+    assert float(values["height"]) == pytest.approx(float(heights[int(values["row"]), int(values["column"])]), rel=1e-7)
     expect(tab.page.locator("header .facts")).to_contain_text("60 \N{MULTIPLICATION SIGN} 80 points")
 
 
@@ -106,6 +106,7 @@ def test_a_token_is_asked_for_and_kept_to_oneself(tabs: Tabs, closed: tuple[str,
     # The server says that this is none; the dialog is there again, and empty.
     expect(dialog.get_by_label("Token")).to_have_value("")
     expect(dialog).not_to_contain_text("This server gives its surfaces")
+    expect(dialog.get_by_role("heading")).to_have_text("The server does not know this token")
     dialog.get_by_label("Token").fill(token)
     dialog.get_by_label("Token").press("Enter")
     tab.page.get_by_role("link", name="torus").click()
@@ -114,6 +115,23 @@ def test_a_token_is_asked_for_and_kept_to_oneself(tabs: Tabs, closed: tuple[str,
     assert not [url for url in [*heard.requests, tab.page.url] if token in url or "lode_wrong" in url]
     kept = tab.page.evaluate("[localStorage.length, sessionStorage.length, document.cookie]")
     assert kept == [0, 0, ""]
+
+
+def test_a_token_that_is_not_for_this_is_told_as_such(
+    tabs: Tabs, closed: tuple[str, str], reader: str, file: Path, heard: Heard
+) -> None:
+    heard.allow("status of 40[13]")
+    server, token = closed
+    tab = tabs(server)
+    dialog = tab.page.get_by_role("dialog")
+    dialog.get_by_label("Token").fill(reader)
+    dialog.get_by_label("Token").press("Enter")
+    expect(tab.page.get_by_role("heading", name="Surfaces")).to_be_visible()
+    tab.page.get_by_label("Files to upload").set_input_files(file)
+    expect(dialog.get_by_role("heading")).to_have_text("This token does not allow that")
+    dialog.get_by_label("Token").fill(token)
+    dialog.get_by_label("Token").press("Enter")
+    tab.page.get_by_role("link", name=file.stem, exact=True).wait_for()
 
 
 def test_without_a_token_nothing_is_shown(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:

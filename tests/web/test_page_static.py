@@ -49,7 +49,7 @@ def test_a_host_of_files_is_enough(tabs: Tabs, host: Path) -> None:
         tab.everything("m")
         values = tab.point(0.5, 0.55)
         height = HEIGHTS[int(values["row"]), int(values["column"])]
-        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-8)
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-7)
         assert len(tab.moments) > 8
         assert sum(asked is not None for _, asked in server.requests) > 1
 
@@ -84,13 +84,13 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
         expect(tab.notice).not_to_be_empty()
         assert not any(moment["complete"] for moment in tab.moments)
         if where > 0.5:
-            assert tab.moments
+            tab.until(lambda: bool(tab.moments))  # they wait for the description, for three seconds at most
             assert all(moment["bytes"] <= place for moment in tab.moments)
             assert tab.rms.inner_text().endswith(" m")
             assert tab.point(0.5, 0.55)["row"]
 
 
-def test_a_container_cut_short_is_told_while_it_waits_for_the_rest(tabs: Tabs, host: Path) -> None:
+def test_a_container_cut_short_is_told(tabs: Tabs, host: Path) -> None:
     path = host / "surface.lode"
     whole = path.read_bytes()
     path.write_bytes(whole[:-5000])
@@ -98,9 +98,9 @@ def test_a_container_cut_short_is_told_while_it_waits_for_the_rest(tabs: Tabs, h
         server.tags = False  # else it is another file that is there in the end
         tab = tabs(f"{server.url}/index.html")
         tab.view.get_by_label("Stop when below a pixel").uncheck()
-        tab.shown("Link lost: resuming", "Failed")
-        tab.page.wait_for_timeout(500)
-        assert len(tab.view.locator(".detail").inner_text()) > 20
+        tab.shown("Failed")
+        expect(tab.notice).to_contain_text("the file was cut short")
+        expect(tab.notice).to_contain_text(str(len(whole) - 5000))
         assert not any(moment["complete"] for moment in tab.moments)
 
 
@@ -126,7 +126,8 @@ def test_ten_lines_of_html_show_a_container(tabs: Tabs, outside: Path, library: 
         tab.everything("m")
         values = tab.point(0.5, 0.55)
         height = HEIGHTS[int(values["row"]), int(values["column"])]
-        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-8)
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-7)
+        tab.press("ArrowLeft")
         tab.until(lambda: "#v=" in tab.page.url)
 
 
@@ -157,7 +158,7 @@ def test_view_encodes_a_file_and_shows_it(tabs: Tabs, tmp_path: Path) -> None:
         expect(tab.page.get_by_role("heading", name="my hills")).to_be_visible()
         values = tab.point(0.5, 0.55)
         height = HEIGHTS[int(values["row"]), int(values["column"])]
-        assert float(values["height"]) == pytest.approx(float(height), rel=1e-8)
+        assert float(values["height"]) == pytest.approx(float(height), rel=1e-7)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
 

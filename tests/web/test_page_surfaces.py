@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -58,7 +59,7 @@ def test_holes_are_not_drawn_and_have_no_values(tabs: Tabs, shelf: Shelf) -> Non
         values = tab.point(x, y)
         row, column = int(values["row"]), int(values["column"])
         assert mask[row, column]
-        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(heights[row, column]), rel=1e-8)
+        assert float(values["height"].removesuffix(" m")) == pytest.approx(float(heights[row, column]), rel=1e-7)
     tab.point_at_nothing(0.5, 0.5)
 
 
@@ -129,6 +130,59 @@ def test_an_attribute_colours_the_surface(tabs: Tabs, shelf: Shelf) -> None:
     tab.until(lambda: legend.locator(".legend-ticks span").first.inner_text() == "240")
     again = at(from_above(tab), 0.7, 0.5)
     assert again[2] > again[1]  # all of it but the last columns is at the low end
+
+
+def test_each_component_of_an_attribute_colours_the_surface(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("wind"))
+    tab.everything("m")
+    legend = tab.view.locator(".legend")
+
+    def shows(name: str, most: str) -> bool:
+        ticks = legend.locator(".legend-ticks span").all_inner_texts()
+        return bool(legend.locator(".legend-title").inner_text() == name and ticks[::2] == ["0", most])
+
+    for name, most in (("wind[0]", "199"), ("wind[1]", "249"), ("wind, magnitude", "319")):
+        tab.choose("Coloured by", name)
+        tab.until(partial(shows, name, most))
+
+
+def test_a_line_of_points_is_drawn_and_read(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("line", VIRIDIS), size=(1100, 460))
+    tab.everything("m")
+    heights = surface("line").points.ravel()
+    expect(tab.notice).to_be_empty()
+    rows, columns = np.nonzero(drawn(tab.picture()))
+    assert columns.max() - columns.min() > 200
+    assert len(np.unique(columns)) > 0.99 * (columns.max() - columns.min())
+    box = tab.canvas.bounding_box()
+    assert box is not None
+    middle = len(rows) // 2
+    values = tab.point(columns[middle] / box["width"], rows[middle] / box["height"])
+    assert values["row"] == "0"
+    found = float(values["height"].removesuffix(" m"))
+    assert found == pytest.approx(float(heights[int(values["column"])]), rel=1e-6)
+
+
+def test_the_error_under_the_pointer_is_that_of_the_part_around_it(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("halves"))
+    tab.everything("m")
+    back = len(tab.moments) // 2
+    tab.press("t", *["["] * back)
+    largest = tab.moments[-1 - back]["max"]
+    tab.until(lambda: float(tab.max.inner_text().removesuffix(" m")) == pytest.approx(largest, rel=0.01))
+    assert tab.status.inner_text() == "Earlier moment"
+    errors = []
+    for x in (0.3, 0.8):
+        tab.point(x, 0.5)
+        tab.until(lambda: "errors of the 150 " in tab.values.inner_text())
+        values = tab.read()
+        errors.append(float(values["error at most"].removesuffix(" m")))
+        assert (int(values["column"]) < 256) == (x < 0.5)
+    rough, even = errors
+    assert even < rough <= largest * 1.01
+    tab.press("End")
+    tab.shown("Complete: exact")
+    tab.until(lambda: tab.read().get("error at most") == "0: exact")
 
 
 def test_slope_change_lines_and_no_colours_are_drawn(tabs: Tabs, shelf: Shelf) -> None:

@@ -35,6 +35,8 @@ from .encode import read_surface
 from .inputs import input_files
 
 if TYPE_CHECKING:
+    from lodestream.surface import Surface
+
     from ..viewer.sources import Source
 
 __all__ = ["ViewOptions", "register", "run"]
@@ -177,8 +179,8 @@ def _write(options: ViewOptions, folder: Path) -> None:
 def _serve(options: ViewOptions) -> None:
     from ..viewer.page_server import PageServer, serving
 
-    server = PageServer(assets(), options.name, options.port)
-    with serving(server):
+    # What cannot be read is told before there is an address.
+    with _opened(options) as make, serving(server := PageServer(assets(), options.name, options.port)):
         say(server.url)
         sys.stdout.flush()  # whoever reads it from a pipe waits for it
         if options.browser:
@@ -190,11 +192,11 @@ def _serve(options: ViewOptions) -> None:
         def progress(done: float) -> None:
             server.progress = done
 
-        with _source(options, progress) as source:
-            server.name = source.name
-            server.source = source
-            note("Ctrl-C ends it")
-            _wait()
+        source = make(progress)
+        server.name = source.name
+        server.source = source
+        note("Ctrl-C ends it")
+        _wait()
 
 
 def _wait() -> None:
@@ -220,14 +222,16 @@ def _draw(options: ViewOptions, out: Path) -> None:
 
 
 @contextmanager
-def _source(options: ViewOptions, progress: Callable[[float], None] = lambda _: None) -> Iterator[Source]:
-    """The container that is shown, made here where a file is something else."""
+def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]], Source]]:
+    """What is shown, once it is certain that it can be read: a function that makes the container, told its progress."""
+    from lodestream.library import require
+
     from ..viewer.sources import FileSource, RemoteSource
 
     if is_url(options.files[0]):
         remote = RemoteSource(options.files[0], options.token)
         try:
-            yield remote
+            yield lambda _: remote
         finally:
             remote.close()
         return
@@ -236,22 +240,32 @@ def _source(options: ViewOptions, progress: Callable[[float], None] = lambda _: 
         first = files.paths[0]
         with first.open("rb") as file:
             ready = len(files.paths) == 1 and file.read(len(_MAGIC)) == _MAGIC
-        if not ready:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lodestream-view-")))
-            # By the names of what was copied, since standard input cannot be read twice.
-            names = tuple(map(str, files.paths))
-            first = folder / "surface.lode"
-            first.write_bytes(_encoded(names, options.surface, progress))
-        yield FileSource(first, options.name)
+        if ready:
+            yield lambda _: FileSource(first, options.name)
+            return
+        # By the names of what was copied, since standard input cannot be read twice.
+        require("encoding")
+        surface = read_surface(tuple(map(str, files.paths)), options.surface)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lodestream-view-")))
+
+        def encoded(progress: Callable[[float], None]) -> Source:
+            container = folder / "surface.lode"
+            container.write_bytes(_encoded(surface, options.surface, progress))
+            return FileSource(container, options.name)
+
+        yield encoded
 
 
-def _encoded(names: tuple[str, ...], options: SurfaceOptions, progress: Callable[[float], None]) -> bytes:
-    from lodestream.library import require
+@contextmanager
+def _source(options: ViewOptions) -> Iterator[Source]:
+    """The container that is shown, made here where a file is something else."""
+    with _opened(options) as make:
+        yield make(lambda _: None)
 
-    require("encoding")
+
+def _encoded(surface: Surface, options: SurfaceOptions, progress: Callable[[float], None]) -> bytes:
     import lodestream as ls
 
-    surface = read_surface(names, options)
     with progress_bar() as bar:
         task = bar.add_task("encoding", total=1.0, figures="")
 

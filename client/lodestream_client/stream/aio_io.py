@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from ..requests import calls
 from ..requests.answers import Head
-from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .effects import WAITS, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
 
 if TYPE_CHECKING:
@@ -66,6 +66,24 @@ class AsyncIO:
             case _:
                 assert_never(effect)
         return None
+
+    async def poll(self, effect: Effect) -> Any:
+        """Carry out one effect if that needs no waiting, as `perform`; otherwise the result is `WAITS`."""
+        await asyncio.sleep(0)  # what has come is taken by the event loop, which had no turn while a view was drawn
+        match effect:
+            case Send():
+                return await self.send()
+            case Hear():
+                message = await self._hear(0.0)
+                return WAITS if message is None else message
+            case Read() if self._arrived():
+                return await self.perform(effect)
+        return WAITS
+
+    def _arrived(self) -> bool:
+        """Whether more of the answer has come."""
+        stream = None if self._response is None else self._response.extensions.get("network_stream")
+        return stream is not None and bool(stream.get_extra_info("is_readable"))
 
     def _left(self, until: float) -> float:
         return max(until - self._session.clock(), 0.0)

@@ -11,6 +11,7 @@ from lodestream.errors import LodestreamError
 from lodestream.target import Region
 
 from .aio_io import AsyncIO
+from .effects import WAITS
 from .options import ConnectOptions
 from .stream import BaseStream
 
@@ -57,6 +58,23 @@ class Stream(BaseStream):
         else:
             await self._abandon()
 
+    async def latest(self) -> AsyncIterator[View]:
+        """Iterate over views for somebody who draws more slowly than they come: the newest that is there, each time.
+
+        Views before it are left out. The last view of the stream is always among them.
+        """
+        async for view in self:
+            newest, failed = view, None
+            try:
+                while (later := self._core.next_view()) is not None or await self._step(wait=False):
+                    newest = later or newest
+            except LodestreamError as error:
+                failed = error
+            self._core.shown()
+            yield newest
+            if failed is not None:
+                raise failed
+
     async def stop(self) -> None:
         """Stop the stream at once: no further view is yielded.
 
@@ -93,12 +111,14 @@ class Stream(BaseStream):
         self._session.abandon()
         await self._io.close()
 
-    async def _step(self) -> bool:
-        """Carry out the next effect; returns whether there was one."""
+    async def _step(self, *, wait: bool = True) -> bool:
+        """Carry out the next effect, perhaps only if it needs no waiting; returns whether that was done."""
         if (effect := self._core.effect) is None:
             return False
         try:
-            result = await self._io.perform(effect)
+            result = await (self._io.perform(effect) if wait else self._io.poll(effect))
+            if result is WAITS:
+                return False
         except Exception as error:
             self._core.failed(error)
         else:

@@ -73,9 +73,14 @@ class Core:
         So the server has its credit, and the link is busy, while somebody looks at the view.
         """
         view = None if isinstance(self._effect, Send) else self.session.next_view()
-        if view is not None and self._viewed is None:
-            self._viewed = self.session.clock()
+        if view is not None:
+            self.shown()
         return view
+
+    def shown(self) -> None:
+        """Declare that from now on somebody looks at a view."""
+        if self._viewed is None:
+            self._viewed = self.session.clock()
 
     def done(self, result: object) -> None:
         """Declare that the effect has been carried out.

@@ -10,7 +10,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
-__all__ = ["Dial", "DialError", "Dialled", "Effect", "Flow", "Get", "HangUp", "Hear", "Read", "Send", "Wait"]
+__all__ = ["WAITS", "Dial", "DialError", "Dialled", "Effect", "Flow", "Get", "HangUp", "Hear", "Read", "Send", "Wait"]
 
 T = TypeVar("T")
 
@@ -126,6 +126,9 @@ class HangUp:
 
 
 Effect: TypeAlias = Dial | Hear | Send | Get | Read | Wait | HangUp
+
+#: In place of an effect's result: it cannot be carried out without waiting, and was not.
+WAITS = object()
 
 #: A part of the core: yields effects, is sent their results or thrown their errors, and returns a `T`. What is sent is
 #: what the effect documents; a generator has one type for all of them.

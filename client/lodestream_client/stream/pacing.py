@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from lodestream.protocol.messages import MAX_CREDIT
+
 __all__ = ["Link", "window_for"]
 
 # A window holds a quarter of a second of the link, so that the server is stopped soon, and never less than what carries
 # a message and its framing well, nor more than the server grants anyway.
 _WINDOW_SECONDS = 0.25
 _WINDOW_LEAST = 1024
-_WINDOW_MOST = 256 * 1024
 
 
 class Link:
@@ -36,4 +37,4 @@ class Link:
 
 def window_for(rate: float) -> int:
     """The credit, in bytes, that keeps a link of `rate` bytes per second busy and no more."""
-    return round(min(max(rate * _WINDOW_SECONDS, _WINDOW_LEAST), _WINDOW_MOST))
+    return round(min(max(rate * _WINDOW_SECONDS, _WINDOW_LEAST), MAX_CREDIT))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from ..requests import calls
 from ..requests.answers import Head
-from .effects import Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .effects import WAITS, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class SyncIO:
         self._opened = ExitStack()  # closes the WebSocket or the answer that is open
         self._socket: ClientConnection | None = None
         self._client: httpx.Client | None = None
+        self._answer: httpx.Response | None = None
         self._body: Iterator[bytes] = iter(())
 
     def perform(self, effect: Effect) -> Any:
@@ -64,6 +65,23 @@ class SyncIO:
             case _:
                 assert_never(effect)
         return None
+
+    def poll(self, effect: Effect) -> Any:
+        """Carry out one effect if that needs no waiting, as `perform`; otherwise the result is `WAITS`."""
+        match effect:
+            case Send():
+                return self.send()
+            case Hear():
+                message = self._hear(0.0)
+                return WAITS if message is None else message
+            case Read() if self._arrived():
+                return self.perform(effect)
+        return WAITS
+
+    def _arrived(self) -> bool:
+        """Whether more of the answer has come."""
+        stream = None if self._answer is None else self._answer.extensions.get("network_stream")
+        return stream is not None and bool(stream.get_extra_info("is_readable"))
 
     def _left(self, until: float) -> float:
         return max(until - self._session.clock(), 0.0)
@@ -108,7 +126,7 @@ class SyncIO:
         answer = self._opened.enter_context(
             self._client.stream("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
         )
-        self._body = answer.iter_raw()
+        self._answer, self._body = answer, answer.iter_raw()
         return Head.of(answer)
 
     def hang_up(self, how: HangUp) -> None:
@@ -123,7 +141,7 @@ class SyncIO:
                 with suppress(TimeoutError, ConnectionClosed):
                     self._socket.recv(how.wait, decode=False)
         finally:
-            self._socket, self._body = None, iter(())
+            self._socket, self._answer, self._body = None, None, iter(())
             self._opened.close()
 
     def close(self, how: HangUp) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import LodestreamError
 from lodestream.target import Region
 
-from .effects import HangUp
+from .effects import WAITS, HangUp
 from .options import ConnectOptions
 from .stream import BaseStream
 from .sync_io import SyncIO
@@ -62,6 +62,23 @@ class Stream(BaseStream):
         # After Ctrl-C somebody waits for the end: no time for taking leave of a server that may be silent.
         self._abandon(abort=isinstance(error, KeyboardInterrupt))
 
+    def latest(self) -> Iterator[View]:
+        """Iterate over views for somebody who draws more slowly than they come: the newest that is there, each time.
+
+        Views before it are left out. The last view of the stream is always among them.
+        """
+        for view in self:
+            newest, failed = view, None
+            try:
+                while (later := self._core.next_view()) is not None or self._step(wait=False):
+                    newest = later or newest
+            except LodestreamError as error:
+                failed = error
+            self._core.shown()
+            yield newest
+            if failed is not None:
+                raise failed
+
     def stop(self) -> None:
         """Stop the stream at once: no further view is yielded.
 
@@ -107,12 +124,14 @@ class Stream(BaseStream):
         self._session.abandon()
         self._io.close(HangUp(abort=abort))
 
-    def _step(self) -> bool:
-        """Carry out the next effect; returns whether there was one."""
+    def _step(self, *, wait: bool = True) -> bool:
+        """Carry out the next effect, perhaps only if it needs no waiting; returns whether that was done."""
         if (effect := self._core.effect) is None:
             return False
         try:
-            result = self._io.perform(effect)
+            result = self._io.perform(effect) if wait else self._io.poll(effect)
+            if result is WAITS:
+                return False
         except Exception as error:
             self._core.failed(error)
         else:

@@ -16,11 +16,11 @@ const REPEATS = 5;
 const MOST = 2;
 
 /** Least seconds of processor and clock of some repetitions; the first ones are compiled on the way. */
-function least(work) {
+async function least(work) {
   let [processor, clock] = [Infinity, Infinity];
   for (let i = 0; i < REPEATS; i++) {
     const [started, used] = [performance.now(), process.cpuUsage()];
-    work();
+    await work();
     const { user, system } = process.cpuUsage(used);
     processor = Math.min(processor, (user + system) / 1e6);
     clock = Math.min(clock, (performance.now() - started) / 1e3);
@@ -28,11 +28,11 @@ function least(work) {
   return { processor, clock };
 }
 
-function decode(kernels, data) {
+async function decode(kernels, data) {
   const decoder = new Decoder(kernels);
   decoder.feed(data);
   decoder.finish();
-  decoder.surface();
+  await decoder.view().surfaceAsync();
 }
 
 const folder = mkdtempSync(join(tmpdir(), "lodestream-bench-"));
@@ -46,7 +46,7 @@ try {
   console.log("surface           points   bytes   Python, s (clock)   here, s (clock)   ratio");
   for (const name of readdirSync(folder).sort()) {
     const data = new Uint8Array(readFileSync(join(folder, name)));
-    const here = least(() => decode(kernels, data));
+    const here = await least(() => decode(kernels, data));
     const { points, processor, clock } = python[name];
     const ratio = here.processor / processor;
     worst = Math.max(worst, ratio);

@@ -48,7 +48,7 @@ beforeAll(async () => {
     }),
   ]);
   served = started;
-  whole = decode(await loadKernels(), served.data);
+  whole = await decode(await loadKernels(), served.data);
 }, 120_000);
 
 afterAll(async () => {

@@ -4,10 +4,10 @@ import { describe, expect, it } from "vitest";
 import { readIndex } from "../src/container";
 import type { View } from "../src/decoding/view";
 import { CorruptStreamError, RemoteError, RemoteProtocolError, TruncatedStreamError } from "../src/errors";
-import { endOf, slicesOf } from "../src/planning/plan";
+import { endOf } from "../src/planning/plan";
 import { plan } from "../src/planning/planner";
 import { makeTarget, type TargetOptions } from "../src/planning/target";
-import { MAX_CREDIT, type Segments } from "../src/protocol/messages";
+import { BASE_CREDIT, type Segments } from "../src/protocol/messages";
 import { parse, serialize } from "../src/protocol/wire";
 import { Download } from "../src/transfer/download";
 import { RangeDownload, type RangeRequest } from "../src/transfer/range-download";
@@ -18,7 +18,7 @@ import { decoderFor } from "./decoders";
 import { containerOf } from "./golden";
 import { run } from "./python";
 import { hex, recording } from "./recording";
-import { Sender } from "./sender";
+import { Sender, slicesOf } from "./sender";
 
 const DATA: Record<string, Uint8Array> = Object.fromEntries(
   run("tests.web.samples")
@@ -73,7 +73,7 @@ class Link {
   constructor(
     kind: string,
     readonly reception: ReceiverState<View>,
-    window = MAX_CREDIT,
+    window = BASE_CREDIT,
   ) {
     this.server = new Sender(INDEX[kind]!, DATA[kind]!);
     this.client = new Download(reception, { window });
@@ -181,7 +181,7 @@ describe("the exchange in docs/protocol.md", () => {
 describe.each(KINDS)("%s", (kind) => {
   it.each(TARGETS)("for %j every order of messages ends where the plan does", (options) => {
     const target = makeTarget(options);
-    for (const window of [300, MAX_CREDIT]) {
+    for (const window of [300, BASE_CREDIT]) {
       const link = new Link(kind, reception(target), window);
       link.run();
       checkEnd(link.reception, kind, target);

@@ -1,4 +1,4 @@
-import { beforeAll, describe, expect, it } from "vitest";
+import { afterEach, beforeAll, describe, expect, it, vi } from "vitest";
 import { decodeMask } from "../src/entropy/mask";
 import { TileTable } from "../src/entropy/tile-table";
 import { type Plane, Tiles } from "../src/entropy/tiles";
@@ -6,7 +6,7 @@ import { axisStep } from "../src/grid/axis";
 import { Layout, plainGrid } from "../src/grid/layout";
 import { Arena } from "../src/kernels/arena";
 import { loadKernels } from "../src/kernels/instance";
-import { sha256 } from "../src/kernels/sha256";
+import { platformSha256, sha256 } from "../src/kernels/sha256";
 import { decodeChunk } from "../src/residual/chunk-coder";
 import { allocatePlane, forwardStep, inverseStep } from "../src/transform/pyramid";
 import type { DType, Shape } from "../src/types";
@@ -150,6 +150,7 @@ describe("the kernels give the bits of the Python library", () => {
 
 describe("SHA-256", () => {
   const text = (value: string) => new TextEncoder().encode(value);
+  afterEach(() => vi.unstubAllGlobals());
 
   it("is that of FIPS 180-4's examples", () => {
     const arena = new Arena(kernels);
@@ -159,10 +160,21 @@ describe("SHA-256", () => {
     expect(sha256(arena, [two])).toBe("248d6a61d20638b8e5c026930c3e6039a33ce45964ff2167f6ecedd419db06c1");
   });
 
-  it("does not depend on how bytes are cut", () => {
+  it("does not depend on how bytes are cut, nor on who computes it", async () => {
     const arena = new Arena(kernels);
     const data = Uint8Array.from({ length: 2_500_001 }, (_, i) => (i * i) >> 3);
     const arrays = [data.subarray(0, 1), data.subarray(1, 1_300_000), data.subarray(1_300_000)];
     expect(sha256(arena, arrays)).toBe(sha256(arena, [data]));
+    expect(await platformSha256([data])).toBe(sha256(arena, [data]));
+    expect(await platformSha256(arrays)).toBe(sha256(arena, [data]));
+    expect(await platformSha256([])).toBe(sha256(arena, []));
+  });
+
+  it("is left to the kernels where the platform gives none, or cannot", async () => {
+    vi.stubGlobal("crypto", {});
+    expect(await platformSha256([text("abc")])).toBeNull();
+    const digest = () => Promise.reject(new DOMException("no memory", "OperationError"));
+    vi.stubGlobal("crypto", { subtle: { digest } });
+    expect(await platformSha256([text("abc")])).toBeNull();
   });
 });

@@ -10,6 +10,7 @@ import { makeTarget } from "../src/planning/target";
 import { Connection, TRANSITIONS } from "../src/protocol/connection";
 import { MAX_OPENING, toAddress } from "../src/protocol/handshake";
 import {
+  BASE_CREDIT,
   CODES,
   type Event,
   MAX_CREDIT,
@@ -64,7 +65,7 @@ describe("docs/protocol.md", () => {
   });
 
   it("has the limits", () => {
-    for (const limit of [MAX_CREDIT, MAX_DATA, MAX_MESSAGE, MAX_HELD, MIN_WINDOW, MAX_OPENING]) {
+    for (const limit of [BASE_CREDIT, MAX_CREDIT, MAX_DATA, MAX_MESSAGE, MAX_HELD, MIN_WINDOW, MAX_OPENING]) {
       expect(PAGE).toContain(limit.toLocaleString("en"));
     }
   });
@@ -310,7 +311,7 @@ describe("a connection", () => {
     expect(() => client.send({ type: "bye" })).toThrow(LocalProtocolError);
     const server = new Connection("server");
     expect(server.receive(client.send(open))).toMatchObject({ credit: 100 });
-    expect(() => client.send({ type: "credit", bytes: MAX_CREDIT })).toThrow(/1 to 262044 bytes of credit/);
+    expect(() => client.send({ type: "credit", bytes: BASE_CREDIT })).toThrow(/1 to 262044 bytes of credit/);
     expect(() => client.send(open)).toThrow(/expected to send credit or stop \(the client is opened\), got open/);
     const header: Event = {
       ...{ type: "header", container: DIGEST, size: 300, planned: 200, extent: 1 },

@@ -3,10 +3,19 @@ import { describe, expect, it } from "vitest";
 import { OptionError } from "../src/errors";
 import { RangeSet } from "../src/planning/byte-ranges";
 import { absolute, makeTarget, tolerance } from "../src/planning/target";
-import { Window } from "../src/protocol/flow-control";
-import { MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
+import { SMALL_MESSAGE, Window } from "../src/protocol/flow-control";
+import { BASE_CREDIT, MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
 import { Link, windowFor } from "../src/transfer/pacing";
 import { MemoryStore } from "../src/transfer/store";
+import { run } from "./python";
+
+/** What `tests.core.protocol.windows` prints of a window. */
+interface Recorded {
+  most: number;
+  heard: number;
+  steps: [granted: number, arrived: number, now: number][];
+  sizes: [size: number, due: number][];
+}
 
 const place = fc.tuple(fc.nat(60), fc.nat(12));
 const bytesOf = (places: Iterable<readonly [number, number]>): Set<number> => {
@@ -102,14 +111,32 @@ describe("the window", () => {
     [125e3, 0.02],
     [125e3, 0.3],
     [1.25e6, 0.1],
+    [12.5e6, 0.02],
   ])("keeps a link of %d bytes/s and %d s busy by little more than it holds", (rate, roundTrip) => {
     const { use, most } = transfer(rate, roundTrip, Math.round(rate * 60));
-    expect(most).toBeLessThanOrEqual(Math.max(MIN_WINDOW, 2.5 * rate * roundTrip));
-    expect(use).toBeGreaterThan(Math.min(0.9, (0.7 * MAX_CREDIT) / (rate * roundTrip)));
+    expect(most).toBeLessThanOrEqual(Math.max(MIN_WINDOW, 5 * rate * roundTrip));
+    expect(use).toBeGreaterThan(0.95);
   });
 
   it("becomes the largest on a link without limits", () => {
     expect(transfer(1e12, 0.05, 20_000_000).size).toBe(MAX_CREDIT);
+  });
+
+  it("is that of the Python library on links of all kinds", () => {
+    const lines = run("tests.core.protocol.windows", 300).trim().split("\n");
+    expect(lines).toHaveLength(300);
+    for (const line of lines) {
+      const { most, heard, steps, sizes } = JSON.parse(line) as Recorded;
+      const window = new Window();
+      window.allow(most);
+      window.heard(heard);
+      const found = steps.map(([granted, arrived, now]) => {
+        if (granted > 0) window.grant(granted, now);
+        window.arrive(arrived, now);
+        return [window.size, window.due(window.size - arrived)];
+      });
+      expect(found).toEqual(sizes);
+    }
   });
 
   it("stays within its bounds, or as it was set", () => {
@@ -118,6 +145,7 @@ describe("the window", () => {
         fc.array(fc.tuple(fc.integer({ min: 1, max: 70_000 }), fc.double({ min: 0, max: 3, noNaN: true }))),
         (steps) => {
           const [free, fixed] = [new Window(), new Window(500)];
+          free.allow(MAX_CREDIT);
           let now = 0;
           for (const [size, time] of steps) {
             now += time;
@@ -132,6 +160,10 @@ describe("the window", () => {
         },
       ),
     );
+    const large = new Window(MAX_CREDIT);
+    expect(large.size).toBe(BASE_CREDIT); // every server keeps as much
+    large.allow(MAX_CREDIT);
+    expect([large.size, large.due(MAX_CREDIT - 1), large.due(100)]).toEqual([MAX_CREDIT, 0, MAX_CREDIT - 100]);
     expect(() => new Window(0)).toThrow(OptionError);
     expect(() => new Window(MAX_CREDIT + 1)).toThrow(OptionError);
   });
@@ -151,8 +183,9 @@ describe("a limited rate", () => {
 /** Receive so many bytes over a link: the share of its rate that was used, the most outstanding, the window. */
 function transfer(rate: number, roundTrip: number, total: number): { use: number; most: number; size: number } {
   const window = new Window();
+  window.allow(MAX_CREDIT);
   let [outstanding, credit] = [window.size, window.size];
-  let [free, now, sent, most] = [0, 0, 0, 0];
+  let [free, now, sent, most, largest] = [0, 0, 0, 0, 0];
   window.grant(window.size, 0);
   window.heard(roundTrip);
   const events: { at: number; grant: boolean; size: number }[] = [];
@@ -163,7 +196,8 @@ function transfer(rate: number, roundTrip: number, total: number): { use: number
   };
   const send = (): void => {
     while (credit > 0 && sent < total) {
-      const size = Math.min(credit, Math.max(Math.floor(credit / 4), 4096), MAX_DATA, total - sent);
+      largest = Math.max(largest, credit);
+      const size = Math.min(credit, Math.max(Math.floor(largest / 16), SMALL_MESSAGE), MAX_DATA, total - sent);
       free = Math.max(free, now) + size / rate;
       later(free + roundTrip / 2, false, size);
       credit -= size;
@@ -181,8 +215,8 @@ function transfer(rate: number, roundTrip: number, total: number): { use: number
     }
     outstanding -= event.size;
     window.arrive(event.size, now);
-    const grant = window.size - outstanding;
-    if (grant > 0 && grant * 4 >= window.size) {
+    const grant = window.due(outstanding);
+    if (grant > 0) {
       window.grant(grant, now);
       outstanding += grant;
       later(now + roundTrip / 2, true, grant);

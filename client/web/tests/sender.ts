@@ -2,10 +2,16 @@
 import { createHash } from "node:crypto";
 import type { Index } from "../src/container";
 import { type Place, RangeSet } from "../src/planning/byte-ranges";
-import { endOf, type Mark, slicesOf } from "../src/planning/plan";
+import { endOf, type Mark, type Plan } from "../src/planning/plan";
 import { plan } from "../src/planning/planner";
 import { Connection } from "../src/protocol/connection";
 import { type Event, MAX_DATA, type Open } from "../src/protocol/messages";
+import type { ByteRange } from "../src/types";
+
+/** All slices of a plan, in order. */
+export function slicesOf(plan: Plan): ByteRange[] {
+  return [...plan.before, ...plan.ranges, ...plan.after];
+}
 
 /** One surface being sent. */
 export class Sender {

@@ -27,7 +27,7 @@ let whole: Surface;
 
 beforeAll(async () => {
   served = await serve();
-  whole = decode(await loadKernels(), served.data);
+  whole = await decode(await loadKernels(), served.data);
 }, 60_000);
 afterAll(() => served?.stop());
 

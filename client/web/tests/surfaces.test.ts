@@ -1,3 +1,4 @@
+import { writeSync } from "node:fs";
 import { beforeAll, describe, expect, it } from "vitest";
 import { Decoder, type View } from "../src/decoding";
 import { loadKernels } from "../src/kernels/instance";
@@ -32,10 +33,26 @@ beforeAll(async () => {
 describe("random surfaces", () => {
   const starts = Array.from({ length: Math.ceil(COUNT / AT_ONCE) }, (_, i) => SEED + i * AT_ONCE);
   it.each(starts)(`are what Python decodes: ${AT_ONCE} from %i on`, { timeout: 600_000 }, (start) => {
-    const lines = run("tests.web.surfaces", start, Math.min(AT_ONCE, SEED + COUNT - start))
-      .trim()
-      .split("\n");
-    for (const [i, line] of lines.entries()) check(JSON.parse(line) as Case, `surface ${start + i}`);
+    const began = performance.now();
+    const count = Math.min(AT_ONCE, SEED + COUNT - start);
+    const lines = run("tests.web.surfaces", start, count).trim().split("\n");
+    expect(lines.length).toBe(count);
+    const made = performance.now();
+    let slowest = { seconds: 0, number: start };
+    for (const [i, line] of lines.entries()) {
+      const used = process.cpuUsage();
+      check(JSON.parse(line) as Case, `surface ${start + i}`);
+      const { user, system } = process.cpuUsage(used);
+      const seconds = (user + system) / 1e6;
+      if (seconds > slowest.seconds) slowest = { seconds, number: start + i };
+    }
+    // Straight to the terminal: vitest keeps what tests print until their file ends.
+    writeSync(
+      2,
+      `surfaces to ${start + count - SEED} of ${COUNT}: ${((made - began) / 1000).toFixed(1)} s in Python, ` +
+        `${((performance.now() - made) / 1000).toFixed(1)} s here; ` +
+        `most processor time ${slowest.seconds.toFixed(2)} s, surface ${slowest.number}\n`,
+    );
   });
 });
 

@@ -32,11 +32,14 @@ class Rights:
         Folders in which it may do anything with files and folders, and single files.
     processes : bool
         Whether it may start processes, which have the same rights.
+    threads : bool
+        Whether it may start threads, which have the same rights; it may where it may start processes.
     """
 
     read: tuple[Path, ...] = ()
     write: tuple[Path, ...] = ()
     processes: bool = False
+    threads: bool = False
 
 
 def confine(rights: Rights) -> tuple[str, ...]:
@@ -64,7 +67,7 @@ def confine(rights: Rights) -> tuple[str, ...]:
     if landlock.restrict(libc, (*libraries, *rights.read), write, libraries if rights.processes else ()):
         held.append("landlock")
     _drop_capabilities(libc)
-    if seccomp.restrict(libc, os.getpid(), processes=rights.processes):
+    if seccomp.restrict(libc, os.getpid(), processes=rights.processes, threads=rights.threads):
         held.append("seccomp")
     return tuple(held)
 

@@ -48,7 +48,7 @@ _DENIED = """
     lookup_dcookie nfsservctl uselib mbind set_mempolicy migrate_pages move_pages io_setup io_submit
 """
 
-_START = ("fork", "vfork", "clone", "execve", "execveat")
+_START = ("fork", "vfork", "execve", "execveat")
 _SIGNALS = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo")
 #: Of which process, says the first argument; 0 is whoever calls.
 _LIMITS = ("prlimit64", "sched_setaffinity")
@@ -61,6 +61,7 @@ _LATE = (436, 439, 441, 444, 445, 446, 449, 453, 454, 455, 456, 462)
 
 _NAMESPACES = 0x7E020000
 _SAME_PARENT = 0x00008000
+_THREAD = 0x00010000
 _TRUNCATE, _ACCESS = os.O_TRUNC, os.O_ACCMODE
 _SHARED, _ANONYMOUS = 0x01, 0x20
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
@@ -118,7 +119,7 @@ def _table(text: str) -> Mapping[str, int]:
 _MACHINES = {"x86_64": (0xC000003E, _table(_X86_64)), "aarch64": (0xC00000B7, _table(_AARCH64))}
 
 
-def restrict(libc: ctypes.CDLL, process: int, *, processes: bool) -> bool:
+def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool = False) -> bool:
     """Make no call from now on but those allowed; whether the kernel holds this process to it.
 
     Parameters
@@ -128,18 +129,22 @@ def restrict(libc: ctypes.CDLL, process: int, *, processes: bool) -> bool:
         The process that calls this, the only one to which it may send signals.
     processes : bool
         Whether further processes may be started, and be sent signals.
+    threads : bool
+        Whether further threads of this process may be started.
     """
     machine = os.uname().machine
     if machine not in _MACHINES or sys.maxsize < 1 << 32 or sys.byteorder != "little":
         return False
     architecture, calls = _MACHINES[machine]
-    code = b"".join(_program(architecture, calls, process, processes=processes))
+    code = b"".join(_program(architecture, calls, process, processes=processes, threads=threads))
     instructions = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("HxxxxxxP", len(code) // 8, ctypes.addressof(instructions))
     return bool(libc.syscall(calls["seccomp"], _SET_FILTER, _ALL_THREADS | _FULL_SPEED, program) == 0)
 
 
-def _program(architecture: int, calls: Mapping[str, int], process: int, *, processes: bool) -> Iterable[bytes]:
+def _program(
+    architecture: int, calls: Mapping[str, int], process: int, *, processes: bool, threads: bool
+) -> Iterable[bytes]:
     # Each rule falls through to the next one, with the call's number loaded.
     yield _instruction(_LOAD, _ARCHITECTURE)
     yield _instruction(_EQUAL, architecture, 1, 0)
@@ -164,6 +169,12 @@ def _program(architecture: int, calls: Mapping[str, int], process: int, *, proce
         yield from _if(calls["fcntl"], 1, (_EQUAL, command))
     if processes:
         yield from _if(calls["clone"], 0, (_ANY_BIT, _NAMESPACES | _SAME_PARENT))
+    elif threads:
+        # A thread shares memory, files and signals with the process, and cannot be had with a namespace of its own.
+        yield from _unless(calls["clone"], 0, (_ANY_BIT, _THREAD))
+    else:
+        yield _instruction(_EQUAL, calls["clone"], 0, 1)
+        yield _instruction(_RETURN, _ERROR | errno.EPERM)
     # The first two versions of Landlock let files be cut that may only be read.
     for name, place in (("open", 1), ("openat", 2)):
         if name in calls:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
 
 from ..errors import TooLargeError
@@ -49,21 +50,19 @@ class Capacity:
     max_vertices : int or None
         Allows this many vertices and `BYTES_PER_VERTEX` bytes for each, plus 16 MiB. None: two fifths of the memory
         available to this process, see `memory_limit`.
-
-    Attributes
-    ----------
-    bytes : int
-        Bytes allowed for the surface, and again for what is read.
     """
 
     def __init__(self, max_vertices: int | None = None) -> None:
         self.max_vertices = max_vertices
-        if max_vertices is None:
-            self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
-            self.bytes = max(int(memory_limit() * self._share), _LEAST)
-        else:
-            self.bytes = _LEAST + max_vertices * BYTES_PER_VERTEX
+        self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
         self._read = 0
+
+    @cached_property
+    def bytes(self) -> int:
+        """Bytes allowed for the surface, and again for what is read; at least `_LEAST`."""
+        if self.max_vertices is None:
+            return max(int(memory_limit() * self._share), _LEAST)
+        return _LEAST + self.max_vertices * BYTES_PER_VERTEX
 
     def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
         """Refuse a surface that needs more memory than this.
@@ -90,7 +89,7 @@ class Capacity:
             edges = (1 + _EDGE / rows) * (1 + _EDGE / columns)
             each = sum(_RECONSTRUCTION + 2 * size + _COEFFICIENT * edges for size in sizes)
             needed += int(rows * columns * each)
-        if needed > self.bytes:
+        if needed > _LEAST and needed > self.bytes:  # the limit of the machine takes files to read
             enough = -(-(needed - _LEAST) // BYTES_PER_VERTEX)
             raise TooLargeError(
                 f"expected a surface that takes at most {_size(self.bytes)} to decode "
@@ -107,7 +106,7 @@ class Capacity:
             If there are more than a surface of this size can have.
         """
         self._read += count
-        if self._read > self.bytes:
+        if self._read > _LEAST and self._read > self.bytes:
             raise TooLargeError(
                 f"expected a container whose data take at most {_size(self.bytes)} ({self._words}), got more"
             )

@@ -116,10 +116,12 @@ class FieldReader:
         CorruptStreamError
             If there is none left.
         """
-        if self.place == len(self.data):
-            raise CorruptStreamError("expected 1 more bytes, got 0", self.at)
+        try:
+            value = self.data[self.place]
+        except IndexError:
+            raise CorruptStreamError("expected 1 more bytes, got 0", self.at) from None
         self.place += 1
-        return self.data[self.place - 1]
+        return value
 
     def varint(self, limit: int = LARGEST) -> int:
         """A whole number that must not exceed ``limit``.
@@ -129,14 +131,15 @@ class FieldReader:
         CorruptStreamError
             If it is larger, takes more than nine bytes, or the bytes end before it does.
         """
-        start, number, shift = self.at, 0, 0
-        while True:
+        byte = self.byte()
+        if byte < 128 and byte <= limit:  # nearly always
+            return byte
+        start, number, shift = self.at - 1, byte & 127, 7
+        while byte >= 128:
             byte = self.byte()
             number |= (byte & 127) << shift
             shift += 7
-            if byte < 128:
-                break
-            if shift == 63:
+            if shift == 63 and byte >= 128:
                 raise CorruptStreamError("expected a whole number of at most 9 bytes, got more", start)
         if number > limit:
             raise CorruptStreamError(f"expected a number of at most {limit}, got {number}", start)

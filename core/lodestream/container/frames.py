@@ -101,9 +101,10 @@ class FrameReader:
             return None
         start, length = extent
         kind, offset = self._data[0], self._offset
-        frame, self._data = self._data[:length], self._data[length:]
+        frame = bytes(self._data[:length])
+        del self._data[:length]  # without a copy of what is left
         self._offset += length
-        return checked(bytes(frame), kind, offset, start)
+        return checked(frame, kind, offset, start)
 
     def _start(self) -> bool:
         sections.check_signature(bytes(self._data[:_START]))
@@ -184,7 +185,7 @@ def index_sections(data: bytes, offset: int) -> tuple[Frame, Frame]:
 def checked(frame: bytes, kind: int, offset: int, start: int) -> Frame:
     """A whole section, whose payload starts at ``start`` of it, after its CRC was checked."""
     payload, crc = memoryview(frame)[start:-4], int.from_bytes(frame[-4:], "little")
-    if zlib.crc32(frame[:-4]) != crc:
+    if zlib.crc32(memoryview(frame)[:-4]) != crc:
         raise CorruptStreamError(f"expected a section of kind {kind} to match its CRC, got other bytes", offset)
     if kind not in _KNOWN and kind < sections.OPTIONAL:
         raise UnsupportedVersionError(

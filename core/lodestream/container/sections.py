@@ -137,7 +137,8 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Error
     """
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
-    units = len(header.layout.tiles) * header.channels
+    channels = header.channels
+    units = len(header.layout.tiles) * channels
     entries, unit = [], 0
     for _ in range(fields.varint(units)):
         start, first = fields.at, fields.byte()
@@ -152,7 +153,7 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Error
         unit += skip
         if unit >= units or top > COEFFICIENT_BITS or length < 1 or (first & 8 and not top):
             raise CorruptStreamError(f"expected one of {units} units and at most 28 planes, got {unit}, {top}", start)
-        entries.append(Entry(*divmod(unit, header.channels), top, passes, length))
+        entries.append(Entry(*divmod(unit, channels), top, passes, length))
         unit += 1
     if sum(entry.length for entry in entries) != len(payload) - fields.place:
         raise CorruptStreamError("expected segments as long as the layer's table says, got another length", offset)

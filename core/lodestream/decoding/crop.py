@@ -1,8 +1,8 @@
 """The reconstruction of a window: of every level only what the window is made of, so that it costs what a window costs.
 
-From the finest level down, an axis is followed by the samples that are wanted, see `lodestream.grid.support`. The nodes
-and details that give them back are one stretch of the axis. It is stepped like an axis of its own: where it ends inside
-the surface, what lies beyond would be extended wrongly, but nothing that is wanted looks there.
+From the finest level down, an axis is followed by the samples that are wanted. The nodes and details that give them
+back, and a few more beside them, are one stretch of the axis. It is stepped like an axis of its own: where it ends
+inside the surface, what lies beyond would be extended wrongly, but nothing that is wanted looks there.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from ..container.model import Header
 from ..entropy.tiles import Tiles
 from ..grid.axis import AxisStep
-from ..grid.support import coefficients_needed
 from ..target import Region
-from ..transform.lifting import CLAMP, FRACTION_BITS, inverse_step
+from ..transform.lifting import FRACTION_BITS, REACH, inverse_step
 from ..transform.predictors import predictor
-from ..transform.pyramid import allocate
+from ..transform.pyramid import allocate, refine
 
 __all__ = ["AxisCrop", "crop_axis", "reconstruct_window"]
 
 #: Nodes that the third step wants of a run.
 _LEAST_NODES = 4
+#: A sample needs the details within `REACH` of its node, and each of them the nodes within three more.
+_SUPPORT = REACH + 3
 
 
 class AxisCrop(NamedTuple):
@@ -55,13 +56,9 @@ def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
     if not step.midpoints:
         length = stop - start
         return AxisCrop(start, AxisStep(length, length, 0, length, False, False, False), 0)
-    samples = np.zeros(step.length, np.bool_)
-    samples[start:stop] = True
-    line = coefficients_needed(samples, step)
-    nodes, details = np.flatnonzero(line[: step.coarse]), np.flatnonzero(line[step.coarse :])
-    first, last = int(nodes[0]), min(int(nodes[-1]), step.run - 1)
-    if details.size:
-        first, last = min(first, int(details[0])), max(last, int(details[-1]) + 1)
+    # What lies beyond an end of the axis is reflected from less far inside than this.
+    first = min(start >> 1, step.run - 1) - _SUPPORT
+    last = min(((stop - 1) >> 1) + 1 + _SUPPORT, step.run - 1)
     first = max(min(first, last + 1 - _LEAST_NODES), 0)
     last = min(max(last, first + _LEAST_NODES - 1), step.run - 1)
     # The sample of its own at the end of an axis of even length goes with the last node of the run.
@@ -119,8 +116,7 @@ def reconstruct_window(
         corner = canvas[: steps[0].coarse, : steps[1].coarse]
         corner[...] = reconstruction
         if level == whole + 1:
-            np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
-            corner <<= FRACTION_BITS
+            refine(corner)
         full = layout.steps(0, level)
         places = tuple((c.first, c.step.coarse, f.coarse) for c, f in zip(crop, full, strict=True))
         _put(tiles, level, state, level > whole, canvas, places)

@@ -21,7 +21,8 @@ from ..library import why_missing
 from ..planning.selection import Selection, select
 from ..surface import Surface
 from ..target import Region
-from .reconstruction import Coded, Progress, Reconstruction
+from .batches import Coded
+from .reconstruction import Progress, Reconstruction
 from .view import View
 
 __all__ = ["Decoder", "View", "decode"]
@@ -264,13 +265,13 @@ class Decoder:
         errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
         self.capacity.take(_ENTRY * len(entries))
         segments = []
-        for entry in entries:
+        for tile, channel, top, passes, length in entries:
             place = frame.payload_offset + start
-            first = self._progress.advance(entry.tile, entry.channel, entry.top, entry.passes, place)
-            data = bytes(frame.payload[start : start + entry.length])
-            segments.append(Coded(entry.tile, entry.channel, first, entry.passes, data, place))
-            start += entry.length
-            self._level = max(self._level, header.layout.tiles[entry.tile].level)
+            first = self._progress.advance(tile, channel, top, passes, place)
+            segments.append(Coded(tile, channel, first, passes, bytes(frame.payload[start : start + length]), place))
+            start += length
+        finest = max((entry.tile for entry in entries), default=0)  # tiles stand by level
+        self._level = max(self._level, header.layout.tiles[finest].level)
         for segment in segments:
             self._reconstruction.add(segment)
         last = number + 1 == header.layer_count

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any
@@ -14,19 +14,19 @@ from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
-from ..entropy.tiles import Tiles, TileTable
+from ..entropy.tiles import Reading, Tiles, TileTable
 from ..errors import CorruptStreamError
 from ..grid.patches import assemble, level_masks, numbered_by_block
+from ..parallel import spread
 from ..quantization.distortion import store_values
 from ..residual import chunk_coder
 from ..target import Region
-from ..transform.lifting import FRACTION_BITS
 from ..transform.predictors import COEFFICIENT_BITS
-from ..transform.pyramid import allocate, inverse
+from .batches import Coded, batch_length, rounds_of
+from .channels import Coordinates, has_bands, reconstruct_channel, values_by_bands
 from .crop import reconstruct_window
 
 __all__ = [
-    "Coded",
     "Coordinates",
     "Progress",
     "Reconstruction",
@@ -35,23 +35,6 @@ __all__ = [
     "reconstruct_channel",
     "to_values",
 ]
-
-#: Lattice coordinates of each grid, over two to the power of the second.
-Coordinates = tuple[list[NDArray[np.int32]], int]
-
-_BATCH = 64  # segments decoded in one go: few enough that an interruption is not kept waiting
-
-
-@dataclass(frozen=True)
-class Coded:
-    """A segment with its bytes: ``passes`` passes of a tile down from ``first``; ``offset`` is its place."""
-
-    tile: int
-    channel: int
-    first: int
-    passes: int
-    data: bytes
-    offset: int
 
 
 class Reconstruction:
@@ -66,7 +49,7 @@ class Reconstruction:
         self.header = header
         self._queue: dict[int, Coded] = {}  # what is not decoded yet, by number
         self._added = self._taken = self._forgotten = 0
-        self._begun: tuple[int, list[Callable[[], None]]] = 0, []  # the batch on its way: what it ends before, its work
+        self._begun: tuple[int, list[list[Reading]]] = 0, []  # the batch on its way: what it ends before, its rounds
         self._lock = Lock()
         self._chunks: dict[int, tuple[bytes, int]] = {}
         self._tiles: list[Tiles] = []
@@ -118,7 +101,12 @@ class Reconstruction:
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
     ) -> list[Values]:
         """The values of all blocks before residual and holes."""
-        return to_values(self.header, self.reconstructions(length, state, level, chosen), level)
+        if not has_bands(self.header, level):
+            return to_values(self.header, self.reconstructions(length, state, level, chosen), level)
+        with self._lock:
+            self._decode(length)
+            arrays = values_by_bands(self.header, self._tiles, state, level, chosen)
+        return [Values(_arranged(self.header, level, [[array] for array in arrays], 0))]
 
     def reconstructions(
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
@@ -222,16 +210,12 @@ class Reconstruction:
         every = self._prepare()
         while self._taken < length:
             if self._begun[0] <= self._taken:
-                end = min(self._taken + _BATCH, length)
-                runs: list[list[tuple[int, int, int, bytes]]] = [[] for _ in every]
-                for number in range(self._taken, end):
-                    segment = self._queue[number]
-                    last = segment.first - segment.passes + 1
-                    runs[segment.channel].append((segment.tile, segment.first, last, segment.data))
-                self._begun = end, [tiles.reading(own) for tiles, own in zip(every, runs, strict=True) if own]
-            end, work = self._begun
-            for read in work:
-                read()
+                waiting = [self._queue[number] for number in range(self._taken, length)]
+                batch = waiting[: batch_length(self.header.layout, waiting)]
+                self._begun = self._taken + len(batch), rounds_of(every, batch)
+            end, rounds = self._begun
+            for readings in rounds:
+                spread(Reading.run, readings)
             self._taken = end
             self._forget(end)
 
@@ -247,8 +231,9 @@ class Progress:
 
     def __init__(self, header: Header) -> None:
         shape = len(header.layout.tiles), header.channels
-        self.top = np.zeros(shape, np.int8)
-        self.state = initial_state(header)
+        self._state = initial_state(header)
+        #: The same arrays, whose numbers are read and written more quickly so.
+        self.top, self.state = np.zeros(shape, np.int8).data, self._state.data
 
     def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
         """Note a segment; returns the first of its passes.
@@ -263,7 +248,7 @@ class Progress:
         CorruptStreamError
             When the tile was not announced, was announced already, or has not so many passes left.
         """
-        known = int(self.top[tile, channel])
+        known = self.top[tile, channel]
         if not known and self.state[tile, channel] == 0:
             raise CorruptStreamError(f"expected no segment of tile {tile}, whose level has zeros only", offset)
         if bool(top) == bool(known):
@@ -277,7 +262,7 @@ class Progress:
             )
         if top:
             self.top[tile, channel], self.state[tile, channel] = top, pass_count(top)
-        below = int(self.state[tile, channel])
+        below = self.state[tile, channel]
         if passes > below:
             raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
         self.state[tile, channel] = below - passes
@@ -288,7 +273,7 @@ class Progress:
 
         Once ``whole``, a tile that no layer has announced is known to have nothing but zeros.
         """
-        return np.where(self.state == UNANNOUNCED, np.int8(0), self.state) if whole else self.state.copy()
+        return np.where(self._state == UNANNOUNCED, np.int8(0), self._state) if whole else self._state.copy()
 
 
 def initial_state(header: Header) -> NDArray[np.int8]:
@@ -302,38 +287,6 @@ def initial_state(header: Header) -> NDArray[np.int8]:
     known[:, : header.geometric] |= np.array([not tile.bands for tile in tiles])[:, None]
     known[:, header.geometric :] |= np.array([not tile.whole for tile in tiles])[:, None]
     return np.where(known, 0, UNANNOUNCED).astype(np.int8)
-
-
-def reconstruct_channel(
-    header: Header,
-    channel: int,
-    tiles: Tiles,
-    state: NDArray[np.int8],
-    level: int,
-    canvases: list[NDArray[np.int32]] | None = None,
-) -> Coordinates:
-    """One channel of the grids of ``level`` in a state.
-
-    Parameters
-    ----------
-    canvases : list of int32 arrays, optional
-        Of the shapes of the level, one for each grid, where the reconstruction is made; new ones otherwise.
-
-    Returns
-    -------
-    (list of int32 arrays, shape (row, column), int)
-        Lattice coordinates of each grid, interfaces first, over two to the power of the second.
-    """
-    layout = header.layout
-    whole = 0
-    while whole < level and not state[layout.tiles_of(whole + 1)].any():
-        whole += 1
-    for canvas in canvases or ():
-        canvas.fill(0)
-    coefficients = canvases or [allocate(layout.shape(number, level)) for number in range(len(layout.grids))]
-    tiles.spread_levels(level, state, coefficients, whole)
-    inverse(coefficients, layout, header.predictors[channel], level, whole, channel < header.geometric)
-    return coefficients, FRACTION_BITS if whole < level else 0
 
 
 @dataclass
@@ -384,7 +337,11 @@ def to_values(header: Header, reconstructions: Sequence[Coordinates], level: int
                 store_values(header.lattices[channel], (coordinates[interfaces + k], fraction), array, component)
             channel += 1
         grids.append(arrays)
-    return [
-        Values([np.ascontiguousarray(assemble(own, layout, level, shape, arrays)) for arrays in grids])
-        for own, (shape, _) in zip(numbered_by_block(patches, len(header.blocks)), header.blocks, strict=True)
-    ]
+    return [Values(_arranged(header, level, grids, block)) for block in range(len(header.blocks))]
+
+
+def _arranged(header: Header, level: int, grids: list[list[NDArray[Any]]], block: int) -> list[NDArray[Any]]:
+    """The arrays of a block from those of patches, which stand by array and patch."""
+    own = numbered_by_block(header.patches, len(header.blocks))[block]
+    shape = header.blocks[block][0]
+    return [np.ascontiguousarray(assemble(own, header.layout, level, shape, arrays)) for arrays in grids]

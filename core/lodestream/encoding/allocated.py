@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.bitplanes import pass_count, pass_gains
 from ..entropy.tile_coder import Strings, TileCoder
 from ..entropy.tiles import Tiles
+from ..parallel import spread
 from .allocation import TileCurve, assign_layers
 from .header import header_of
 from .large_units import large_level
@@ -35,6 +37,7 @@ class Allocated:
     Attributes
     ----------
     quantized : Quantized
+        Its channels have the coefficients of small units only, those before the first large one.
     header : Header
         With the largest chunks; their size is chosen when errors are measured.
     tiles : tuple of Tiles, one for each channel
@@ -65,22 +68,38 @@ def allocate(quantized: Quantized) -> Allocated:
     states = assign_layers(curves, layout, len(channels), quantized.quantiser is not None)
     coefficient_bytes = sum(float(curve.bits.sum()) for curve in curves) / 8
     header = header_of(quantized, large)
+    quantized = _without_large(quantized, coder)
     return Allocated(quantized, header, tuple(coder.tiles), coder.strings, tuple(states), coefficient_bytes)
+
+
+def _without_large(quantized: Quantized, coder: TileCoder) -> Quantized:
+    """Without the coefficients of large units, which are not coded again."""
+    channels = [
+        replace(channel, true=channel.true[: tiles.table.small_size(tiles.large)].copy())
+        for channel, tiles in zip(quantized.channels, coder.tiles, strict=True)
+    ]
+    return replace(quantized, channels=tuple(channels))
 
 
 def _curves(quantized: Quantized, coder: TileCoder) -> Iterator[TileCurve]:
     """Cost and gain of every pass of each tile and channel that has a bit-plane; parents before their children."""
+    layout = quantized.prepared.layout
+    for level in range(layout.levels + 1):
+        units = itertools.product(layout.tiles_of(level), range(len(quantized.channels)))
+        coded = [(tile, number) for tile, number in units if quantized.channels[number].top[tile]]
+        # Contexts of a unit come from itself and its parent: those of a level are coded side by side.
+        yield from spread(lambda unit: _curve(quantized, coder, *unit), coded)
+
+
+def _curve(quantized: Quantized, coder: TileCoder, tile: int, number: int) -> TileCurve:
+    """Code a unit as a whole."""
+    channel, table = quantized.channels[number], quantized.tables[number]
     rounding = _ROUNDING if quantized.quantiser is None else 0.0
-    for tile in range(len(quantized.prepared.layout.tiles)):
-        for number, (channel, table) in enumerate(zip(quantized.channels, quantized.tables, strict=True)):
-            top = int(channel.top[tile])
-            if not top:
-                continue
-            passes = pass_count(top)
-            costs = np.zeros(passes, np.float64)
-            coder.code(tile, number, passes, passes, costs)
-            bits = np.diff(costs[::-1], prepend=0.0)[::-1]
-            rows, weights = table.of_tile(tile), channel.weights[table.first[tile] : table.first[tile + 1]]
-            gains = np.diff(pass_gains(rows, weights, passes, channel.true, coder.tiles[number].early))
-            gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
-            yield TileCurve(tile, number, bits, gains)
+    passes = pass_count(int(channel.top[tile]))
+    costs = np.zeros(passes, np.float64)
+    coder.code(tile, number, passes, passes, costs)
+    bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+    rows, weights = table.of_tile(tile), channel.weights[table.first[tile] : table.first[tile + 1]]
+    gains = np.diff(pass_gains(rows, weights, passes, channel.true, coder.tiles[number].early))
+    gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
+    return TileCurve(tile, number, bits, gains)

@@ -15,6 +15,7 @@ from ..library import require
 from ..quality import Limit, Quality
 from ..surface import Surface
 from .allocated import allocate
+from .corrected import correct
 from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
 from .losses import at_holes
 from .measured import measure
@@ -138,11 +139,15 @@ def _stages(prepared: Prepared, lattices: Lattices, progress: _Progress) -> byte
     quantized = quantize(transformed, lambda done: progress(0.1 + 0.2 * done))
     del transformed  # the lattice coordinates of all points
     allocated = allocate(quantized)
+    del quantized  # the coefficients of large units
     progress(0.4)
     measured = measure(allocated, lambda done: progress(0.4 + 0.4 * done))
-    del allocated  # what a reader knows in the end, which takes as much as the coder that writes it
+    del allocated  # what a reader knows in the end
+    progress(0.7)
+    corrected = correct(measured)
+    del measured  # what a reader has reconstructed in the end
     progress(0.8)
-    return write(measured)
+    return write(corrected)
 
 
 def _progressive(surface: Surface, quality: Quality, progress: _Progress) -> bytes:

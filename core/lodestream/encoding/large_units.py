@@ -6,10 +6,13 @@ much; and on a few surfaces the neighbours in the same plane tell more than thos
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from ..entropy.tile_coder import Channel, TileCoder
 from ..entropy.tiles import TileTable
+from ..parallel import spread
 from ..quantization.band_steps import Quantiser
 
 __all__ = ["large_level"]
@@ -29,11 +32,11 @@ def large_level(tables: list[TileTable], channels: list[Channel], geometric: int
         return 0
     tiles = layout.tiles_of(layout.levels)
     tried = [tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)]
-    sizes = []
-    for large in (level, 0):
-        coder = TileCoder(tables, channels, geometric, quantiser, large)
-        sizes.append(sum(_size(coder, tile, channel, channels[channel]) for channel in coded for tile in set(tried)))
-    return level if sizes[0] <= _MOST * sizes[1] else 0
+    coders = [TileCoder(tables, channels, geometric, quantiser, large) for large in (level, 0)]
+    units = itertools.product(coders, sorted(set(tried)), coded)
+    sizes = spread(lambda unit: _size(*unit, channels[unit[2]]), units)
+    half = len(sizes) // 2
+    return level if sum(sizes[:half]) <= _MOST * sum(sizes[half:]) else 0
 
 
 def _size(coder: TileCoder, tile: int, number: int, channel: Channel) -> int:

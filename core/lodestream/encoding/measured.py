@@ -1,17 +1,19 @@
-"""The fifth stage: the error of what a receiver shows after each layer and level, and the residual of the last."""
+"""The fifth stage: the error of what a receiver shows after each layer and level."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
-from ..decoding.reconstruction import Coordinates, Values, initial_state, reconstruct_channel, to_values
+from ..decoding.reconstruction import Coordinates, initial_state, reconstruct_channel
 from ..entropy.tile_coder import Strings
+from ..parallel import spread, threads
 from ..planning.window_errors import is_divided, layer_codes, no_errors
 from ..quantization.distortion import Original, coordinate_distances, other_originals
 from ..transform.pyramid import PADDING
@@ -19,14 +21,16 @@ from .allocated import Allocated, State
 from .holes import given_arrays
 from .prepared import Prepared
 from .quantized import Quantized
-from .residual_encoder import chunk_size, encode_chunks
+from .states import StateReconstructor
 
 __all__ = ["Measured", "MeasuredLayer", "all_passes", "measure"]
 
-#: Room for a reconstruction, see `Prepared.canvases`.
-Canvases = list[NDArray[np.int32]]
+#: Canvases of several threads have at most so many points together, unless one alone has more.
+_POINTS = 1 << 23
 #: For each patch, sums and largest of the squared distances in cells, see `coordinate_distances`.
 Cells = list[NDArray[np.float64]]
+#: Of one state.
+Found = tuple[Errors, Cells]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,22 +54,22 @@ class MeasuredLayer:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """All that the container tells, but for the coded passes.
+    """What receivers will see.
 
     Attributes
     ----------
     quantized : Quantized
     header : Header
-        With the size of chunks.
+        With the largest chunks; their size is chosen with the residual.
     strings : dict
         The bytes of large units, see `TileCoder`.
     layers : tuple of MeasuredLayer
     levels : tuple of Errors
-        Of the states that hold all levels up to one; the last of them is the complete surface, residual included.
-    chunks : tuple of bytes
-        The residual, see `encode_chunks`.
-    exact : tuple of bool, one for each channel
-        Whether it comes back bit for bit.
+        Of the states that hold all levels up to one, but for the last level.
+    last : tuple of Coordinates, one for each channel
+        What a receiver has reconstructed after the last layer.
+    coefficient_bytes : float
+        See `Allocated`.
     """
 
     quantized: Quantized
@@ -73,8 +77,8 @@ class Measured:
     strings: Strings
     layers: tuple[MeasuredLayer, ...]
     levels: tuple[Errors, ...]
-    chunks: tuple[bytes, ...]
-    exact: tuple[bool, ...]
+    last: tuple[Coordinates, ...]
+    coefficient_bytes: float
 
 
 def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured:
@@ -90,15 +94,14 @@ def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured
     """
     quantized, header = allocated.quantized, allocated.header
     measuring = _Measuring(allocated)
-    layers, restored = _measured_layers(allocated, measuring)
+    states = _shown(allocated)
+    levels = _level_states(quantized.prepared, header)
+    found = measuring.every([*states[:-1], *levels])
+    found[len(states) - 1 : len(states) - 1] = [measuring.errors(states[-1])]
+    layers = _kept_layers(header, allocated.states, found[: len(states)])
     progress(0.75)
-    chunk = chunk_size(quantized.prepared, header, restored, allocated.coefficient_bytes)
-    header = replace(header, chunk=chunk)
-    chunks, exact = encode_chunks(quantized.prepared, header, restored)
-    del restored  # before the canvases of levels take as much
-    last = _remaining(layers[-1].errors, exact, quantized.prepared.geometric)
-    levels = *_level_errors(quantized.prepared, header, measuring), last
-    return Measured(quantized, header, allocated.strings, tuple(layers), levels, tuple(chunks), tuple(exact))
+    last, told_levels = measuring.coordinates(states[-1]), tuple(errors for errors, _ in found[len(states) :])
+    return Measured(quantized, header, allocated.strings, tuple(layers), told_levels, last, allocated.coefficient_bytes)
 
 
 def all_passes(quantized: Quantized) -> State:
@@ -114,42 +117,70 @@ class _Measuring:
         self._header, self._tiles = allocated.header, allocated.tiles
         self._prepared, self._lattices = quantized.prepared, quantized.lattices.channels
         self._others = _others(quantized.prepared) if len(self._lattices) > 1 else []
+        self._own = self._reconstructor()
 
-    def errors(self, state: State, canvases: Canvases, cells: Cells | None = None) -> Errors:
-        """Errors of what a receiver shows in this state, as a container tells them.
+    def _reconstructor(self) -> StateReconstructor:
+        return StateReconstructor(self._header, self._tiles)
+
+    def every(self, states: Sequence[State]) -> list[Found]:
+        """Errors of many states, see `errors`, by several threads: each has canvases of its own."""
+        together = max(1, min(threads(), _POINTS // self._prepared.layout.points(self._prepared.layout.levels)))
+        numbers, lock = iter(range(len(states))), Lock()
+        found: list[Found | None] = [None] * len(states)
+
+        def work(reconstructor: StateReconstructor) -> None:
+            while True:
+                with lock:
+                    number = next(numbers, None)
+                if number is None:
+                    return
+                found[number] = self.errors(states[number], reconstructor)
+
+        spread(work, [self._own, *(self._reconstructor() for _ in range(together - 1))])
+        return [errors for errors in found if errors is not None]
+
+    def errors(self, state: State, reconstructor: StateReconstructor | None = None) -> Found:
+        """Errors of what a receiver shows in this state, as a container tells them, and the distances in cells.
 
         Parameters
         ----------
         state : int8, shape (tile, channel)
-        canvases : see `Prepared.canvases`
-            What is reconstructed: the coordinates, unless other channels took the place of the first.
-        cells : list, optional
-            Is given the distances in cells, see `coordinate_distances`.
+        reconstructor : StateReconstructor, optional
+            By default the one from which `restored` takes the last of these states.
         """
+        reconstructor = reconstructor or self._own
         prepared, geometric = self._prepared, self._prepared.geometric
-        fractions = [self._reconstructed_into(canvases, k, k, state) for k in range(geometric)]
-        shown = canvases[prepared.interfaces :]
+        shown = reconstructor.canvases[prepared.interfaces :]
+        fractions = [reconstructor.reconstruct(k, k, np.ascontiguousarray(state[:, k])) for k in range(geometric)]
+        cells: Cells = []
         distances, *found = coordinate_distances(
             prepared.originals, self._lattices[:geometric], shown, fractions, cells=cells
         )
         if len(self._lattices) > 1:
             found = found or [distances]
         for number, (originals, component) in enumerate(self._others, geometric):
-            fraction = self._reconstructed_into(canvases, 0, number, state)
+            fraction = reconstructor.reconstruct(0, number, np.ascontiguousarray(state[:, number]))
             own = [canvas[:1] for canvas in shown]
             found += coordinate_distances(originals, [self._lattices[number]], own, [fraction], component)
         channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in found)
-        return Errors(told(distances[0]), told(distances[1]), channels)
+        return Errors(told(distances[0]), told(distances[1]), channels), cells
 
-    def reconstructed(self, channel: int, state: State, canvases: Canvases | None = None) -> Coordinates:
-        """One channel in a state, see `reconstruct_channel`."""
-        levels = self._prepared.layout.levels
-        return reconstruct_channel(self._header, channel, self._tiles[channel], state[:, channel], levels, canvases)
+    def coordinates(self, state: State) -> tuple[Coordinates, ...]:
+        """All channels in the state whose errors were measured last.
 
-    def _reconstructed_into(self, canvases: Canvases, place: int, channel: int, state: State) -> int:
-        """Reconstruct a channel into the canvases of a coordinate; it stands over two to the power returned."""
-        places = [canvas[place, :, : -PADDING or None] for canvas in canvases]
-        return self.reconstructed(channel, state, places)[1]
+        The canvases hold it, unless attributes took the place of coordinates.
+        """
+        geometric, channels = self._prepared.geometric, len(self._lattices)
+        shared = geometric if channels == geometric else 0
+        canvases = self._own.canvases
+        known: list[Coordinates] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
+        known += [
+            reconstruct_channel(
+                self._header, number, self._tiles[number], state[:, number], self._prepared.layout.levels
+            )
+            for number in range(shared, channels)
+        ]
+        return tuple(known)
 
 
 def _others(prepared: Prepared) -> list[tuple[list[Original], int]]:
@@ -159,61 +190,46 @@ def _others(prepared: Prepared) -> list[tuple[list[Original], int]]:
     return other_originals(prepared.arrangement, arrays, [block.mask for block in blocks], prepared.geometric)
 
 
-def _measured_layers(allocated: Allocated, measuring: _Measuring) -> tuple[list[MeasuredLayer], list[Values]]:
-    """The layers that lower the RMS error, and the last one; and the values of each block after that."""
-    quantized, header, states = allocated.quantized, allocated.header, allocated.states
-    canvases = quantized.prepared.canvases()
-    start, announced = initial_state(header), all_passes(quantized)
-    layers: list[MeasuredLayer] = []
-    for state in states:
-        complete = state is states[-1]
-        shown = state if complete else np.where(state < announced, state, start)
-        cells: Cells = []
-        errors = measuring.errors(shown.astype(np.int8), canvases, cells)
-        if complete:
-            while layers and errors.rms > layers[-1].errors.rms:
-                layers.pop()
-        elif layers and errors.rms > layers[-1].errors.rms:
-            continue
-        layers.append(MeasuredLayer(state, errors, _window_codes(header, errors, cells)))
-    return layers, _restored(quantized, header, measuring, states[-1], canvases)
+def _shown(allocated: Allocated) -> list[State]:
+    """What a receiver knows after each layer; tiles of which it has heard nothing are `UNANNOUNCED` until the last."""
+    start, announced = initial_state(allocated.header), all_passes(allocated.quantized)
+    shown = [np.where(state < announced, state, start).astype(np.int8) for state in allocated.states[:-1]]
+    return [*shown, allocated.states[-1]]
 
 
-def _restored(
-    quantized: Quantized, header: Header, measuring: _Measuring, last: State, canvases: Canvases
-) -> list[Values]:
-    """The values of each block in the last state, whose reconstruction the canvases hold.
-
-    They do so unless attributes took the place of coordinates.
-    """
-    geometric, channels = quantized.prepared.geometric, len(quantized.channels)
-    shared = geometric if channels == geometric else 0
-    known: list[Coordinates] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
-    known += [measuring.reconstructed(number, last) for number in range(shared, channels)]
-    return to_values(header, known, quantized.prepared.layout.levels)
-
-
-def _window_codes(header: Header, errors: Errors, cells: Cells) -> NDArray[np.uint8] | None:
-    """Errors of the cells of a layer, where there are several and they can be told."""
-    if header.arrangement is not None or not is_divided(header):
-        return None
-    if not errors.maximum:
-        return no_errors(header)
-    return layer_codes(cells[0], header) if cells else None
-
-
-def _remaining(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
-    """The errors of the complete surface, of which some channels are exact."""
-    channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
-    return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)
-
-
-def _level_errors(prepared: Prepared, header: Header, measuring: _Measuring) -> list[Errors]:
-    """Errors of the states that hold all levels up to one, but for the last."""
-    canvases, start = prepared.canvases(), initial_state(header)
-    errors = []
+def _level_states(prepared: Prepared, header: Header) -> list[State]:
+    """The states that hold all levels up to one, but for the last."""
+    start, states = initial_state(header), []
     for level in range(prepared.layout.levels):
         state = start.copy()
         state[: prepared.layout.tiles_of(level).stop] = 0
-        errors.append(measuring.errors(state, canvases))
-    return errors
+        states.append(state)
+    return states
+
+
+def _kept_layers(header: Header, states: Sequence[State], found: Sequence[Found]) -> list[MeasuredLayer]:
+    """The layers that lower the RMS error, and the last one."""
+    kept: list[int] = []
+    rms = [errors.rms for errors, _ in found]
+    for number in range(len(states)):
+        if number == len(states) - 1:
+            while kept and rms[number] > rms[kept[-1]]:
+                kept.pop()
+        elif kept and rms[number] > rms[kept[-1]]:
+            continue
+        kept.append(number)
+    codes = _window_codes(header, [found[number] for number in kept])
+    return [MeasuredLayer(states[number], found[number][0], own) for number, own in zip(kept, codes, strict=True)]
+
+
+def _window_codes(header: Header, found: Sequence[Found]) -> list[NDArray[np.uint8] | None]:
+    """Errors of the cells of each layer, where there are several and they can be told; None otherwise."""
+    if header.arrangement is not None or not is_divided(header):
+        return [None] * len(found)
+    measured = [cells[0] for errors, cells in found if errors.maximum and cells]
+    codes = layer_codes(np.stack(measured), header) if measured else np.zeros(0, np.uint8)
+    own = iter([None] * len(measured) if codes is None else codes)
+    return [
+        next(own) if errors.maximum and cells else None if errors.maximum else no_errors(header)
+        for errors, cells in found
+    ]

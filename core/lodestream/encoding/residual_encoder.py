@@ -11,6 +11,7 @@ import numpy as np
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..decoding.reconstruction import Values
+from ..parallel import spread
 from ..residual import chunk_coder
 from ..surface import Block, Surface
 from .holes import given_channel
@@ -36,8 +37,12 @@ def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) ->
         What comes back without these chunks.
     """
     coder = _ChunkCoder(prepared, header, restored)
-    chunks = [coder.code(window) for window in chunk_places(header)]
-    return chunks, coder.exact
+    windows = list(chunk_places(header))
+    coded = spread(coder.code, windows)
+    exact = [True] * header.channels
+    for window, (_, whole) in zip(windows, coded, strict=True):
+        exact[window.channel] &= whole
+    return [chunk for chunk, _ in coded], exact
 
 
 def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
@@ -63,18 +68,18 @@ def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coeff
     for chunk in prepared.chunks:
         tried = replace(header, chunk=chunk)
         coder = _ChunkCoder(prepared, tried, restored)
-        inside = (
+        inside = [
             window
             for window in chunk_places(tried)
             if starts[0] <= window.rows[0] < stops[0] and starts[1] <= window.columns[0] < stops[1]
-        )
-        costs.append(sum(len(coder.code(window)) + _TABLES for window in inside) / share)
+        ]
+        costs.append(sum(len(chunk) + _TABLES for chunk, _ in spread(coder.code, inside)) / share)
     most = min(costs) + _WORTH * (min(costs) + coefficients)
     return next(chunk for chunk, cost in zip(prepared.chunks, costs, strict=True) if cost <= most)
 
 
 class _ChunkCoder:
-    """Makes chunks; ``exact`` says of each channel whether it is exact with those so far."""
+    """Makes chunks."""
 
     def __init__(self, prepared: Prepared, header: Header, restored: list[Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
@@ -83,10 +88,9 @@ class _ChunkCoder:
         for kind in prepared.kinds:
             rough += [kind.name in prepared.attribute_precisions] * kind.channels
         self._rough = rough
-        self.exact = [True] * header.channels
 
-    def code(self, window: ChunkPlace) -> bytes:
-        """One chunk."""
+    def code(self, window: ChunkPlace) -> tuple[bytes, bool]:
+        """One chunk, and whether its values are exact then."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]
         mask = prepared.kept[window.block] if window.kept else block.mask
@@ -95,14 +99,15 @@ class _ChunkCoder:
         known = self._restored[window.block].window(window)
         chosen = slice(None) if mask is None else mask
         wanted, known = (np.ascontiguousarray(v[chosen]).ravel() for v in (wanted, known))
+        exact = True
         if self._rough[channel] and not window.kept:
             if wanted.dtype.kind == "f":
                 given, wanted = wanted, np.where(np.isfinite(wanted), known, wanted)
             else:
                 given, wanted = wanted, known
-            self.exact[channel] &= chunk_coder.agree(given, wanted)
+            exact = chunk_coder.agree(given, wanted)
         step = self._header.lattices[channel].step if wanted.dtype == np.float32 else None
-        return chunk_coder.encode_chunk(wanted, known, step)
+        return chunk_coder.encode_chunk(wanted, known, step), exact
 
 
 def as_returned(surface: Surface, hole: int) -> Iterator[Block]:

@@ -11,6 +11,7 @@ from ..container.writer import CodedLayer, CodedSegment, write_container
 from ..entropy.tile_coder import TileCoder
 from ..planning.window_errors import KIND as WINDOW_ERRORS
 from ..planning.window_errors import serialize_window_errors
+from .corrected import Corrected
 from .measured import Measured, MeasuredLayer, all_passes
 from .residual_encoder import as_returned
 
@@ -20,15 +21,16 @@ __all__ = ["write"]
 _WINDOWS_SHARE = 0.005
 
 
-def write(measured: Measured) -> bytes:
+def write(corrected: Corrected) -> bytes:
     """The container; if all channels are exact its metadata hold the digest of the values."""
-    given, header = measured.quantized.prepared.given, measured.header
-    lossless = all(measured.exact)
-    metadata = dict(measured.quantized.prepared.surface.metadata)
+    measured, header = corrected.measured, corrected.header
+    prepared = measured.quantized.prepared
+    lossless = all(corrected.exact)
+    metadata = dict(prepared.surface.metadata)
     if lossless:
-        metadata[DIGEST] = values_digest(as_returned(given, header.hole))
+        metadata[DIGEST] = values_digest(as_returned(prepared.given, header.hole))
     layers = _coded(measured)
-    levels, chunks = list(measured.levels), list(measured.chunks)
+    levels, chunks = list(corrected.levels), list(corrected.chunks)
     optional = _window_errors(measured.layers, layers, chunks)
     return write_container(header, layers, levels, chunks, metadata, exact=lossless, optional=optional)
 
@@ -36,7 +38,8 @@ def write(measured: Measured) -> bytes:
 def _coded(measured: Measured) -> list[CodedLayer]:
     """Code the passes that each layer adds."""
     quantized, channels = measured.quantized, list(measured.quantized.channels)
-    tables, geometric, large = list(quantized.tables), quantized.prepared.geometric, measured.header.large
+    geometric, large = quantized.prepared.geometric, measured.header.large
+    tables = [table.of_small(own.true.size) for table, own in zip(quantized.tables, channels, strict=True)]
     coder = TileCoder(tables, channels, geometric, quantized.quantiser, large, measured.strings)
     before = start = all_passes(quantized)
     coded = []

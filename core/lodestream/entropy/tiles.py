@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,16 @@ from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
 from .dequantize import UNANNOUNCED, spread_bands
 
-__all__ = ["TileTable", "Tiles", "gather"]
+__all__ = ["Reading", "Run", "TileTable", "Tiles", "gather"]
 
 #: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
 _NO_PARENT = (1, 0, 31, 31)
 
 #: Where reading: no coefficients that would be written, and no costs.
 _NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
+
+#: Column of a table of runs: where a run's bytes begin, see `bitplanes.code_passes`.
+RUN_START = 5
 
 #: By grid and kind, a tile's bands, where they begin in the flat arrays, and their strides there.
 _Places = dict[tuple[int, int], tuple[Band, int, int]]
@@ -107,9 +111,47 @@ class TileTable:
             np.int64,
         )
 
+    def small_size(self, large: int) -> int:
+        """How long the flat array of coefficients is up to the tile ``large``, the first that is not in it."""
+        if self.first[large] == len(self.bands):
+            return self.size
+        row = self.bands[self.first[large]]
+        return int(row[OFFSET] - 2 * row[STRIDE] - 2) + PADDING
+
+    def of_small(self, size: int) -> TileTable:
+        """The same places in flat arrays that end after so many coefficients, see `small_size`."""
+        return replace(self, size=size)
+
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""
         return self.bands[self.first[tile] : self.first[tile + 1]]
+
+
+class Run(NamedTuple):
+    """Passes of a tile, from ``first`` down to ``last``, with their bytes."""
+
+    tile: int
+    first: int
+    last: int
+    data: bytes
+
+
+class Reading:
+    """Runs of passes that are decoded one after another.
+
+    Readings of different tiles may run at the same time, unless one has a tile whose parent the other one has.
+    """
+
+    def __init__(self, tiles: Tiles, table: NDArray[np.int64], parts: list[bytes]) -> None:
+        self._tiles, self._table, self._parts = tiles, table, parts
+        self._state = np.zeros(PASSES_STATE, np.int64)
+
+    def run(self) -> None:
+        """Decode; after an interruption another call goes on where it was, and once all is done it does nothing."""
+        if self._state[0] < len(self._table):
+            data = np.frombuffer(bytearray().join(self._parts), np.uint8)  # kernels take what can be written
+            self._tiles.code(True, self._table, _NOTHING, data, _FREE, self._state)
+            self._parts = []
 
 
 class Tiles:
@@ -130,18 +172,25 @@ class Tiles:
         self.large = len(table.members) if self.trellis else table.layout.tiles_from(large)
         self.models = new_models(len(table.members), self.trellis, self.large)
 
-    def read(self, runs: Sequence[tuple[int, int, int, bytes]]) -> None:
-        """Decode runs of passes one after another: of each the tile, its first and its last pass, and its bytes."""
-        self.reading(runs)()
+    def read(self, runs: Sequence[Run]) -> None:
+        """Decode runs of passes one after another."""
+        self.readings(runs, [len(runs)])[0].run()
 
-    def reading(self, runs: Sequence[tuple[int, int, int, bytes]]) -> Callable[[], None]:
-        """What does `read` when it is called. If an interruption ends the call, another one goes on where it was."""
-        tile, first, last, length = np.array([(*run[:3], len(run[3])) for run in runs], np.int64).reshape(-1, 4).T
+    def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
+        """What decodes the runs up to each of ``ends``, from the end before it."""
         bands = np.array(self.table.first)
+        lengths = [len(run.data) for run in runs]
+        described = [(run.tile, run.first, run.last, length) for run, length in zip(runs, lengths, strict=True)]
+        tile, first, last, length = np.array(described, np.int64).reshape(-1, 4).T
         count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
-        data = np.frombuffer(b"".join(data for *_, data in runs), np.uint8).copy()  # kernels take what can be written
         table = np.stack([bands[tile], count, tile, first, last, start, length, tile >= self.large], 1)
-        return partial(self.code, True, table, _NOTHING, data, _FREE, np.zeros(PASSES_STATE, np.int64))
+        made, begin = [], 0
+        for end in ends:
+            own = table[begin:end]
+            own[:, RUN_START] -= own[:1, RUN_START].copy()
+            made.append(Reading(self, own, [run.data for run in runs[begin:end]]))
+            begin = end
+        return made
 
     def code(
         self,
@@ -183,6 +232,44 @@ class Tiles:
             chosen = numbers[numbers < last]
             chosen = chosen[state[self.table.origins[chosen, 0]] < UNANNOUNCED]
             self._spread(chosen, state, array, tiles_of(whole).stop)
+
+    def spread_above(
+        self,
+        start: int | None,
+        state: NDArray[np.int8],
+        coefficients: Sequence[NDArray[np.int32]],
+        whole: int,
+        bare: Collection[int] = (),
+    ) -> None:
+        """`spread` all tiles of the levels above ``start``, or of every level: zeros where they were not announced.
+
+        Otherwise as `spread_levels`; what ``coefficients`` (int32 arrays, shape (row, column), one for each grid) hold
+        there does not matter. ``state`` has the shape (tile,). Levels in ``bare`` are passed over.
+        """
+        tiles_of = self.table.layout.tiles_of
+        wanted = np.ones(len(self.table.layout.tiles), np.bool_)
+        wanted[: 0 if start is None else tiles_of(start).stop] = False
+        for level in bare:
+            wanted[slice(tiles_of(level).start, tiles_of(level).stop)] = False
+        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
+            self._spread(numbers[wanted[self.table.origins[numbers, 0]]], state, array, tiles_of(whole).stop)
+
+    def spread_rows(
+        self, numbers: NDArray[np.int64], state: NDArray[np.int8], rows: NDArray[np.int32], first: int, finer: bool
+    ) -> None:
+        """`spread` what some bands have in some rows of a grid, zeros where they were not announced.
+
+        Parameters
+        ----------
+        numbers : int64, shape (band,)
+            In the table.
+        state : int8, shape (tile,)
+        rows : int32, shape (row, column)
+            The grid's coefficients from row ``first`` on.
+        finer : bool
+            They are multiplied by 2**`FRACTION_BITS`.
+        """
+        self._spread(numbers, state, rows, 0 if finer else len(self.table.members), (first, 0))
 
     def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
         """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column).

@@ -216,6 +216,8 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
         To `places`, and from what they become to the points that are also one vertex.
     """
     nothing = Change(np.empty(0, np.int64), np.empty((0, 2), np.int64))
+    if all(block.points.ndim == 2 for block in surface.blocks):
+        return nothing, nothing  # heights lie beside each other
     try:
         numbers = _that_count(numbered_blocks(surface), poles_of(surface))
     except InputError:

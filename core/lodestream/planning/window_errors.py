@@ -113,29 +113,29 @@ def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np
 
 
 def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
-    """The codes of the cells of the only block after a layer, shape (cell, 2).
+    """The codes of the cells of the only block after a layer, or after several at once.
 
     Parameters
     ----------
-    figures : float64, shape (row of parts, column of parts, 2)
+    figures : float64, shape (row of parts, column of parts, 2) or (layer, row of parts, column of parts, 2)
         Sums and largest of the squared distances in parts of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
     header : Header
 
     Returns
     -------
-    uint8 array, or None where an error is larger than codes can tell
+    uint8 array, shape (cell, 2) or (layer, cell, 2), or None where an error is larger than codes can tell
     """
     together = (1 << CELL[0]) // PART_ROWS, (1 << CELL[1]) // PART_COLUMNS
-    places = [np.arange(0, count, size) for count, size in zip(figures.shape, together, strict=False)]
+    places = [np.arange(0, count, size) for count, size in zip(figures.shape[-3:-1], together, strict=True)]
 
     def gathered(combine: np.ufunc, own: Floats) -> Floats:
-        down: Floats = combine.reduceat(own, places[0], axis=0)
-        cells: Floats = combine.reduceat(down, places[1], axis=1)
-        return cells.ravel()
+        down: Floats = combine.reduceat(own, places[0], axis=-2)
+        cells: Floats = combine.reduceat(down, places[1], axis=-1)
+        return cells.reshape(*own.shape[:-2], -1)
 
     counts = _cell_counts(header.shape, CELL, header.masks[0]).ravel()
     rms = np.sqrt(gathered(np.add, figures[..., 0]) / np.maximum(counts, 1))
-    errors = np.stack([rms, np.sqrt(gathered(np.maximum, figures[..., 1]))], axis=1)
+    errors = np.stack([rms, np.sqrt(gathered(np.maximum, figures[..., 1]))], axis=-1)
     known = header.extent * _FRACTIONS[:_NOTHING]
     if errors.max() > known[0]:
         return None  # then no layer gets codes: a bound that is too low would be worse than none

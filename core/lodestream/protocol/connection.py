@@ -27,6 +27,7 @@ from typing import TypeAlias
 
 from ..errors import LocalProtocolError
 from .messages import (
+    BASE_CREDIT,
     MAX_CREDIT,
     MAX_DATA,
     Bye,
@@ -140,6 +141,8 @@ class Connection:
     ----------
     side : Side
         Which end this is.
+    most : int
+        The most credit that the server keeps, `BASE_CREDIT` to `MAX_CREDIT`. A client learns it from the header.
 
     Attributes
     ----------
@@ -147,11 +150,13 @@ class Connection:
         Current state of this side.
     credit : int
         Bytes of `Segments.data` that the server may still send (on the server), or that may still arrive (on the
-        client). From 0 to `MAX_CREDIT`.
+        client). From 0 to `most`.
+    most : int
     """
 
-    def __init__(self, side: Side) -> None:
+    def __init__(self, side: Side, most: int = BASE_CREDIT) -> None:
         self.side = side
+        self.most = most
         self.state = State.IDLE
         self.credit = 0
 
@@ -196,10 +201,12 @@ class Connection:
                 raise MessageError("out-of-turn", f"expected at most {self.credit} bytes, got {len(event.data)}")
             self.credit -= len(event.data)
         elif isinstance(event, Open):
-            self.credit = min(event.credit, MAX_CREDIT)
+            self.credit = min(event.credit, self.most)
         elif isinstance(event, Credit):
             # What goes beyond the cap is forgotten rather than refused: a client that grants generously loses nothing.
-            self.credit = min(self.credit + event.bytes, MAX_CREDIT)
+            self.credit = min(self.credit + event.bytes, self.most)
+        elif isinstance(event, Opened):
+            self.most = min(event.credit or BASE_CREDIT, MAX_CREDIT)
         self.state = moves[type(event)]
         return event
 
@@ -210,7 +217,7 @@ class Connection:
         self.credit -= size
 
     def _grant(self, size: int, least: int) -> None:
-        most = MAX_CREDIT - self.credit
+        most = self.most - self.credit
         if not least <= size <= most:
             raise LocalProtocolError(f"expected {least} to {most} bytes of credit on top of {self.credit}, got {size}")
         self.credit += size

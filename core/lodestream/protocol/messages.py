@@ -14,6 +14,7 @@ from ..errors import RemoteProtocolError
 from ..target import Target
 
 __all__ = [
+    "BASE_CREDIT",
     "CODES",
     "MAX_CREDIT",
     "MAX_DATA",
@@ -48,9 +49,12 @@ MAX_DATA = 64 * 1024
 #: The most bytes of a whole message, either way.
 MAX_MESSAGE = MAX_DATA + 1024
 
-#: The most credit that may be outstanding. TCP buffers hold megabytes before anyone notices; this bounds what a slow
+#: The credit that every server keeps. TCP buffers hold megabytes before anyone notices; credit bounds what a slow
 #: reader has in front of it, and what still arrives after a `stop`.
-MAX_CREDIT = 256 * 1024
+BASE_CREDIT = 256 * 1024
+
+#: The most credit that a server keeps, if its `Opened` says so: enough for 640 Mbit/s over a round trip of 100 ms.
+MAX_CREDIT = 8 * 1024 * 1024
 
 #: What a client has outstanding at least, however slow the link is: below it, messages and their framing cost too much.
 MIN_WINDOW = 16 * 1024
@@ -128,7 +132,7 @@ class Open:
 
     type: ClassVar[str] = "open"
     target: Target = field(default_factory=Target)
-    credit: int = MAX_CREDIT
+    credit: int = BASE_CREDIT
     held: tuple[tuple[int, int], ...] = ()
     container: str | None = None
     token: str | None = field(default=None, repr=False)
@@ -176,6 +180,8 @@ class Opened:
     prefix : bool
         True if the file is sent from its first byte on (cached slices left out), then the metadata. False if the index
         comes first, then slices.
+    credit : int or None
+        The most credit that the server keeps for this stream; None: `BASE_CREDIT`.
     """
 
     type: ClassVar[str] = "header"
@@ -186,6 +192,7 @@ class Opened:
     index: tuple[int, int]
     metadata: tuple[int, int]
     prefix: bool
+    credit: int | None = None
 
 
 @dataclass(frozen=True)

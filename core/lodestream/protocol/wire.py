@@ -17,6 +17,7 @@ import msgpack
 from ..errors import OptionError, UnsupportedVersionError
 from ..target import Region, Target, Tolerance
 from .messages import (
+    BASE_CREDIT,
     MAX_DATA,
     MAX_HELD,
     MAX_MESSAGE,
@@ -55,6 +56,12 @@ def _integer(value: Any, least: int = 0) -> int:
 
 def _positive(value: Any) -> int:
     return _integer(value, 1)
+
+
+def _credit(value: Any) -> int:
+    if type(value) is not int or not BASE_CREDIT <= value <= _MAX_INTEGER:
+        raise _MismatchError(f"an integer from {BASE_CREDIT} to 2^53")
+    return value
 
 
 def _number(value: Any) -> float:
@@ -166,6 +173,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
         "index": _place,
         "metadata": _place,
         "prefix": _flag,
+        "credit": _credit,
     },
     Segments: {"offset": _integer, "data": _data},
     Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _error, "max": _error},
@@ -175,8 +183,9 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
-#: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit.
-_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "token")}
+#: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit, and
+#: servers of earlier releases do not say how much they keep of it.
+_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "token"), (Opened, "credit")}
 #: What is left out where it is not known.
 _UNKNOWN = {(Layer, "rms"), (Layer, "max")}
 

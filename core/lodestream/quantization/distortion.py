@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .. import kernels
 from ..grid.connectivity import Arrangement, stored
 from ..grid.multiblock import VertexCounter
+from ..parallel import spread
 from .lattice import Lattice
 from .measure import distances
 
@@ -22,7 +23,7 @@ Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the seco
 
 #: Points in one call of a kernel, and cells of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
 _AT_ONCE = 1 << 20
-_CELLS = 16
+_CELLS = 64
 _EVERY = np.zeros(0, np.bool_)
 
 
@@ -179,6 +180,8 @@ def coordinate_distances(
         rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
         patches = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
         worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in range(_kinds(len(lattices)))]
+        if worst[0] == 0 and dtype.itemsize < 8:  # squares of narrower types never vanish
+            return [(0.0, 0.0)] * len(worst)
         if 1e-250 < worst[0] < 1e250:
             if cells is not None:
                 cells += [patch[..., 0, :] for patch in patches]
@@ -235,6 +238,8 @@ def _distances(
     counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
     arrays = original.points, coordinates, rules, counted, figures
     shapes = rows, columns, channels, channel, *coordinates.shape[1:]
-    for first in range(0, down * across, _CELLS):
-        kernels.square_distances(*arrays, *shapes, first, min(first + _CELLS, down * across))
+    spread(
+        lambda first: kernels.square_distances(*arrays, *shapes, first, min(first + _CELLS, down * across)),
+        range(0, down * across, _CELLS),
+    )
     return figures

@@ -31,9 +31,9 @@ class Download:
     target : Target
         What to receive, where to stop, and in which order.
     window : int or None
-        Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it
-        is less than what the link carries in one round trip, the link is idle at times. None: a `FlowWindow` measures
-        the link; this needs times.
+        Bytes that may be in flight at once, 1 to `MAX_CREDIT`, as far as the server keeps so much credit. Up to this
+        many bytes still arrive after `stop`. If it is less than what the link carries in one round trip, the link is
+        idle at times. None: a `FlowWindow` measures the link; this needs times.
     reception : ReceiverState or None
         What has arrived over other connections; its target is used then.
 
@@ -247,6 +247,8 @@ class Download:
         self.answer = event
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
+        self.window.allow(self._connection.most)
+        self._grant(now)
         self.reception.identify(event.container, event.size)
         return [*self.reception.expect(event.planned, event.index, event.metadata, event.prefix)]
 
@@ -255,12 +257,14 @@ class Download:
         shown = not stopped or self._turning
         views = self.reception.take(event.offset, event.data)
         self.window.arrive(len(event.data), now)
-        grant = self.window.size - self._connection.credit
-        # Four grants a window: fewer would leave the link idle between them, more would be chatter.
-        if not stopped and grant > 0 and grant * 4 >= self.window.size:
+        self._grant(now)
+        return [*views] if shown else []
+
+    def _grant(self, now: float | None) -> None:
+        grant = self.window.due(self._connection.credit)
+        if grant and self._connection.state is State.STREAMING:
             self._outbox.append(self._connection.send(Credit(grant)))
             self.window.grant(grant, now)
-        return [*views] if shown else []
 
 
 def _largest(reception: ReceiverState) -> tuple[tuple[int, int], ...]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..errors import RemoteError, RemoteProtocolError, TruncatedStreamError
-from ..protocol.messages import MAX_CREDIT, MIN_WINDOW
+from ..protocol.messages import BASE_CREDIT, MIN_WINDOW
 from .receiver_state import ReceiverState
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ __all__ = ["RangeDownload", "RangeRequest"]
 # file, hold index and metadata of most. Where they do not, one more request brings the rest.
 _HEAD = 4096
 _FIRST = MIN_WINDOW
-_FIRST_MOST = MAX_CREDIT
+_FIRST_MOST = BASE_CREDIT
 _TAIL_SHARE = 512
 _TAIL_LEAST = 2048
 _TAIL_MOST = 64 * 1024
@@ -255,7 +255,7 @@ class RangeDownload:
         round_trip, seconds = self._answered_at - self._asked_at, now - self._answered_at
         if got >= MIN_WINDOW and round_trip > 0:
             rate = got / max(seconds, round_trip)
-            self._gap = round(min(max(rate * round_trip, MIN_WINDOW), MAX_CREDIT))
+            self._gap = round(min(max(rate * round_trip, MIN_WINDOW), BASE_CREDIT))
 
     def _check_same(self, headers: Mapping[str, str], status: int) -> None:
         etag = headers.get("etag", "")

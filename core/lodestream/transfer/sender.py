@@ -12,13 +12,27 @@ from ..planning.byte_ranges import RangeSet
 from ..planning.plan import Mark, Plan
 from ..planning.planner import plan
 from ..protocol.connection import Connection, Side, State
-from ..protocol.messages import CODES, MAX_DATA, End, Error, Event, Layer, MessageError, Open, Opened, Segments, Stop
+from ..protocol.flow_control import SMALL_MESSAGE
+from ..protocol.messages import (
+    BASE_CREDIT,
+    CODES,
+    MAX_DATA,
+    End,
+    Error,
+    Event,
+    Layer,
+    MessageError,
+    Open,
+    Opened,
+    Segments,
+    Stop,
+)
 
 __all__ = ["Sender"]
 
-# A message takes a quarter of the most credit that there was, but not so little that its framing counts.
-_SHARES = 4
-_LEAST = 4096
+# A message takes this part of the most credit that there was, but not so little that its framing counts: nothing is
+# granted again for a message before all of it has come.
+_SHARES = 16
 
 
 class Sender:
@@ -34,6 +48,8 @@ class Sender:
         Index of the container.
     container : str
         SHA-256 of the container, in hexadecimal digits.
+    credit : int
+        The most credit that is kept of what the client grants, `BASE_CREDIT` to `MAX_CREDIT`.
 
     Attributes
     ----------
@@ -47,14 +63,14 @@ class Sender:
         Why the stream ended, once it has.
     """
 
-    def __init__(self, index: Index, container: str) -> None:
+    def __init__(self, index: Index, container: str, credit: int = BASE_CREDIT) -> None:
         self.sent = 0
         self.layers = 0
         self.cached = RangeSet()
         self.why: str | None = None
         self._index = index
         self._container = container
-        self._connection = Connection(Side.SERVER)
+        self._connection = Connection(Side.SERVER, credit)
         self._outbox: deque[Event] = deque()
         self._slices: deque[ByteRange] = deque()
         self._marks: deque[tuple[int, Mark]] = deque()  # by bytes provided
@@ -121,10 +137,9 @@ class Sender:
             return None
         # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
         until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
-        # Nothing is granted again for a message before all of it has come: several of them keep a small window going.
         credit = self._connection.credit
         self._window = max(self._window, credit)
-        share = min(credit, max(self._window // _SHARES, _LEAST))
+        share = min(credit, max(self._window // _SHARES, SMALL_MESSAGE))
         slice_ = self._slices[0]
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
 
@@ -174,6 +189,7 @@ class Sender:
                 (index.index.offset, index.index.length),
                 (index.metadata.offset, index.metadata.length),
                 chosen.prefix,
+                None if self._connection.most == BASE_CREDIT else self._connection.most,
             )
         )
         self._end_if_done()

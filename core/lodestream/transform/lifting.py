@@ -54,18 +54,21 @@ def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor
     ValueError
         Where step and shape do not fit each other.
     """
-    _step(values, axis, step, predictor, False)
+    _step(values, axis, step, predictor, 0)
 
 
-def inverse_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
+def inverse_step(
+    values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], bare: bool = False
+) -> None:
     """Undo `forward_step` in place, on shape (row, column).
 
-    What comes out is within +-`CLAMP`, for any magnitudes below 2^29.
+    What comes out is within +-`CLAMP`, for any magnitudes below 2^29. ``bare``: all details are 0, whatever stands in
+    their places.
     """
-    _step(values, axis, step, predictor, True)
+    _step(values, axis, step, predictor, kernels.LIFT_BARE if bare else 1)
 
 
-def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: bool) -> None:
+def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: int) -> None:
     if not step.midpoints:
         return
     # A transposed or reversed view: the kernel takes rows with their samples side by side.

@@ -7,7 +7,7 @@ needs are made by a forward step of the interface's points. Interfaces are there
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ __all__ = [
     "forward",
     "inverse",
     "inverse_level",
+    "refine",
     "synthesis_norms",
     "take_details",
     "take_nodes",
@@ -109,6 +110,8 @@ def inverse(
     level: int,
     whole: int | None = None,
     coordinate: bool = True,
+    start: int | None = None,
+    bare: Collection[int] = (),
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
@@ -120,35 +123,45 @@ def inverse(
     would only add errors of its own from level to level.
 
     Of a channel that is no ``coordinate`` no side comes from an interface, and interfaces mean nothing.
+
+    With ``start``, the arrays hold the grids of that level already, as this leaves them there with the same ``whole``.
+    Details of the levels in ``bare`` are 0, whatever stands in their places; none where sides come from interfaces.
     """
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
-    if coordinate:
+    if coordinate and start is None:
         take_nodes(arrays, layout)
-    for finer in range(1, level + 1):
+    for finer in range((start or 0) + 1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
-                # The first level with details missing: from here on in eighths, clipped to what the kernel takes.
-                corner = _corner(arrays[k], layout.shape(k, whole))
-                np.clip(corner, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=corner)
-                corner <<= FRACTION_BITS
+                refine(_corner(arrays[k], layout.shape(k, whole)))  # the first level with details missing
             if coordinate:
                 take_details(arrays, layout, predictors, k, finer)
-            inverse_level(arrays[k], layout, predictors, k, finer)
+            inverse_level(arrays[k], layout, predictors, k, finer, finer in bare)
+
+
+def refine(nodes: NDArray[np.int32]) -> None:
+    """Turn lattice steps into steps over 2**`FRACTION_BITS`, in place, clipped to what the kernel takes.
+
+    ``nodes`` has the shape (row, column).
+    """
+    np.clip(nodes, -(CLAMP >> FRACTION_BITS), CLAMP >> FRACTION_BITS, out=nodes)
+    nodes <<= FRACTION_BITS
 
 
 def inverse_level(
-    array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int
+    array: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8], number: int, level: int, bare: bool = False
 ) -> None:
     """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place.
 
-    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2).
+    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2). ``bare``: the details
+    are 0, whatever stands in their places.
     """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in (1, 0):  # the forward transform's axes in reverse: rounding makes the order matter
         if steps[axis].midpoints:
-            inverse_step(
-                corner, axis, steps[axis], predictor(predictors, layout.grids[number], steps[axis], level, axis)
-            )
+            rule = predictor(predictors, layout.grids[number], steps[axis], level, axis)
+            known = corner[: steps[0].coarse] if bare and axis == 1 else corner
+            inverse_step(known, axis, steps[axis], rule, bare)
 
 
 def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:

@@ -21,6 +21,8 @@ from typing import Any
 from fastapi import Request
 from starlette.types import Message, Receive
 
+from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
+
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
 from .access import Caller
@@ -32,6 +34,9 @@ _STRIDE = 16 << 20
 
 # What stays free where the settings say nothing, unless the disk is small.
 _KEPT = 1 << 30
+
+# Part of the memory left for streams that one more of them gets.
+_STREAM_SHARE = 8
 
 # What an upload may still take when the server is told to end.
 _LAST_SECONDS = 2.0
@@ -71,14 +76,18 @@ class Limits:
         self._kept = kept
         self._alone = alone
         self._streams: Counter[str] = Counter()
+        self._credit = 0  # beyond the least, of all streams
         self._openings: Counter[str] = Counter()
         self._uploads: dict[asyncio.Timeout, str] = {}  # and whose they are
         self._promised: Counter[str] = Counter()  # bytes, by caller
         self._taken: Counter[str | None] = Counter()  # bytes of uploads under way, by owner
 
     @contextmanager
-    def stream(self, client: str) -> Iterator[None]:
-        """Count an open stream for the length of the block.
+    def stream(self, client: str) -> Iterator[int]:
+        """Count an open stream for the length of the block; yields the most credit that is kept for it.
+
+        What goes beyond `BASE_CREDIT` is an eighth of what the memory for streams has left, so that all streams
+        together never have more than that.
 
         Parameters
         ----------
@@ -98,9 +107,12 @@ class Limits:
         if self._streams[client] >= most_each:
             raise TooManyError(f"expected at most {most_each} streams of one client at the same time; end one of them")
         self._streams[client] += 1
+        more = min((self._settings.memory_of_streams - self._credit) // _STREAM_SHARE, MAX_CREDIT - BASE_CREDIT)
+        self._credit += more
         try:
-            yield
+            yield BASE_CREDIT + more
         finally:
+            self._credit -= more
             _subtract(self._streams, client, 1)
 
     @contextmanager

@@ -38,6 +38,7 @@ from typing import Any, NoReturn, get_type_hints
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
+from lodestream import parallel
 from lodestream.confinement import Rights, confine
 
 __all__ = ["Allowed", "main", "receive_exactly", "resolve"]
@@ -48,6 +49,9 @@ _MOST_FILES = 256
 _MOST_SECONDS = 2.0**31
 
 _TRACEBACK = 20_000
+
+# A process that computes gets a third of what one without this gets of a processor that both want.
+_NICE = 5
 
 
 @dataclass(frozen=True)
@@ -62,11 +66,13 @@ class Allowed:
         A folder that it may write to, also used for temporary files.
     processes : bool
         Whether it may start processes; each has the same limits.
+    threads : int
+        Threads of the kernels.
     memory : int or None
         Bytes of private writable memory; code and files mapped for reading do not count. Beyond it the process gets
         MemoryError or ends.
     seconds : float or None
-        Processor time.
+        Processor time of each thread.
     file_bytes : int or None
         Largest file that it may write.
     """
@@ -74,6 +80,7 @@ class Allowed:
     read: tuple[Path, ...] = ()
     write: Path | None = None
     processes: bool = False
+    threads: int = 1
     memory: int | None = None
     seconds: float | None = None
     file_bytes: int | None = None
@@ -286,11 +293,13 @@ def _limit(allowed: Allowed) -> None:
             most = most if hard == resource.RLIM_INFINITY else min(most, hard)
             resource.setrlimit(kind, (most, most))
     if allowed.seconds is not None:
-        most = math.ceil(min(time.process_time() + allowed.seconds, _MOST_SECONDS))
+        most = math.ceil(min(time.process_time() + allowed.threads * allowed.seconds, _MOST_SECONDS))
         # Told so by SIGXCPU; who does not listen is killed.
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
     write = () if allowed.write is None else (allowed.write,)
-    confine(Rights(allowed.read, write, allowed.processes))
+    os.environ[parallel.VARIABLE] = str(allowed.threads)
+    os.nice(_NICE)  # streams come first
+    confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))
 
 
 def resolve(name: str) -> Callable[..., Any]:

@@ -131,7 +131,7 @@ class Builder:
         self._storage = storage
         self._settings = settings
         self._finished = finished
-        self._memory = settings.memory_of_build
+        self._memory, self._threads = settings.memory_of_build, settings.threads_of_build
         self.fork_server = ForkServer(worker.preload)
         self._pool = Pool(settings.workers, self.fork_server)
         self._turns = Turns(settings.workers, _REMEMBERED)
@@ -389,7 +389,7 @@ class Builder:
         folder = self._storage.work_folder(record.id)
         job = self._job(record, folder)
         begun = await asyncio.to_thread(_identities, job.files)
-        allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory)
+        allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
         # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
         call = Call(worker.build, (job,), self._settings.build_seconds, partial(make_folder, folder), allowed)
         self._running[record.id] = _Running(folder, call)
@@ -493,7 +493,7 @@ async def _removed(folder: Path) -> None:
         raise
 
 
-def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:
+def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:
     """What the process of a build may touch and take."""
     from lodestream.formats import sniff
 
@@ -507,6 +507,7 @@ def _allowed(job: worker.Job, size: int, memory: int) -> Allowed:
         read=job.files,
         write=job.folder,
         processes=process,
+        threads=threads,
         memory=memory,
         # No container is longer than what it was made of takes in memory, and one that was uploaded is copied.
         file_bytes=max(memory, size) + (1 << 20),

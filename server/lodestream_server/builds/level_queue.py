@@ -348,7 +348,7 @@ class LevelQueue:
         advice = "ask for a coarser level, or stream the surface"
         seconds = self._settings.level_seconds
         try:
-            call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings.memory_of_levels))
+            call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings))
             made: MadeLevel | RefusedLevel = await self._pool.run(call)
         except TimeoutError:
             raise TooLargeError(f"expected a level that is made within {seconds:g} s; {advice}") from None
@@ -391,9 +391,15 @@ class LevelQueue:
         return FullError(f"expected disk space for a level, got {most} bytes; delete surfaces or enlarge the disk")
 
 
-def _allowed(wanted: LevelJob, memory: int) -> Allowed:
+def _allowed(wanted: LevelJob, settings: Settings) -> Allowed:
     """What the process that makes a level may touch and take: a stranger may have written the container."""
-    return Allowed((wanted.container,), wanted.folder, memory=memory, file_bytes=wanted.most_bytes)
+    return Allowed(
+        (wanted.container,),
+        wanted.folder,
+        threads=settings.threads_of_build,
+        memory=settings.memory_of_levels,
+        file_bytes=wanted.most_bytes,
+    )
 
 
 def _checked_size(wanted: LevelJob, made: MadeLevel) -> int:

@@ -57,10 +57,18 @@ class Bounds(BaseModel):
         "that is less",
     )
     max_builds: int = _count(1000, "builds that wait or run")
+    stream_memory: int | None = _follows(
+        0,
+        "bytes that all streams together may have under way to clients, in buffers of the system, beside the 256 KiB "
+        "that each of them may have in any case: a quarter of `memory`; a stream gets an eighth of what is left, at "
+        "most 8 MiB",
+    )
     build_memory: int | None = _follows(
         256 << 20, "memory of one build: `memory` divided by `workers`, but at least 512 MiB"
     )
-    build_seconds: float = _seconds(3600.0, "seconds that one build may take, by the clock and in processor time")
+    build_seconds: float = _seconds(
+        3600.0, "seconds that one build may take, by the clock, and in processor time for each of its threads"
+    )
     level_seconds: float = _seconds(120.0, "seconds that making one level as a file may take")
     idle_seconds: float = _seconds(
         60.0, "seconds for which a client may send nothing of an upload, do nothing in a stream, or not read its answer"

@@ -51,6 +51,7 @@ class Settings(Bounds):
     upload_bytes: int = _field("upload_bytes")
     keep_free: int | None = _field("keep_free")
     workers: int = _field("workers")
+    threads: int | None = _field("threads")
     memory: int | None = _field("memory")
     log_format: str = _field("log_format")
     log_level: str = _field("log_level")
@@ -93,9 +94,19 @@ class Settings(Bounds):
         return each if self.build_memory is None else self.build_memory
 
     @property
+    def threads_of_build(self) -> int:
+        """Threads of one build, and of the process that makes level files."""
+        return max((os.cpu_count() or 1) // self.workers, 1) if self.threads is None else self.threads
+
+    @property
     def memory_of_levels(self) -> int:
         """Bytes of memory that the process that makes level files may use."""
         return max(self._memory // 2, _LEAST_LEVEL_MEMORY) if self.level_memory is None else self.level_memory
+
+    @property
+    def memory_of_streams(self) -> int:
+        """Bytes that all streams together may have under way, beside what each of them may have in any case."""
+        return self._memory // 4 if self.stream_memory is None else self.stream_memory
 
     @property
     def _memory(self) -> int:

@@ -312,6 +312,16 @@ _SETTINGS = (
         usual="the number of processors less one",
     ),
     Setting(
+        "threads",
+        _INTEGER,
+        None,
+        "threads of each build, and of the process that makes levels as files",
+        "limits",
+        1,
+        256,
+        usual="the number of processors divided by that of builds at the same time, at least 1",
+    ),
+    Setting(
         "memory",
         _SIZE,
         None,

@@ -94,11 +94,12 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
-        with parts.limits.stream(caller.key):
+        with parts.limits.stream(caller.key) as credit:
             record = ready(parts, surface)
             with still_there(parts, surface):
                 container = await asyncio.to_thread(parts.containers.open, record.container or "")
-            await _stream(_Session(socket, container, parts, first, caller), surface, caller)
+            sender = Sender(container.index, container.sha256, credit)
+            await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
         return
     except LodestreamError as error:
@@ -169,7 +170,13 @@ class _Session:
     """
 
     def __init__(
-        self, socket: WebSocket, container: OpenContainer, parts: Parts, first: bytes | None, caller: Caller
+        self,
+        socket: WebSocket,
+        container: OpenContainer,
+        sender: Sender,
+        parts: Parts,
+        first: bytes | None,
+        caller: Caller,
     ) -> None:
         self.result = "lost"
         self.first_surface: float | None = None
@@ -183,7 +190,7 @@ class _Session:
         self._container = container
         self._settings = parts.settings
         self._storage = parts.storage
-        self._sender = Sender(container.index, container.sha256)
+        self._sender = sender
         self._heard = asyncio.Event()
         self._planning = parts.planning
         self._pace = parts.pace

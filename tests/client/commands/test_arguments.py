@@ -73,7 +73,7 @@ def test_a_link_delays_each_message_by_its_length() -> None:
     assert link.delay(100, now=20.0) == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(("rate", "window"), [(100.0, 1024), (8000.0, 2000), (125_000.0, 31_250), (1e9, 256 * 1024)])
+@pytest.mark.parametrize(("rate", "window"), [(100.0, 1024), (8000.0, 2000), (125_000.0, 31_250), (1e9, 8 << 20)])
 def test_the_window_follows_the_rate(rate: float, window: int) -> None:
     assert pacing.window_for(rate) == window
 

@@ -17,7 +17,7 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import ProtocolError, RemoteProtocolError
-from lodestream.protocol.messages import MAX_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Opened, Segments
+from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Opened, Segments
 from lodestream.protocol.wire import serialize
 from lodestream_client import sync
 
@@ -216,7 +216,7 @@ def test_a_server_that_does_not_take_leave(asynchronous: bool, container_file: P
     header = header_of(data, len(data))
     slices = [serialize(Segments(at, data[at : at + 60_000])) for at in range(0, len(data), 60_000)]
     with websocket_server(says(header, *slices, serialize(End("complete")))) as url:
-        follow(url, asynchronous, window=MAX_CREDIT)  # returns within the time for closing
+        follow(url, asynchronous, window=BASE_CREDIT)  # returns within the time for closing
 
 
 @pytest.mark.parametrize(

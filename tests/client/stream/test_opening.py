@@ -20,7 +20,7 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.protocol.handshake import from_address
-from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, End, Event, Open, Opened, Segments
+from lodestream.protocol.messages import BASE_CREDIT, SUBPROTOCOL, Bye, End, Event, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import sync
@@ -127,7 +127,7 @@ def answering(container: bytes, heard: list[Event]) -> Iterator[str]:
 def test_open_is_said_once(container_file: Path, terrain: Terrain, asynchronous: bool) -> None:
     heard: list[Event] = []
     with answering(container_file.read_bytes(), heard) as url:
-        views, stream = follow(url, asynchronous, window=MAX_CREDIT)
+        views, stream = follow(url, asynchronous, window=BASE_CREDIT)
     assert stream.ended == "complete"
     assert np.array_equal(views[-1].points, terrain)
     assert not any(isinstance(event, Open) for event in heard)

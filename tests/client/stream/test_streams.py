@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 import lodestream_client as client
+from lodestream.errors import LodestreamError
 from lodestream_client import sync
+from tests.links import Fault, linked
 
 Terrain = NDArray[np.float32]
 
@@ -294,3 +297,49 @@ def test_the_client_of_the_manual_works(surface: str, terrain: Terrain) -> None:
     assert names["reception"].ended == "bytes"
     assert names["surface"].points.shape == terrain.shape
     assert names["reception"].decoder.rms == pytest.approx(rms(names["surface"].points, terrain), rel=1e-6)
+
+
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_the_latest_view_is_that_of_all_that_has_come(surface: str, terrain: Terrain, transport: Any) -> None:
+    with sync.connect(surface, transport=transport, window=1 << 18) as stream:
+        everything = len(list(stream))
+    with sync.connect(surface, transport=transport, window=1 << 18) as stream:
+        views = []
+        for view in stream.latest():
+            views.append(view)
+            time.sleep(0.3)  # more than the rest of the surface takes
+    assert stream.ended == "complete"
+    assert np.array_equal(views[-1].points, terrain)
+    assert [view.bytes for view in views] == sorted({view.bytes for view in views})
+    assert len(views) <= everything / 3
+
+
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_the_latest_view_is_awaited_too(surface: str, terrain: Terrain, transport: Any) -> None:
+    async def follow() -> list[Any]:
+        async with client.connect(surface, transport=transport, window=1 << 18) as stream:
+            views = []
+            async for view in stream.latest():
+                views.append(view)
+                time.sleep(0.3)
+        assert stream.ended == "complete"
+        return views
+
+    views = asyncio.run(follow())
+    assert np.array_equal(views[-1].points, terrain)
+    assert len(views) <= 10
+
+
+def test_what_came_before_an_error_is_seen_before_it(surface: str) -> None:
+    with linked(surface, Fault(cut_down=4000)) as link, sync.connect(link.url, transport="ws", deadline=0.0) as stream:
+        views = []
+
+        def draw() -> None:
+            for view in stream.latest():
+                views.append(view)
+                time.sleep(0.3)
+
+        with pytest.raises(LodestreamError):
+            draw()
+    assert stream.ended == "truncated"
+    assert views[-1].bytes == stream.decoder.view().bytes

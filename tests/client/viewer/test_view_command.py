@@ -105,6 +105,20 @@ def test_other_files_are_encoded_first(tmp_path: Path) -> None:
     assert np.array_equal(ls.decode((tmp_path / "out" / "surface.lode").read_bytes()).points, HILLS)
 
 
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize("kind", ["missing", "letter", "folder"])
+def test_what_cannot_be_read_gets_no_address(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    path = tmp_path / "hills.npy"
+    if kind == "letter":
+        path.write_text("Dear reader, this is no surface.")
+    elif kind == "folder":
+        path.mkdir()
+    assert main(["view", "--no-browser", str(path)]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "hills.npy" in told.err
+
+
 def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = pytest.importorskip("PIL.Image")
     pytest.importorskip("matplotlib")

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import InputError, OptionError
 from lodestream.container import describe
-from lodestream.container.model import Errors
-from lodestream.encoding.measured import _Measuring
+from lodestream.container.model import Header
+from lodestream.encoding import measured
+from lodestream.encoding.allocated import State
 
 from ..surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus
 
@@ -185,17 +186,17 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
     points = terrain((40, 33), 1)
     told = [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
     assert len(told) > 5
-    measured = _Measuring.errors
+    kept_layers = measured._kept_layers
 
     def layers_when(raised: int, wrong: float) -> list[float]:
         """What is told if the layer of this number had an error of ``wrong``."""
-        calls = itertools.count()
 
-        def errors(self: _Measuring, *args: Any) -> Errors:
-            found = measured(self, *args)
-            return found._replace(rms=wrong) if next(calls) == raised else found
+        def kept(header: Header, states: list[State], found: list[measured.Found]) -> list[measured.MeasuredLayer]:
+            errors, cells = found[raised]
+            changed = [*found[:raised], (errors._replace(rms=wrong), cells), *found[raised + 1 :]]
+            return kept_layers(header, states, changed)
 
-        monkeypatch.setattr(_Measuring, "errors", errors)
+        monkeypatch.setattr(measured, "_kept_layers", kept)
         return [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
 
     assert layers_when(3, told[2] * 1.5) == told[:3] + told[4:]

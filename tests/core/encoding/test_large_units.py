@@ -14,7 +14,7 @@ from lodestream import kernels
 from lodestream.entropy import bitplanes
 from lodestream.entropy.bitplanes import pass_count, symbols_room
 from lodestream.entropy.tile_coder import Channel, TileCoder
-from lodestream.entropy.tiles import Tiles, TileTable, gather
+from lodestream.entropy.tiles import Run, Tiles, TileTable, gather
 from lodestream.grid.layout import Layout
 
 from ..entropy.coding import planes_of
@@ -70,7 +70,7 @@ def read(table: TileTable, units: dict[int, Segments], budget: int) -> Tiles:
     tiles = Tiles(table, None, 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bitplanes, "_AT_ONCE", budget)
-        tiles.read([(tile, *segment) for tile, segments in units.items() for segment in segments])
+        tiles.read([Run(tile, *segment) for tile, segments in units.items() for segment in segments])
     return tiles
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lodestream.container import Header
-from lodestream.decoding.reconstruction import Coded, Reconstruction
+from lodestream.decoding.batches import Coded
+from lodestream.decoding.reconstruction import Reconstruction
 from lodestream.entropy.bitplanes import pass_count
 from lodestream.entropy.tile_coder import Channel, TileCoder
 from lodestream.entropy.tiles import TileTable, gather

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream import kernels
-from lodestream.decoding.reconstruction import Coded, Reconstruction
+from lodestream.decoding.batches import Coded
+from lodestream.decoding.reconstruction import Reconstruction
 from lodestream.entropy import bitplanes
 from lodestream.entropy.band_fields import COLUMNS, ROWS
 from lodestream.entropy.bitplanes import pass_count, pass_gains, reconstruction_point

@@ -79,7 +79,7 @@ def _told(event: Event) -> str:
         value = getattr(event, field.name)
         if isinstance(event, Segments) and field.name == "data":
             value = f"{len(event.data)} bytes"
-        if isinstance(event, Open) and (value is None or field.name == "target"):
+        if value is None or (isinstance(event, Open) and field.name == "target"):
             continue
         if field.name == "container":
             value = f"{value[:8]}..."

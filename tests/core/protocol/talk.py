@@ -12,7 +12,7 @@ import numpy as np
 import lodestream as ls
 from lodestream.container import ByteRange, Index, read_index
 from lodestream.decoding.decoder import View
-from lodestream.protocol.messages import MAX_CREDIT, MAX_MESSAGE, Segments
+from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, Segments
 from lodestream.protocol.wire import parse
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.receiver_state import ReceiverState
@@ -41,7 +41,7 @@ class Link:
     """A client and a server, and what is under way between them."""
 
     target: ls.Target = field(default_factory=ls.Target)
-    window: int = MAX_CREDIT
+    window: int = BASE_CREDIT
     now: float = 0.0
     reception: ReceiverState | None = None
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from random import Random
 
+import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from lodestream.errors import LocalProtocolError, UnsupportedVersionError
 from lodestream.protocol.connection import TRANSITIONS, Connection, Side, State
 from lodestream.protocol.messages import (
+    BASE_CREDIT,
     CODES,
     MAX_CREDIT,
     MAX_DATA,
@@ -124,31 +127,55 @@ def test_the_client_refuses_what_comes_beyond_the_credit() -> None:
 
 
 def test_a_message_is_never_larger_than_the_limit() -> None:
-    _, server = opened(credit=MAX_CREDIT)
+    _, server = opened(credit=BASE_CREDIT)
     with pytest.raises(LocalProtocolError, match=str(MAX_DATA)):
         server.send(Segments(0, bytes(MAX_DATA + 1)))
 
 
 def test_the_client_cannot_grant_more_than_the_cap() -> None:
-    client, server = opened(credit=MAX_CREDIT - 5)
+    client, server = opened(credit=BASE_CREDIT - 5)
     with pytest.raises(LocalProtocolError, match="1 to 5 bytes"):
         client.send(Credit(6))
     with pytest.raises(LocalProtocolError):
         client.send(Credit(0))
     server.receive(client.send(Credit(5)))
-    assert server.credit == MAX_CREDIT
+    assert server.credit == BASE_CREDIT
     with pytest.raises(LocalProtocolError):
         Connection(Side.CLIENT).send(Open(credit=-1))
 
 
 def test_the_server_forgets_what_is_granted_beyond_the_cap() -> None:
     server = Connection(Side.SERVER)
-    server.receive(serialize(Open(credit=10 * MAX_CREDIT)))
-    assert server.credit == MAX_CREDIT
+    server.receive(serialize(Open(credit=10 * BASE_CREDIT)))
+    assert server.credit == BASE_CREDIT
     server.send(HEADER)
     server.send(Segments(0, bytes(100)))
     server.receive(serialize(Credit(2**50)))
+    assert server.credit == BASE_CREDIT
+
+
+def test_a_server_may_keep_more_than_every_server_does() -> None:
+    client, server = Connection(Side.CLIENT), Connection(Side.SERVER, MAX_CREDIT)
+    server.receive(client.send(Open(credit=BASE_CREDIT)))
+    with pytest.raises(LocalProtocolError):
+        client.send(Credit(1))  # it may be a server of an earlier release, which would forget it
+    client.receive(server.send(replace(HEADER, credit=MAX_CREDIT)))
+    assert client.most == MAX_CREDIT
+    server.receive(client.send(Credit(MAX_CREDIT - BASE_CREDIT)))
+    assert client.credit == server.credit == MAX_CREDIT
+    server.receive(serialize(Credit(2**50)))
     assert server.credit == MAX_CREDIT
+
+
+def test_a_client_believes_no_more_credit_than_there_can_be() -> None:
+    client = Connection(Side.CLIENT)
+    client.send(Open(credit=1))
+    client.receive(serialize(replace(HEADER, credit=2**53)))
+    assert client.most == MAX_CREDIT
+    fields = msgpack.unpackb(serialize(HEADER))
+    assert "credit" not in fields
+    with pytest.raises(MessageError, match=r"header.credit to be an integer from 262144 to 2\^53"):
+        Connection(Side.CLIENT).receive(msgpack.packb(fields | {"credit": BASE_CREDIT - 1}))
 
 
 def test_after_stop_the_server_can_only_end() -> None:

@@ -10,33 +10,41 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import OptionError
-from lodestream.protocol.flow_control import FlowWindow
-from lodestream.protocol.messages import MAX_CREDIT, MAX_DATA, MIN_WINDOW
+from lodestream.protocol.flow_control import SMALL_MESSAGE, FlowWindow
+from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT, MAX_DATA, MIN_WINDOW
 
 
 @dataclass
 class Outcome:
-    """How a transfer went: the share of the link's rate that was used, and the most that was outstanding."""
+    """How a transfer went: the share of the link's rate that was used; the most outstanding, and in its second half."""
 
     use: float
     most: int
+    settled: int
     window: FlowWindow
 
 
-def transfer(rate: float, round_trip: float, total: int, burst: float = 0.0) -> Outcome:
-    """Receive so many bytes over a link that lets nothing through but every ``burst`` seconds."""
+def transfer(
+    rate: float, round_trip: float, total: int, *, burst: float = 0.0, share: int = 16, most_credit: int = MAX_CREDIT
+) -> Outcome:
+    """Receive so many bytes over a link that lets nothing through but every ``burst`` seconds.
+
+    The server keeps so much credit, and sends messages of a share of the most that there was.
+    """
     window = FlowWindow()
+    window.allow(most_credit)
     outstanding = credit = window.size
     window.grant(window.size, 0.0)
     window.heard(round_trip)
     events: list[tuple[float, int, str, int]] = []
-    free = now = sent = most = 0.0
-    count = 0
+    free = now = sent = most = settled = 0.0
+    count = largest = 0
 
     def send(now: float) -> None:
-        nonlocal credit, free, sent, count
+        nonlocal credit, free, sent, count, largest
         while credit and sent < total:
-            size = int(min(credit, max(credit // 4, 4096), MAX_DATA, total - sent))
+            largest = max(largest, credit)
+            size = int(min(credit, max(largest // share, SMALL_MESSAGE), MAX_DATA, total - sent))
             free = max(free, now) + size / rate
             due = -(-free // burst) * burst if burst else free
             heapq.heappush(events, (due + round_trip / 2, count, "data", size))
@@ -46,33 +54,62 @@ def transfer(rate: float, round_trip: float, total: int, burst: float = 0.0) -> 
     while events:
         now, _, kind, size = heapq.heappop(events)
         if kind == "grant":
-            credit += size
+            credit = min(credit + size, most_credit)
             send(now)
             continue
         outstanding -= size
         window.arrive(size, now)
-        grant = window.size - outstanding
-        if grant > 0 and grant * 4 >= window.size:
+        if grant := window.due(outstanding):
             window.grant(grant, now)
             outstanding += grant
             heapq.heappush(events, (now + round_trip / 2, count, "grant", grant))
             count += 1
         most = max(most, outstanding)
-    return Outcome(total / now / rate, int(most), window)
+        settled = max(settled, outstanding) if sent > total / 2 else 0
+    return Outcome(total / now / rate, int(most), int(settled), window)
 
 
 @pytest.mark.parametrize("round_trip", [0.001, 0.02, 0.1, 0.3])
 @pytest.mark.parametrize("rate", [8e3, 32e3, 125e3, 1.25e6])
 def test_a_link_is_kept_busy_by_little_more_than_it_holds(rate: float, round_trip: float) -> None:
     outcome = transfer(rate, round_trip, round(rate * 60))
-    assert outcome.most <= max(MIN_WINDOW, 2.5 * rate * round_trip)
-    assert outcome.use > min(0.9, 0.7 * MAX_CREDIT / (rate * round_trip))
+    product = rate * round_trip
+    enough = 1.1 * (product + 0.005 * rate) + 2.5 * SMALL_MESSAGE
+    assert outcome.most <= max(MIN_WINDOW, enough, 5 * product)
+    assert outcome.settled <= max(MIN_WINDOW, enough)
+    assert outcome.use > 0.95
+
+
+@pytest.mark.parametrize(("rate", "round_trip"), [(12.5e6, 0.1), (12.5e6, 0.02), (125e6, 0.02)])
+def test_a_fast_link_is_filled_soon_by_no_more_than_1_2_times_what_it_holds(rate: float, round_trip: float) -> None:
+    outcome = transfer(rate, round_trip, round(4 * rate))
+    assert outcome.use > 0.85
+    assert outcome.settled <= 1.2 * rate * max(round_trip, 0.1)
+
+
+@pytest.mark.parametrize(("rate", "round_trip"), [(125e3, 0.3), (625e3, 0.1), (1.25e6, 0.1), (2e6, 0.1)])
+def test_a_server_of_an_earlier_release_is_kept_busy_too(rate: float, round_trip: float) -> None:
+    outcome = transfer(rate, round_trip, round(rate * 30), share=4, most_credit=BASE_CREDIT)
+    assert outcome.use > 0.95
+
+
+def test_a_link_that_becomes_faster_is_filled_again() -> None:
+    window = FlowWindow()
+    window.allow(MAX_CREDIT)
+    window.heard(0.1)
+    now = 0.0
+    for rate in (1e5, 1e7):
+        for _ in range(2000):
+            window.arrive(SMALL_MESSAGE, now)
+            # A window goes out in a round trip, or at the rate of the link.
+            now += SMALL_MESSAGE / min(rate, window.size / 0.1)
+    assert window.size > 1e6
 
 
 @pytest.mark.parametrize("round_trip", [0.001, 0.02, 0.1, 0.3])
 @pytest.mark.parametrize("burst", [0.0, 0.1, 0.5, 2.0])
 def test_on_256_kbit_per_second_no_more_than_32_kib_are_under_way(round_trip: float, burst: float) -> None:
-    outcome = transfer(32e3, round_trip, 1_000_000, burst)
+    outcome = transfer(32e3, round_trip, 1_000_000, burst=burst)
     assert outcome.most <= 32 * 1024
 
 
@@ -87,6 +124,7 @@ def test_a_link_without_limits_gets_all_that_is_allowed() -> None:
 )
 def test_it_stays_within_its_limits_whatever_comes(arrivals: list[tuple[int, float]], heard: float | None) -> None:
     window, now = FlowWindow(), 0.0
+    window.allow(MAX_CREDIT)
     if heard is not None:
         window.heard(heard)
     for size, seconds in arrivals:
@@ -94,6 +132,13 @@ def test_it_stays_within_its_limits_whatever_comes(arrivals: list[tuple[int, flo
         window.grant(size, now)
         window.arrive(size, now)
         assert MIN_WINDOW <= window.size <= MAX_CREDIT
+
+
+@given(st.none() | st.integers(1, MAX_CREDIT), st.integers(0, MAX_CREDIT))
+def test_a_grant_never_goes_beyond_the_window_and_always_comes(fixed: int | None, credit: int) -> None:
+    window = FlowWindow(fixed)
+    assert credit + window.due(credit) <= max(window.size, credit)
+    assert window.due(0) == window.size
 
 
 def test_without_times_it_stays_as_it_is() -> None:
@@ -104,9 +149,11 @@ def test_without_times_it_stays_as_it_is() -> None:
     assert window.size == MIN_WINDOW
 
 
-@pytest.mark.parametrize("size", [1, 1000, MAX_CREDIT])
+@pytest.mark.parametrize("size", [1, 1000, BASE_CREDIT, MAX_CREDIT])
 def test_a_fixed_one_is_not_measured(size: int) -> None:
     window = FlowWindow(size)
+    assert window.size == min(size, BASE_CREDIT)  # every server keeps as much
+    window.allow(MAX_CREDIT)
     for number in range(100):
         window.grant(size, float(number))
         window.arrive(size, number + 1e-3)

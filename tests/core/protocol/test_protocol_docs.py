@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from lodestream.protocol.connection import TRANSITIONS
 from lodestream.protocol.messages import (
+    BASE_CREDIT,
     CODES,
     MAX_CREDIT,
     MAX_DATA,
@@ -60,7 +61,7 @@ def test_codes() -> None:
 
 
 def test_limits() -> None:
-    for number in (MAX_CREDIT, MAX_DATA, MAX_MESSAGE, MAX_HELD, MIN_WINDOW):
+    for number in (BASE_CREDIT, MAX_CREDIT, MAX_DATA, MAX_MESSAGE, MAX_HELD, MIN_WINDOW):
         assert f"{number:,}" in DOCS
     assert f"`version`, which is {VERSION};" in DOCS
 

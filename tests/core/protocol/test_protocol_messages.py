@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from lodestream import Target, Tolerance, UnsupportedVersionError
 from lodestream.protocol.messages import (
+    BASE_CREDIT,
     CODES,
     MAX_DATA,
     MAX_HELD,
@@ -41,6 +42,7 @@ EVENTS: list[Event] = [
     Stop(),
     Bye(),
     Opened(DIGEST, 2**40, 12345, 1e305, (2**39, 500), (13000, 1), True),
+    Opened(DIGEST, 100, 90, 1.0, (90, 5), (80, 1), True, BASE_CREDIT + 1),
     Segments(7, bytes(range(256))),
     Segments(0, bytes(MAX_DATA)),
     Layer(0, 2, 96, 0.125, 3.5),
@@ -64,7 +66,17 @@ targets = st.builds(Target, level=st.none() | integers) | st.builds(
 events = st.one_of(
     st.builds(Open, targets, integers, st.lists(places, max_size=5).map(tuple), st.none() | st.just(DIGEST)),
     st.builds(Credit, st.integers(1, 2**53)),
-    st.builds(Opened, st.just(DIGEST), integers, integers, numbers, places, places, st.booleans()),
+    st.builds(
+        Opened,
+        st.just(DIGEST),
+        integers,
+        integers,
+        numbers,
+        places,
+        places,
+        st.booleans(),
+        st.none() | st.integers(BASE_CREDIT, 2**53),
+    ),
     st.builds(Segments, integers, st.binary(min_size=1, max_size=300)),
     st.builds(Layer, integers, integers, integers, numbers, numbers),
     st.builds(End, st.text(max_size=20)),

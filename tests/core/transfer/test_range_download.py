@@ -19,7 +19,7 @@ from lodestream.decoding.view import View
 from lodestream.errors import OptionError, RemoteError, RemoteProtocolError, TruncatedStreamError
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
-from lodestream.protocol.messages import MAX_CREDIT, MIN_WINDOW
+from lodestream.protocol.messages import BASE_CREDIT, MIN_WINDOW
 from lodestream.transfer.download import Download
 from lodestream.transfer.range_download import RangeDownload, RangeRequest
 from lodestream.transfer.receiver_state import MemoryStore, ReceiverState
@@ -363,11 +363,11 @@ def test_layers_are_shown_before_the_index_has_come_and_none_too_many(name: str,
     ids=repr,
 )
 def test_the_first_request_is_as_large_as_the_target_allows(large: bytes, target: ls.Target, requests: int) -> None:
-    assert 2 * MIN_WINDOW < len(large) < MAX_CREDIT
+    assert 2 * MIN_WINDOW < len(large) < BASE_CREDIT
     file = File(large)
     file.serve(RangeDownload(ReceiverState(target)))
     assert len(file.asked) == requests
-    assert file.asked[0] == (0, {1: MAX_CREDIT, 2: target.max_bytes or MIN_WINDOW}[requests])
+    assert file.asked[0] == (0, {1: BASE_CREDIT, 2: target.max_bytes or MIN_WINDOW}[requests])
 
 
 def kept(target: Any, data: bytes) -> MemoryStore:

@@ -340,3 +340,16 @@ def test_the_reference_in_plain_and_in_python_integers_agree() -> None:
         plain: NDArray[Any] = reference.forward(lines.astype(np.int64), ends, *predictor)
         np.testing.assert_array_equal(plain, reference.forward(lines.astype(object), ends, *predictor).astype(np.int64))
         np.testing.assert_array_equal(reference.inverse(plain, ends, *predictor), lines)
+
+
+@given(shapes=st.tuples(st.integers(1, 90), st.integers(1, 90)), closed=st.booleans(), seed=st.integers(0, 2**32 - 1))
+def test_a_bare_inverse_is_that_of_details_that_are_all_zero(shapes: tuple[int, int], closed: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for axis in (0, 1):
+        step = axis_step(shapes[axis], closed)
+        values = rng.integers(-5000, 5000, shapes).astype(np.int32)
+        zeros = values.copy()
+        (zeros if axis == 0 else zeros.T)[step.coarse :] = 0
+        for array, bare in ((values, True), (zeros, False)):
+            inverse_step(array, axis, step, (19, -3), bare)
+        np.testing.assert_array_equal(values, zeros)

@@ -17,7 +17,7 @@ import pytest
 from fastapi import Request
 from websockets.exceptions import ConnectionClosed
 
-from lodestream.protocol.messages import Error, Open, Opened
+from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT, Error, Open, Opened
 from lodestream_server import Settings, running_server
 from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
@@ -176,6 +176,18 @@ def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:
     for _ in range(5):
         with made.stream("a"), made.stream("a"):
             pass
+
+
+def test_streams_together_have_no_more_under_way_than_their_memory(tmp_path: Path) -> None:
+    memory = 16 * MAX_CREDIT
+    made = limits(tmp_path, stream_memory=memory)
+    for _ in range(2):  # what a stream had is given back
+        with ExitStack() as held:
+            credits = [held.enter_context(made.stream("a")) for _ in range(100)]
+        assert credits[0] == MAX_CREDIT
+        assert credits == sorted(credits, reverse=True)
+        assert credits[-1] >= BASE_CREDIT
+        assert memory / 2 < sum(credits) - 100 * BASE_CREDIT <= memory
 
 
 def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Path) -> None:

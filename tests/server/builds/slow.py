@@ -11,7 +11,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from threading import Barrier, get_ident
 
+from lodestream.parallel import spread, threads
 from lodestream_server.builds import jobs, level_queue, worker
 from lodestream_server.builds.forkserver import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
@@ -45,6 +47,7 @@ __all__ = [
     "raise_error",
     "raise_full",
     "refuse",
+    "share",
     "sleep",
     "take",
     "use_processors",
@@ -106,6 +109,13 @@ def leave(code: int) -> None:
 def end_by(number: int) -> None:
     """End as a signal ends a process."""
     os.kill(os.getpid(), number)
+
+
+def share() -> list[int]:
+    """Threads that it may have, those that take part where each waits for the others, and how nice it is."""
+    together = Barrier(threads())
+    taking_part = set(spread(lambda _: (together.wait(20), get_ident())[1], range(threads())))
+    return [threads(), len(taking_part), os.getpriority(os.PRIO_PROCESS, 0)]
 
 
 def processor_seconds_left() -> float:

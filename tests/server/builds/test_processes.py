@@ -44,10 +44,16 @@ async def pool(server: ForkServer, size: int = 1) -> AsyncIterator[Pool]:
 
 
 async def ask(
-    made: Pool, function: Callable[..., Any], *args: Any, seconds: float | None = None, write: Path | None = None
+    made: Pool,
+    function: Callable[..., Any],
+    *args: Any,
+    seconds: float | None = None,
+    write: Path | None = None,
+    threads: int = 1,
 ) -> Any:
+    allowed = Allowed(write=write, memory=_MEMORY, threads=threads)
     async with asyncio.timeout(PATIENCE):
-        return await made.run(Call(function, args, seconds, allowed=Allowed(write=write, memory=_MEMORY)))
+        return await made.run(Call(function, args, seconds, allowed=allowed))
 
 
 def gone(process: int) -> bool:
@@ -204,6 +210,22 @@ def test_each_call_has_its_own_processor_time(server: ForkServer) -> None:
             # The system counts whole seconds; what the call before has used is no longer in it.
             assert 29.9 < left < 31.1
             assert await ask(made, slow.processor_seconds_left) < 0  # no limit is -1
+
+    asyncio.run(call())
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_call_has_its_threads_and_lets_streams_go_first(
+    server: ForkServer, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LODESTREAM_THREADS", "7")  # of the server itself
+
+    async def call() -> None:
+        async with pool(server) as made:
+            found = await ask(made, slow.share, seconds=30.0, threads=threads)
+            assert found == [threads, threads, os.getpriority(os.PRIO_PROCESS, 0) + 5]
+            left = await ask(made, slow.processor_seconds_left, seconds=30.0, threads=threads)
+            assert 30 * threads - 0.1 < left < 30 * threads + 1.1
 
     asyncio.run(call())
 

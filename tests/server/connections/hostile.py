@@ -23,6 +23,7 @@ from typing import NoReturn
 import numpy as np
 
 from lodestream.library import library
+from lodestream.parallel import VARIABLE
 from lodestream_server.builds import worker
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel
 from lodestream_server.builds.worker import Built, Job, Refused, build
@@ -106,12 +107,16 @@ def escape(job: Job) -> Built | Refused:
         "raise a limit": _raise_limit,
         "open thousands of files": lambda: [os.open(job.files[0], os.O_RDONLY) for _ in range(5000)],
     }
+    if os.environ.get(VARIABLE) != "1":
+        del trials["start a thread"]  # which builds that have several may
     done, handles = [], _handles()
     for name, trial in trials.items():
         with suppress(OSError, ValueError, RuntimeError, subprocess.SubprocessError):
             trial()
             done.append(name)
-    return Refused(json.dumps([done, handles, [name for name in os.environ if name.startswith("LODESTREAM")]]))
+    # Of the settings a build is told only how many threads it has.
+    secrets = [name for name in os.environ if name.startswith("LODESTREAM") and name != VARIABLE]
+    return Refused(json.dumps([done, handles, secrets]))
 
 
 def _linked(link: Path, target: Path) -> bytes:

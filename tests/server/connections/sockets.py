@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
 from lodestream import Target
-from lodestream.protocol.messages import MAX_CREDIT, SUBPROTOCOL, Bye, Credit, End, Error, Open, Opened, Segments
+from lodestream.protocol.messages import BASE_CREDIT, SUBPROTOCOL, Bye, Credit, End, Error, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 
 __all__ = [
@@ -119,7 +119,7 @@ class Reader:
     """
 
     target: Target = field(default_factory=Target)
-    window: int = MAX_CREDIT
+    window: int = BASE_CREDIT
     size: int = 0
     ended: str | None = None
     closed: int | None = None

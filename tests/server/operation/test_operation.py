@@ -27,7 +27,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import lodestream as ls
-from lodestream.protocol.messages import MAX_CREDIT, Bye, End, Layer, Open, Opened, Stop
+from lodestream.protocol.messages import BASE_CREDIT, Bye, End, Layer, Open, Opened, Stop
 from lodestream_server import running_server
 from lodestream_server.operation import logs
 from lodestream_server.operation.metrics import Metrics
@@ -83,7 +83,7 @@ def test_streams_are_counted_and_what_stopping_saved(http: httpx.Client, server:
 def test_a_complete_stream_saves_nothing_and_a_stop_does(http: httpx.Client, server: str, made: dict[str, Any]) -> None:
     before = figures(http)
     with raw_stream(server + made["url"]) as stream:
-        stream.send(Open(ls.Target(level=0), MAX_CREDIT))
+        stream.send(Open(ls.Target(level=0), BASE_CREDIT))
         assert any(isinstance(event, Layer) for event in stream.until_end())
     with raw_stream(server + made["url"]) as stream:
         stream.send(Open(credit=1000))

@@ -141,8 +141,10 @@ def test_memory_is_divided_among_builds_and_levels(monkeypatch: pytest.MonkeyPat
         for workers in (1, 2, 3, 7):
             chosen = Settings(workers=workers)
             assert chosen.memory_of_build * workers <= there // 2
-            assert chosen.memory_of_build * workers + chosen.memory_of_levels < there
+            assert chosen.memory_of_build * workers + chosen.memory_of_levels + chosen.memory_of_streams < there
     assert Settings(memory=8 << 30, workers=4).memory_of_build == 2 << 30
     assert Settings(memory=8 << 30, workers=4).memory_of_levels == 4 << 30
+    assert Settings(memory=8 << 30, workers=4).memory_of_streams == 2 << 30
+    assert Settings(stream_memory=0).memory_of_streams == 0
     assert Settings(workers=1000000).memory_of_build == 512 << 20
     assert Settings(build_memory=1 << 30).memory_of_build == 1 << 30

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from lodestream.errors import StreamError
-from lodestream.protocol.messages import CODES, MAX_CREDIT, Credit, Error, Event, Open
+from lodestream.protocol.messages import BASE_CREDIT, CODES, Credit, Error, Event, Open
 from lodestream_server.operation.repeats import Repeats
 from lodestream_server.storage import damage
 from lodestream_server.storage.storage import Storage
@@ -36,7 +36,7 @@ def error_of(http: httpx.Client, made: dict[str, Any], spoil: Callable[[], None]
         events: list[Event] = [stream.receive()]
         if not before:
             spoil()
-            stream.send(Credit(MAX_CREDIT))
+            stream.send(Credit(BASE_CREDIT))
         while not isinstance(events[-1], Error):
             events.append(stream.receive())
         closed(stream, CODES["damaged"].close)

@@ -121,6 +121,22 @@ def test_a_delete_that_is_finished_keeps_what_cannot_be_read(two: Two) -> None:
         assert settled(http, two.places["bert"])["state"] == "ready"
 
 
+def test_what_is_missing_is_built_again_once_another_owner_has_pushed_it(two: Two) -> None:
+    # A restored backup may lack the files of both, and have one record.
+    two.record("bert").unlink()
+    container = json.loads(two.record("anna").read_text())["container"]
+    shutil.rmtree(two.upload("anna"))
+    (two.data / "containers" / f"{container}.lode").unlink()
+    with two.served() as http:
+        assert http.get(two.places["anna"]).json()["state"] == "missing"
+        assert http.post("/v1/surfaces", content=BODY, headers=two.headers["bert"]).status_code == 202
+        assert settled(http, two.places["bert"])["state"] == "ready"
+    with two.served() as http:
+        assert settled(http, two.places["anna"])["state"] == "ready"
+        assert http.get(f"{two.places['anna']}/container", follow_redirects=True).status_code == 200
+    assert (two.upload("anna") / "0").read_bytes() == BODY
+
+
 def test_a_rotten_upload_never_becomes_a_surface(two: Two) -> None:
     container = json.loads(two.record("anna").read_text())["container"]
     (two.data / "containers" / f"{container}.lode").unlink()

@@ -21,32 +21,6 @@ const MOST_BASE = 2 ** 24 - 1;
 /** Exponents of two: rows and columns. */
 export type Exponents = readonly [number, number];
 
-interface Fields {
-  readonly dtype: DType;
-  readonly blocks: readonly BlockShape[];
-  readonly arrangement: Arrangement | null;
-  readonly pointChannels: number;
-  readonly flat: boolean;
-  readonly attributes: readonly AttributeKind[];
-  readonly lattices: readonly Lattice[];
-  readonly predictors: readonly Predictors[];
-  readonly extent: number;
-  readonly empty: readonly number[];
-  readonly tile: Exponents;
-  readonly chunk: Exponents;
-  readonly large: number;
-  readonly exact: boolean;
-  readonly corrected: boolean;
-  readonly layerCount: number;
-  readonly codecs: readonly number[];
-  readonly plane: Plane | null;
-  readonly jointChanges: readonly [JointChange, JointChange] | null;
-  readonly masked: boolean;
-  readonly base: number;
-  readonly layout: Layout;
-  readonly length: number;
-}
-
 /** What the section of masks holds. */
 export interface MaskData {
   /** What integer points are where there is a hole. */
@@ -72,84 +46,68 @@ export function countRectangles(blocks: readonly BlockShape[], [down, across]: E
   return count;
 }
 
-/** What is needed to draw. */
-export class Header {
+/** What the header section tells. */
+class HeaderFields {
   /** Type of the points. */
-  readonly dtype: DType;
-  readonly blocks: readonly BlockShape[];
+  declare readonly dtype: DType;
+  declare readonly blocks: readonly BlockShape[];
   /** How blocks are coded; null: one block by itself. */
-  readonly arrangement: Arrangement | null;
+  declare readonly arrangement: Arrangement | null;
   /** Numbers of a point: coordinates, and attributes in the same array. */
-  readonly pointChannels: number;
+  declare readonly pointChannels: number;
   /** The points came as an array (H, W), not (H, W, C). */
-  readonly flat: boolean;
-  readonly attributes: readonly AttributeKind[];
+  declare readonly flat: boolean;
+  declare readonly attributes: readonly AttributeKind[];
   /** One for each channel: of the points, then of each attribute. */
-  readonly lattices: readonly Lattice[];
+  declare readonly lattices: readonly Lattice[];
   /** The (a, b) of each channel's third steps. */
-  readonly predictors: readonly Predictors[];
+  declare readonly predictors: readonly Predictors[];
   /** Range of the heights, or diagonal of the box of the points. */
-  readonly extent: number;
+  declare readonly extent: number;
   /** For each channel the levels, as bits, that have no coefficient other than 0. */
-  readonly empty: readonly number[];
+  declare readonly empty: readonly number[];
   /** Of a tile, in coefficients of one band. */
-  readonly tile: Exponents;
+  declare readonly tile: Exponents;
   /** Of a chunk of the residual, in points. */
-  readonly chunk: Exponents;
+  declare readonly chunk: Exponents;
   /** The coarsest level whose units are large; 0: none are. */
-  readonly large: number;
+  declare readonly large: number;
   /** The complete stream restores every value bit for bit. */
-  readonly exact: boolean;
+  declare readonly exact: boolean;
   /** A residual section follows the layers. */
-  readonly corrected: boolean;
-  readonly layerCount: number;
-  readonly codecs: readonly number[];
+  declare readonly corrected: boolean;
+  declare readonly layerCount: number;
+  declare readonly codecs: readonly number[];
   /** Rules of x and y, of heights that came with them. */
-  readonly plane: Plane | null;
+  declare readonly plane: Plane | null;
   /** How the points at one place, and those that are one vertex, differ from those that the arrangement makes one. */
-  readonly jointChanges: readonly [JointChange, JointChange] | null;
+  declare readonly jointChanges: readonly [JointChange, JointChange] | null;
   /** A section of masks follows. */
-  readonly masked: boolean;
+  declare readonly masked: boolean;
   /** Base of the quantiser of coordinates, in lattice steps; 0: they are not quantised. */
-  readonly base: number;
+  declare readonly base: number;
   /** Levels, bands and tiles. */
-  readonly layout: Layout;
+  declare readonly layout: Layout;
   /** Bytes from the start of the container to the end of the header and the masks. */
-  readonly length: number;
-  readonly masks: MaskData;
-  readonly #fields: Fields;
+  declare readonly length: number;
 
-  constructor(fields: Fields, masks: MaskData = NO_MASKS) {
-    this.#fields = fields;
-    this.dtype = fields.dtype;
-    this.blocks = fields.blocks;
-    this.arrangement = fields.arrangement;
-    this.pointChannels = fields.pointChannels;
-    this.flat = fields.flat;
-    this.attributes = fields.attributes;
-    this.lattices = fields.lattices;
-    this.predictors = fields.predictors;
-    this.extent = fields.extent;
-    this.empty = fields.empty;
-    this.tile = fields.tile;
-    this.chunk = fields.chunk;
-    this.large = fields.large;
-    this.exact = fields.exact;
-    this.corrected = fields.corrected;
-    this.layerCount = fields.layerCount;
-    this.codecs = fields.codecs;
-    this.plane = fields.plane;
-    this.jointChanges = fields.jointChanges;
-    this.masked = fields.masked;
-    this.base = fields.base;
-    this.layout = fields.layout;
-    this.length = fields.length;
-    this.masks = masks;
+  constructor(fields: HeaderFields) {
+    Object.assign(this, fields);
+  }
+}
+
+/** What is needed to draw. */
+export class Header extends HeaderFields {
+  constructor(
+    fields: HeaderFields,
+    readonly masks: MaskData = NO_MASKS,
+  ) {
+    super(fields);
   }
 
   /** The header with the masks of their section, which ends at `length`. */
   withMasks(masks: MaskData, length: number): Header {
-    return new Header({ ...this.#fields, length }, masks);
+    return new Header({ ...this, length }, masks);
   }
 
   /** Whether the section of masks is still to come. */

@@ -399,9 +399,13 @@ export class Decoder {
 }
 
 /** Decode a complete container. `module` is that of `loadKernels`. */
-export function decode(module: WebAssembly.Module, container: Uint8Array, maxVertices?: number): Surface {
+export async function decode(
+  module: WebAssembly.Module,
+  container: Uint8Array,
+  maxVertices?: number,
+): Promise<Surface> {
   const decoder = new Decoder(module, { maxVertices: maxVertices ?? null });
   decoder.feed(container);
   decoder.finish();
-  return decoder.surface();
+  return decoder.view().surfaceAsync();
 }

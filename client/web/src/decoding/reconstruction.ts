@@ -8,7 +8,7 @@ import { type Plane, Tiles } from "../entropy/tiles";
 import { patchesByBlock } from "../grid/patches";
 import { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
-import { sha256 } from "../kernels/sha256";
+import { platformSha256, sha256 } from "../kernels/sha256";
 import { decodeChunk } from "../residual/chunk-coder";
 import { allocatePlane, FRACTION_BITS, inverse } from "../transform/pyramid";
 import { DTYPE_BYTES, DTYPES, type DType, type Region, type Span } from "../types";
@@ -113,8 +113,13 @@ export class Reconstruction {
   }
 
   /** The SHA-256 of values one after another, in hexadecimal digits. */
-  digest(bytes: Iterable<Uint8Array>): string {
+  digest(bytes: readonly Uint8Array[]): string {
     return sha256(this.#arena, bytes);
+  }
+
+  /** The same, by the platform where it has it. */
+  async digestAsync(bytes: readonly Uint8Array<ArrayBuffer>[]): Promise<string> {
+    return (await platformSha256(bytes)) ?? this.digest(bytes);
   }
 
   /** The values of all blocks before residual and holes. */

@@ -85,6 +85,26 @@ export class View implements ViewInfo {
    * wrong, or no value is finite.
    */
   surface(level?: number): Surface {
+    const { surface, digest } = this.#computed(level);
+    if (digest !== null) this.#check(digest, this.#shared.reconstruction.digest(valuesOf(surface.blocks)));
+    return surface;
+  }
+
+  /** As `surface`, but the SHA-256 is the platform's where it has one, which saves a quarter of the time. */
+  async surfaceAsync(level?: number): Promise<Surface> {
+    const { surface, digest } = this.#computed(level);
+    if (digest !== null) this.#check(digest, await this.#shared.reconstruction.digestAsync(valuesOf(surface.blocks)));
+    return surface;
+  }
+
+  #check(wanted: string, found: string): void {
+    if (found === wanted) return;
+    const { length } = this.#shared.reconstruction.header;
+    throw new CorruptStreamError(`expected values with the SHA-256 ${wanted}, got ${found}`, length);
+  }
+
+  /** The state as a surface, and the SHA-256 that its values have to have; null where that is not known. */
+  #computed(level: number | undefined): { surface: Surface; digest: string | null } {
     const { reconstruction, metadata, digest } = this.#shared;
     const { header } = reconstruction;
     const { region } = this.#selection;
@@ -141,15 +161,9 @@ export class View implements ViewInfo {
       const kept = keptMasks[0] ? pick(keptMasks[0], header.shape, nodes[0]!) : null;
       blocks = [withCoordinates(only, plane, placed, kept, header)];
     }
-    if (region) {
-      values = windowMetadata(values, header.shape, region);
-    } else if (this.complete && finest && header.exact && digest.value !== null && chosen.every(Boolean)) {
-      const found = reconstruction.digest(valuesOf(blocks));
-      if (found !== digest.value) {
-        throw new CorruptStreamError(`expected values with the SHA-256 ${digest.value}, got ${found}`, header.length);
-      }
-    }
-    return { blocks, metadata: values };
+    if (region) values = windowMetadata(values, header.shape, region);
+    const exact = this.complete && finest && header.exact && !region && chosen.every(Boolean);
+    return { surface: { blocks, metadata: values }, digest: exact ? digest.value : null };
   }
 
   /** Whether the residual is known. */
@@ -304,10 +318,8 @@ function put(grid: Grid, place: number, value: number): void {
 }
 
 /** All values as bytes: block by block the points, then each attribute. */
-function* valuesOf(blocks: readonly Block[]): Generator<Uint8Array> {
-  for (const { points, attributes } of blocks) {
-    for (const { values } of [points, ...attributes.values()]) {
-      yield new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
-    }
-  }
+function valuesOf(blocks: readonly Block[]): Uint8Array<ArrayBuffer>[] {
+  return blocks
+    .flatMap(({ points, attributes }) => [points, ...attributes.values()])
+    .map(({ values }) => new Uint8Array(values.buffer as ArrayBuffer, values.byteOffset, values.byteLength));
 }

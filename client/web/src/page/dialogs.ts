@@ -21,8 +21,21 @@ function buttons(answer: string, kind: string): HTMLElement {
   return html("div", { class: "actions" }, cancel, html("button", { value: "yes", class: kind }, answer));
 }
 
-/** Asks for a token. @param problem - Why; may be empty. @returns null if none was given. */
-export async function askToken(problem: string): Promise<string | null> {
+/** What is wrong with a token, by the server's words. */
+const HEADINGS: Readonly<Record<string, string>> = {
+  "bad-token": "The server does not know this token",
+  "small-scope": "This token does not allow that",
+};
+
+/**
+ * Asks for a token.
+ *
+ * @param code - Why, in the server's word: `no-token`, `bad-token` or `small-scope`.
+ * @param problem - What the server says of the token that was given before.
+ * @returns null if none was given.
+ */
+export async function askToken(code: string, problem: string): Promise<string | null> {
+  const heading = HEADINGS[code];
   const input = html("input", {
     type: "password",
     id: "token",
@@ -36,8 +49,12 @@ export async function askToken(problem: string): Promise<string | null> {
     html(
       "form",
       { method: "dialog" },
-      html("h2", { id: "token-title" }, "A token is needed"),
-      html("p", {}, problem === "" ? "This server gives its surfaces to those who have a token." : problem),
+      html("h2", { id: "token-title" }, heading ?? "A token is needed"),
+      html(
+        "p",
+        {},
+        heading === undefined ? "This server gives its surfaces to those who have a token." : `${problem}.`,
+      ),
       html("label", { for: "token" }, "Token (kept until this page is closed)"),
       input,
       buttons("Continue", "primary"),

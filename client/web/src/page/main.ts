@@ -22,7 +22,7 @@ let asking: Promise<boolean> | null = null;
 function allowed(error: ProblemError): Promise<boolean> {
   if (error.code !== "no-token" && error.code !== "bad-token" && error.code !== "small-scope")
     return Promise.resolve(false);
-  asking ??= askToken(server.token === null ? "" : `${error.message}.`).then((token) => {
+  asking ??= askToken(server.token === null ? "no-token" : error.code, error.message).then((token) => {
     asking = null;
     if (token !== null) server.token = token;
     return token !== null;
@@ -58,10 +58,7 @@ function open(src: string, name: string, back: boolean): void {
     document.title = `${name || info.name || "Surface"} – Lodestream`;
     const [first] = info.blocks;
     const points = info.blocks.length === 1 && first ? first.shape.join(" × ") : `${info.blocks.length} blocks`;
-    setText(
-      facts,
-      info.size > 0 ? `${points} points, ${formatBytes(info.size)}`.replace("blocks points", "blocks") : points,
-    );
+    setText(facts, info.blocks.length === 1 ? `${points} points` : points);
   });
   view.addEventListener("lodestream-progress", async (event) => {
     const { state, code, detail } = (event as CustomEvent<Progress>).detail;

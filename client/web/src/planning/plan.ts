@@ -36,11 +36,6 @@ export interface Plan {
   readonly prefix: boolean;
 }
 
-/** All slices of a plan, in order. */
-export function slicesOf(plan: Plan): ByteRange[] {
-  return [...plan.before, ...plan.ranges, ...plan.after];
-}
-
 /** The state at the end of a plan; its `bytes` are those of the surface's slices, sent or cached. */
 export function endOf(plan: Plan): Mark {
   return plan.marks[plan.marks.length - 1]!;

@@ -19,7 +19,7 @@
  */
 
 import { LocalProtocolError } from "../errors";
-import { type Event, type EventType, MAX_CREDIT, MAX_DATA, MessageError } from "./messages";
+import { BASE_CREDIT, type Event, type EventType, MAX_CREDIT, MAX_DATA, MessageError } from "./messages";
 import { parse, serialize } from "./wire";
 
 /** The two ends of a stream. */
@@ -69,10 +69,14 @@ export const TRANSITIONS: Readonly<Record<Side, Readonly<Partial<Record<State, r
 export class Connection {
   /** Current state of this side. */
   state: State = "idle";
-  /** Bytes of `segments.data` that the server may still send, or that may still arrive; 0 to `MAX_CREDIT`. */
+  /** Bytes of `segments.data` that the server may still send, or that may still arrive; 0 to `most`. */
   credit = 0;
 
-  constructor(readonly side: Side) {}
+  /** @param most The most credit that the server keeps, `BASE_CREDIT` to `MAX_CREDIT`; a client learns it. */
+  constructor(
+    readonly side: Side,
+    public most: number = BASE_CREDIT,
+  ) {}
 
   /**
    * The message for an event that this side sends now.
@@ -112,11 +116,11 @@ export class Connection {
         throw new MessageError("out-of-turn", `expected at most ${this.credit} bytes, got ${event.data.length}`);
       }
       this.credit -= event.data.length;
-    } else if (event.type === "open") this.credit = Math.min(event.credit, MAX_CREDIT);
+    } else if (event.type === "open") this.credit = Math.min(event.credit, this.most);
     else if (event.type === "credit") {
       // What goes beyond the cap is forgotten rather than refused: a client that grants generously loses nothing.
-      this.credit = Math.min(this.credit + event.bytes, MAX_CREDIT);
-    }
+      this.credit = Math.min(this.credit + event.bytes, this.most);
+    } else if (event.type === "header") this.most = Math.min(event.credit ?? BASE_CREDIT, MAX_CREDIT);
     this.state = next;
     return event;
   }
@@ -134,7 +138,7 @@ export class Connection {
   }
 
   private grant(size: number, least: number): void {
-    const most = MAX_CREDIT - this.credit;
+    const most = this.most - this.credit;
     if (!(least <= size && size <= most)) {
       throw new LocalProtocolError(
         `expected ${least} to ${most} bytes of credit on top of ${this.credit}, got ${size}`,

@@ -11,7 +11,16 @@ import { unpack } from "../msgpack";
 import type { Place } from "../planning/byte-ranges";
 import { makeTarget } from "../planning/target";
 import type { Region, Span, Target, Tolerance } from "../types";
-import { type Event, type EventType, MAX_DATA, MAX_HELD, MAX_MESSAGE, MessageError, VERSION } from "./messages";
+import {
+  BASE_CREDIT,
+  type Event,
+  type EventType,
+  MAX_DATA,
+  MAX_HELD,
+  MAX_MESSAGE,
+  MessageError,
+  VERSION,
+} from "./messages";
 
 // Integers stay exact in every language that reads them as a double.
 const MAX_INTEGER = 2 ** 53;
@@ -31,6 +40,8 @@ function integer(value: unknown, least = 0): number {
 
 const count: Read = (value) => integer(value);
 const positive: Read = (value) => integer(value, 1);
+
+const credit: Read = (value) => integer(value, BASE_CREDIT);
 
 function number(value: unknown): number {
   const found = typeof value === "bigint" ? Number(value) : value;
@@ -137,6 +148,7 @@ const FIELDS: Readonly<Record<EventType, readonly (readonly [name: string, read:
     ["index", place],
     ["metadata", place],
     ["prefix", flag],
+    ["credit", credit],
   ],
   segments: [
     ["offset", count],
@@ -163,6 +175,7 @@ const DEFAULTS: Readonly<Record<string, unknown>> = {
   "open.held": [],
   "open.container": undefined,
   "open.token": undefined,
+  "header.credit": undefined,
   "layer.rms": Number.NaN,
   "layer.max": Number.NaN,
 };

@@ -12,8 +12,9 @@ import type { ReceiverState } from "./receiver-state";
 /** What may be given to a download beside its receiver state. */
 export interface DownloadOptions {
   /**
-   * Bytes that may be in flight at once, 1 to `MAX_CREDIT`. Up to this many bytes still arrive after `stop`. If it is
-   * less than what the link carries in one round trip, the link is idle at times. Left out: measured, with times.
+   * Bytes that may be in flight at once, 1 to `MAX_CREDIT`, as far as the server keeps so much credit. Up to this many
+   * bytes still arrive after `stop`. If it is less than what the link carries in one round trip, the link is idle at
+   * times. Left out: measured, with times.
    */
   readonly window?: number | undefined;
   /** For a client that cannot send a header with the handshake; the first message then has no place in an address. */
@@ -205,6 +206,8 @@ export class Download<View extends ViewInfo> {
   private begin(event: Header, now: number | undefined): View[] {
     this.header = event;
     if (now !== undefined && this.openedAt !== undefined) this.window.heard(now - this.openedAt);
+    this.window.allow(this.connection.most);
+    this.grant(now);
     this.reception.identify(event.container, event.size);
     // What answers the last target says nothing of the one that is asked for next.
     if (this.aiming) return [];
@@ -215,13 +218,15 @@ export class Download<View extends ViewInfo> {
     const stopped = this.connection.state === "stopping";
     const views = this.reception.take(event.offset, event.data);
     this.window.arrive(event.data.length, now);
-    const grant = this.window.size - this.connection.credit;
-    // Four grants a window: fewer would leave the link idle between them, more would be chatter.
-    if (!stopped && grant > 0 && grant * 4 >= this.window.size) {
-      this.outbox.push(this.connection.send({ type: "credit", bytes: grant }));
-      this.window.grant(grant, now);
-    }
+    this.grant(now);
     return !stopped || this.turning ? views : [];
+  }
+
+  private grant(now: number | undefined): void {
+    const bytes = this.window.due(this.connection.credit);
+    if (bytes === 0 || this.connection.state !== "streaming") return;
+    this.outbox.push(this.connection.send({ type: "credit", bytes }));
+    this.window.grant(bytes, now);
   }
 
   private finish(why: string): void {

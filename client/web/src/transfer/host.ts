@@ -96,8 +96,8 @@ export class Host implements Questions {
     this.own.throttle(rate);
   }
 
-  surface(view: number, level: number | undefined): Surface {
-    return this.viewOf(view).surface(level);
+  async surface(view: number, level: number | undefined): Promise<Surface> {
+    return this.viewOf(view).surfaceAsync(level);
   }
 
   window(view: number, region: Region): Surface {

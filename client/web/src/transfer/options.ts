@@ -52,7 +52,7 @@ export interface PlainStreamOptions {
   readonly closeTimeout?: number | undefined;
   /** Bytes per second, to feel a slow link. */
   readonly limitRate?: number | undefined;
-  /** Bytes that may be in flight over a WebSocket, up to 262,144; left out: measured from the link. */
+  /** Bytes that may be in flight over a WebSocket, up to 8,388,608; left out: measured from the link. */
   readonly window?: number | undefined;
   /** Give only the newest view to whoever is slower than the stream, which then does not wait. */
   readonly latest?: boolean | undefined;

@@ -37,6 +37,9 @@ for (const status of [408, 425, 429, 500, 502, 503, 504]) PASSING.add(`http-${st
 /** A WebSocket that did not open, or does not speak the stream protocol: plain HTTP may get through. */
 export class NoStreamError extends UnreachableError {}
 
+/** A file that its host says is shorter than the container that it begins. */
+export class CutShortError extends TruncatedStreamError {}
+
 /** The error for an error code of the server. */
 export function fromCode(code: string, message: string): LodestreamError {
   const kind = Object.hasOwn(BY_CODE, code) ? BY_CODE[code] : undefined;
@@ -68,6 +71,7 @@ export function fromResponse(status: number, reason: string, body: string, url: 
 /** Whether the same request may succeed a little later. */
 export function passes(error: LodestreamError): boolean {
   if (error instanceof RemoteError) return PASSING.has(error.code);
+  if (error instanceof CutShortError) return false;
   return error instanceof UnreachableError || error instanceof SilenceError || error instanceof TruncatedStreamError;
 }
 

@@ -79,7 +79,7 @@ export interface Questions {
   focus(region: Region | undefined): void;
   aim(target: TargetOptions): void;
   throttle(rate: number | undefined): void;
-  surface(view: number, level: number | undefined): Surface;
+  surface(view: number, level: number | undefined): Promise<Surface>;
   window(view: number, region: Region): Surface;
   prices(): Promise<readonly Price[]>;
   kept(): Kept;

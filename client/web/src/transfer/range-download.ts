@@ -8,8 +8,9 @@
 
 import { RemoteError, RemoteProtocolError, TruncatedStreamError } from "../errors";
 import { type Place, RangeSet } from "../planning/byte-ranges";
-import { MAX_CREDIT, MIN_WINDOW } from "../protocol/messages";
+import { BASE_CREDIT, MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
+import { CutShortError } from "./problems";
 import type { ReceiverState } from "./receiver-state";
 import { inFileOrder } from "./safe-prefix";
 
@@ -18,7 +19,7 @@ import { inFileOrder } from "./safe-prefix";
 // the file, hold index and metadata of most. Where they do not, one more request brings the rest.
 const HEAD = 4096;
 const FIRST = MIN_WINDOW;
-const FIRST_MOST = MAX_CREDIT;
+const FIRST_MOST = BASE_CREDIT;
 const TAIL_SHARE = 512;
 const TAIL_LEAST = 2048;
 const TAIL_MOST = 64 * 1024;
@@ -146,9 +147,7 @@ export class RangeDownload<View extends ViewInfo> {
     request.answeredAt = now;
     this.checkSame(headers, status);
     if (status === 416) {
-      throw new TruncatedStreamError(
-        `expected a container of at least ${request.offset + 1} bytes, got a shorter file`,
-      );
+      throw new CutShortError(`expected a container of at least ${request.offset + 1} bytes, got a shorter file`);
     }
     if (status !== 206) {
       throw new RemoteProtocolError(
@@ -233,7 +232,7 @@ export class RangeDownload<View extends ViewInfo> {
     const roundTrip = request.answeredAt - request.askedAt;
     if (got < MIN_WINDOW || roundTrip <= 0) return;
     const rate = got / Math.max(now - request.answeredAt, roundTrip);
-    this.gap = Math.round(Math.min(Math.max(rate * roundTrip, MIN_WINDOW), MAX_CREDIT));
+    this.gap = Math.round(Math.min(Math.max(rate * roundTrip, MIN_WINDOW), BASE_CREDIT));
   }
 
   private checkSame(headers: AnswerHeaders, status: number): void {
@@ -289,9 +288,15 @@ export class RangeDownload<View extends ViewInfo> {
   }
 
   private readIndex(): View[] {
-    const found = this.reception.find(this.reception.size ?? 0);
-    if ("missing" in found) this.needed = found.missing;
-    return "views" in found ? found.views : [];
+    try {
+      const found = this.reception.find(this.reception.size ?? 0);
+      if ("missing" in found) this.needed = found.missing;
+      return "views" in found ? found.views : [];
+    } catch (error) {
+      // All bytes that the host has were looked at: others would not follow.
+      if (error instanceof TruncatedStreamError) throw new CutShortError(`the file was cut short: ${error.message}`);
+      throw error;
+    }
   }
 
   /** The next slice that is missing, with those after it that are near and nothing between that is cached. */

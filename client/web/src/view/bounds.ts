@@ -38,6 +38,8 @@ export interface FrameOptions {
   readonly heights: boolean;
   /** Of the box of the whole surface; 0 where it is not known: a coarse picture may be smaller. */
   readonly diagonal: number;
+  /** Range of z of the whole surface; 0 where it is not known. */
+  readonly relief: number;
 }
 
 /** So many times higher than wide are surfaces of x, y, z whose z has another unit. */
@@ -48,16 +50,15 @@ const FITTED = 0.4;
 
 /**
  * The frame in which what lies in a box is drawn about 2 units large around 0.
-.
  *
  * Heights that range over more than x and y have another unit than these, such as metres over degrees, and so have z that
  * range over ten times as much: they are drawn so that the relief can be seen.
  */
-export function frameOf(box: Box, { geographic, heights, diagonal }: FrameOptions): Frame {
+export function frameOf(box: Box, { geographic, heights, diagonal, relief }: FrameOptions): Frame {
   const origin = ([0, 1, 2] as const).map((k) => (box[0][k] + box[1][k]) / 2) as [number, number, number];
   const metres = geographic ? [DEGREE * Math.max(Math.cos((origin[1] * Math.PI) / 180), 0.01), DEGREE, 1] : [1, 1, 1];
   const sides = Math.max(...[0, 1].map((k) => (box[1][k]! - box[0][k]!) * metres[k]!));
-  const height = box[1][2] - box[0][2];
+  const height = relief || box[1][2] - box[0][2];
   const fitted = sides > 0 && height > sides * (heights ? 1 : OTHER_UNIT);
   const across = (fitted ? sides : Math.max(sides, diagonal / 2)) || height || 1;
   const scale = metres.map((unit) => (2 * unit) / across) as [number, number, number];

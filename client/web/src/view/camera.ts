@@ -27,19 +27,52 @@ export function positionOf({ azimuth, elevation, distance, target }: Orbit): [nu
   ];
 }
 
+/** Share of the view that is filled by what is to be seen whole. */
+const FILLED = 0.9;
+
 /**
- * The camera that sees a whole box.
+ * The camera at given angles that sees a whole box around 0 and is as near as that allows.
  *
- * @param half - Half the extent of the box around 0.
+ * @param half - Half the extent of the box.
  * @param whole - Half the diagonal of the whole surface, where the box may be that of a coarser one; else 0.
  * @param aspect - Width of the view by its height.
- * @param flat - A height field: seen from the south and above.
  */
-export function fitted(half: Triple, whole: number, aspect: number, flat: boolean): Orbit {
-  const radius = Math.max(Math.hypot(...half), whole) || 1;
-  const narrow = Math.min(1, aspect);
-  const distance = (radius / Math.sin((VIEW_ANGLE / 2) * RADIANS) / narrow) * (flat ? 0.8 : 0.82);
-  return { azimuth: flat ? -90 : -60, elevation: flat ? 42 : 25, distance, target: [0, 0, 0] };
+export function fitted(half: Triple, whole: number, aspect: number, azimuth: number, elevation: number): Orbit {
+  const [a, e] = [azimuth * RADIANS, elevation * RADIANS];
+  const axes: readonly Triple[] = [
+    [-Math.sin(a), Math.cos(a), 0],
+    [-Math.sin(e) * Math.cos(a), -Math.sin(e) * Math.sin(a), Math.cos(e)],
+    [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)],
+  ];
+  const high = FILLED * Math.tan((VIEW_ANGLE / 2) * RADIANS);
+  const larger = Math.max(1, whole / (Math.hypot(...half) || Number.POSITIVE_INFINITY));
+  let distance = 0;
+  for (let corner = 0; corner < 8; corner += 1) {
+    const [right, up, near] = axes.map((axis) =>
+      axis.reduce((sum, part, k) => sum + part * half[k as 0 | 1 | 2] * (corner & (1 << k) ? larger : -larger), 0),
+    ) as [number, number, number];
+    distance = Math.max(distance, near + Math.abs(right) / (high * aspect), near + Math.abs(up) / high);
+  }
+  if (!(distance > 0)) distance = (whole || 1) / high;
+  return { azimuth, elevation, distance, target: [0, 0, 0] };
+}
+
+/** Whether two cameras with the same angles show about the same, so that moving from one to the other is not worth it. */
+export function nearly(a: Orbit, b: Orbit): boolean {
+  const apart = Math.hypot(...([0, 1, 2] as const).map((k) => a.target[k] - b.target[k]));
+  const farther = Math.max(a.distance, b.distance);
+  return apart <= 0.015 * farther && Math.abs(a.distance - b.distance) <= 0.03 * farther;
+}
+
+/** The camera at a share of the way from one to another. */
+export function blended(from: Orbit, to: Orbit, share: number): Orbit {
+  const mix = (a: number, b: number): number => a + (b - a) * share;
+  return {
+    azimuth: wrapped(from.azimuth + wrapped(to.azimuth - from.azimuth) * share),
+    elevation: mix(from.elevation, to.elevation),
+    distance: from.distance * (to.distance / from.distance) ** share,
+    target: ([0, 1, 2] as const).map((k) => mix(from.target[k], to.target[k])) as [number, number, number],
+  };
 }
 
 /** Turns around the target. */

@@ -2,10 +2,12 @@
 
 import { Capacity } from "../container/capacity";
 import type { Header } from "../container/header";
+import type { Index } from "../container/model";
 import { INDEX_GROWTH, indexFrom, readMetadata } from "../container/reader";
 import { FOOTER_LENGTH, type Metadata, parseFooter } from "../container/sections";
+import { readWindowErrors, type WindowErrors } from "../planning/window-errors";
 import { containerUrl, isSurface } from "../transfer/addresses";
-import { attributeNames } from "./grids";
+import { attributesIn } from "./grids";
 import type { Price, SurfaceInfo } from "./source";
 
 /** Metadata and price list. */
@@ -13,10 +15,17 @@ export interface Description {
   readonly metadata: Metadata;
   readonly prices: readonly Price[] | null;
   readonly size: number;
+  /** Reads the errors of windows; null where the container tells none, or an index or a section is too large. */
+  windows(): Promise<WindowErrors | null>;
 }
 
 /** Nothing is known. */
-export const NO_DESCRIPTION: Description = { metadata: {}, prices: null, size: 0 };
+export const NO_DESCRIPTION: Description = {
+  metadata: {},
+  prices: null,
+  size: 0,
+  windows: () => Promise.resolve(null),
+};
 
 /** Bytes at the end of a container that are asked for first, beside a 512th of it: footer, index and metadata of most. */
 const TAIL = 2048;
@@ -34,12 +43,13 @@ export async function describe(url: string, token: string | null, header: Promis
   if (isSurface(url)) {
     const answer = await fetch(url, { headers });
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
-    return fromServer((await answer.json()) as Record<string, unknown>);
+    const described = fromServer((await answer.json()) as Record<string, unknown>);
+    return { ...described, windows: async () => windowsOf(await openEnd(containerUrl(url), headers, await header)) };
   }
-  return fromTail(containerUrl(url), headers, await header);
+  return fromEnd(await openEnd(containerUrl(url), headers, await header));
 }
 
-function fromServer({ metadata, layers, bytes }: Record<string, unknown>): Description {
+function fromServer({ metadata, layers, bytes }: Record<string, unknown>): Omit<Description, "windows"> {
   const prices = Array.isArray(layers) && layers.every(isPrice) ? layers : null;
   return { metadata: (metadata ?? {}) as Metadata, prices, size: typeof bytes === "number" ? bytes : 0 };
 }
@@ -49,7 +59,16 @@ function isPrice(value: unknown): value is Price {
   return [bytes, level, rms, max].every((number) => typeof number === "number");
 }
 
-async function fromTail(url: string, headers: Record<string, string>, header: Header): Promise<Description> {
+/** A container whose end has been read. */
+interface Opened {
+  readonly size: number;
+  /** null: it is too large to be asked for. */
+  readonly index: Index | null;
+  /** A part of the container, of which the end is there already. */
+  read(offset: number, length: number): Promise<Uint8Array>;
+}
+
+async function openEnd(url: string, headers: Record<string, string>, header: Header): Promise<Opened> {
   const part = async (first: number, past: number): Promise<{ data: Uint8Array; size: number }> => {
     const range = { range: `bytes=${first}-${past - 1}` };
     const answer = await fetch(url, { headers: { ...headers, ...range }, cache: "no-store" });
@@ -66,19 +85,27 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
   const footer = parseFooter(data.subarray(data.length - FOOTER_LENGTH), size - FOOTER_LENGTH);
   // The metadata stand right before the index and have at most 64 KiB.
   const start = Math.max(0, footer.index.offset - (1 << 16) - 32);
-  if (first > footer.index.offset && size - start > LARGEST_TAIL) return { ...NO_DESCRIPTION, size };
   const read = async (offset: number, length: number): Promise<Uint8Array> => {
-    if (offset < first) {
+    if (offset >= start && offset < first) {
       data = (await part(offset, size)).data;
       first = offset;
     }
-    return data.subarray(offset - first, offset - first + length);
+    return offset < first
+      ? (await part(offset, offset + length)).data
+      : data.subarray(offset - first, offset - first + length);
   };
+  if (first > footer.index.offset && size - start > LARGEST_TAIL) return { size, index: null, read };
   // A header of a few bytes can announce any number of tiles, all of which an index lists.
   const capacity = new Capacity();
   capacity.promise(0, [], { masked: 0, tables: header.tables });
   capacity.take(INDEX_GROWTH * footer.index.length);
   const index = indexFrom(await read(footer.index.offset, footer.index.length), footer.index.offset, header);
+  return { size, index, read };
+}
+
+async function fromEnd(opened: Opened): Promise<Description> {
+  const { size, index, read } = opened;
+  if (index === null) return { ...NO_DESCRIPTION, size };
   const metadata = readMetadata(await read(index.metadata.offset, index.metadata.length), index.metadata.offset);
   const last = index.layers.at(-1);
   const prices: Price[] = index.layers.map(({ end, level, errors }) => ({
@@ -91,7 +118,15 @@ async function fromTail(url: string, headers: Record<string, string>, header: He
     const { errors, level } = index.levels.at(-1)!;
     prices.push({ bytes: index.surfaceEnd, level, rms: errors.rms, max: errors.maximum });
   }
-  return { metadata, prices, size };
+  return { metadata, prices, size, windows: () => windowsOf(opened) };
+}
+
+async function windowsOf({ index, read }: Opened): Promise<WindowErrors | null> {
+  if (index === null) return null;
+  return readWindowErrors(index, (offset, length) => {
+    if (length > LARGEST_TAIL) throw new Error(`expected errors of windows of at most ${LARGEST_TAIL} bytes`);
+    return read(offset, length);
+  });
 }
 
 /** The body of an answer. @throws Error if it is not of this length: what is longer is not read. */
@@ -114,7 +149,7 @@ async function bytesOf(answer: Response, length: number): Promise<Uint8Array> {
 }
 
 /** The description of a surface for those who look at it. */
-export function infoOf(header: Header, { metadata, prices, size }: Description): SurfaceInfo {
+export function infoOf(header: Header, { metadata, prices, size }: Omit<Description, "windows">): SurfaceInfo {
   const text = (key: string): string => {
     const value = metadata[key];
     return typeof value === "string" ? value : "";
@@ -132,7 +167,7 @@ export function infoOf(header: Header, { metadata, prices, size }: Description):
     joined: header.arrangement !== null,
     unit: text("unit"),
     exact: header.exact,
-    attributes: attributeNames(header),
+    attributes: attributesIn(header),
     size,
     prices,
   };

@@ -31,6 +31,11 @@ export function svg<K extends keyof SVGElementTagNameMap>(
   return filled(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
 }
 
+/** Whether the user wants nothing to move by itself. */
+export function isStill(): boolean {
+  return matchMedia("(prefers-reduced-motion: reduce)").matches;
+}
+
 /** Replaces the text of an element, if it is another. */
 export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;

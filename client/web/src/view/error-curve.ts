@@ -33,6 +33,16 @@ export function logScale(values: readonly number[], start: number, end: number):
   };
 }
 
+/** Pixels between the lowest power of ten and an error of 0. */
+const ZERO = 16;
+
+/** A logarithmic scale with a place below it for 0, if there is one among the values. */
+export function withZero(values: readonly number[], bottom: number, top: number): Scale & { readonly zero: boolean } {
+  const zero = values.includes(0);
+  const scale = logScale(values, zero ? bottom - ZERO : bottom, top);
+  return { ...scale, zero, place: (value) => (value > 0 ? scale.place(value) : bottom) };
+}
+
 /** What is drawn of one curve. */
 export interface CurveData {
   readonly prices: readonly Price[] | null;
@@ -47,14 +57,14 @@ export interface CurveData {
 export class ErrorCurve {
   readonly element = svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", class: "curve" });
 
-  /** Draws the data; an error of 0 lies on the lower edge. */
+  /** Draws the data; an error of 0 lies on a line of its own, below the logarithmic scale. */
   draw({ prices, moments, shown, axis, unit }: CurveData): void {
     const cost = (of: Moment): number => (axis === "bytes" ? of.bytes : of.seconds);
     const priced = axis === "bytes" ? (prices ?? []) : [];
     const known = moments.filter(({ rms }) => !Number.isNaN(rms));
     const errors = [...priced, ...known].flatMap(({ rms, max }) => [rms, max]);
     const x = logScale([...priced.map(({ bytes }) => bytes), ...moments.map(cost)], LEFT, WIDTH - RIGHT);
-    const y = logScale(errors, HEIGHT - BOTTOM, TOP);
+    const y = withZero(errors, HEIGHT - BOTTOM, TOP);
     const at = (of: { rms: number; max: number }, kind: "rms" | "max", along: number): string =>
       `${x.place(along).toFixed(1)},${y.place(of[kind]).toFixed(1)}`;
     const line = (kind: "rms" | "max") =>
@@ -83,11 +93,11 @@ export class ErrorCurve {
       ...dots("max"),
       ...dots("rms"),
     );
-    this.element.setAttribute("aria-label", describe(moments, axis, unit));
+    this.element.setAttribute("aria-label", describe(current, axis, unit));
   }
 }
 
-function axes(x: Scale, y: Scale, axis: CurveAxis): SVGElement[] {
+function axes(x: Scale, y: Scale & { readonly zero: boolean }, axis: CurveAxis): SVGElement[] {
   const parts: SVGElement[] = [];
   const every = (scale: Scale, most: number): number[] => {
     const step = Math.max(1, Math.ceil((scale.high - scale.low) / most));
@@ -95,7 +105,7 @@ function axes(x: Scale, y: Scale, axis: CurveAxis): SVGElement[] {
     for (let power = scale.low; power <= scale.high; power += step) ticks.push(10 ** power);
     return ticks;
   };
-  for (const value of every(y, 4)) {
+  for (const value of [...(y.zero ? [0] : []), ...every(y, 4)]) {
     const at = y.place(value);
     parts.push(svg("line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: at, y2: at }));
     parts.push(svg("text", { class: "tick", x: LEFT - 5, y: at + 3, "text-anchor": "end" }, formatNumber(value, 2)));
@@ -112,9 +122,8 @@ function axes(x: Scale, y: Scale, axis: CurveAxis): SVGElement[] {
   return parts;
 }
 
-function describe(moments: readonly Moment[], axis: CurveAxis, unit: string): string {
-  const last = moments.at(-1);
-  if (last === undefined) return "Error against bytes: nothing has come yet";
-  const cost = axis === "bytes" ? formatBytes(last.bytes) : formatSeconds(last.seconds);
-  return `Error against ${axis}: after ${cost}, RMS ${formatNumber(last.rms)} ${unit}, maximum ${formatNumber(last.max)} ${unit}`;
+function describe(shown: Moment | undefined, axis: CurveAxis, unit: string): string {
+  if (shown === undefined) return "Error against bytes: nothing is drawn yet";
+  const cost = axis === "bytes" ? formatBytes(shown.bytes) : formatSeconds(shown.seconds);
+  return `Error against ${axis}: after ${cost}, RMS ${formatNumber(shown.rms)} ${unit}, maximum ${formatNumber(shown.max)} ${unit}`;
 }

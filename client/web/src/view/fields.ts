@@ -1,9 +1,9 @@
 /** The numbers by which a surface is coloured. */
 
-import type { Field } from "./geometry-messages";
+import type { Component, Field } from "./geometry-messages";
 import { between, type Frame, interpolated, type Lattice, placesOf } from "./lattice";
 import { slopes } from "./normals";
-import type { Grid } from "./source";
+import type { AttributeGrid, Grid } from "./source";
 
 /** What stands in the place of a value that there is not. */
 export const NO_VALUE = -1e30;
@@ -71,13 +71,7 @@ export function fieldBefore(field: Field, old: Grid, input: FieldInput): Float64
   );
   const found = old.attributes.find(({ name }) => name === field.name);
   if (found === undefined) return null;
-  const { components, values } = found;
-  return interpolated(
-    down,
-    across,
-    old.columnsAt.length,
-    (node) => values[node * components + field.component] ?? Number.NaN,
-  );
+  return interpolated(down, across, old.columnsAt.length, reading(found, field.component));
 }
 
 function heights(nodes: Lattice, { origin, scale }: Frame): Float64Array {
@@ -100,8 +94,19 @@ function changes({ nodes, before, normals, frame }: FieldInput): Float64Array {
   });
 }
 
+/** Reads a component of an attribute, or the length of all of them, by nodes. */
+function reading({ components, values }: AttributeGrid, component: Component): (node: number) => number {
+  if (component !== "magnitude")
+    return component < components ? (node) => values[node * components + component]! : () => Number.NaN;
+  return (node) => {
+    let sum = 0;
+    for (let k = 0; k < components; k += 1) sum += values[node * components + k]! ** 2;
+    return Math.sqrt(sum);
+  };
+}
+
 function attributeAt(
-  field: { readonly name: string; readonly component: number },
+  field: { readonly name: string; readonly component: Component },
   grid: Grid,
   rows: readonly number[],
   columns: readonly number[],
@@ -109,12 +114,13 @@ function attributeAt(
   const found = grid.attributes.find(({ name }) => name === field.name);
   const values = new Float64Array(rows.length * columns.length).fill(Number.NaN);
   if (found === undefined) return values;
+  const read = reading(found, field.component);
   const [height, width] = [grid.rowsAt.length, grid.columnsAt.length];
   rows.forEach((row, i) => {
     columns.forEach((column, j) => {
       const node = (row % height) * width + (column % width);
       if (grid.mask?.[node] === 0) return;
-      values[i * columns.length + j] = found.values[node * found.components + field.component] ?? Number.NaN;
+      values[i * columns.length + j] = read(node);
     });
   });
   return values;

@@ -2,8 +2,9 @@
 
 import { html, setText } from "./dom";
 import { type CurveAxis, ErrorCurve } from "./error-curve";
-import { formatBytes, formatNumber, formatSeconds } from "./format";
-import type { Moment, Progress, SurfaceInfo, Target } from "./source";
+import { formatBytes, formatSeconds } from "./format";
+import type { Moment, Target } from "./source";
+import { detailText, errorText, type FocusState, isWhole, statusText } from "./status";
 
 /** What the panel asks for. */
 export interface FocusActions {
@@ -14,19 +15,6 @@ export interface FocusActions {
   setTarget(target: Target): void;
   throttle(rate: number | null): void;
   stopBelowPixel(on: boolean): void;
-}
-
-/** All that the panel shows. */
-export interface FocusState {
-  readonly info: SurfaceInfo | null;
-  readonly moments: readonly Moment[];
-  readonly drawn: Moment | null;
-  readonly drawnLevel: number;
-  readonly following: boolean;
-  readonly progress: Progress;
-  readonly belowPixel: boolean;
-  /** Seconds without a byte, while receiving. */
-  readonly silent: number;
 }
 
 const TARGETS: readonly (readonly [string, string])[] = [
@@ -127,7 +115,8 @@ export class FocusPanel {
 
   /** Goes so many moments back or on. */
   step(by: number): void {
-    const to = Math.min(Math.max(Number(this.slider.value) + by, 0), Number(this.slider.max));
+    const from = this.last?.following === false ? this.slider.value : this.slider.max;
+    const to = Math.min(Math.max(Number(from) + by, 0), Number(this.slider.max));
     this.slider.value = String(to);
     this.slide(to);
   }
@@ -148,9 +137,10 @@ export class FocusPanel {
     const [first, last] = [moments[0]?.number ?? 0, moments.at(-1)?.number ?? 0];
     this.slider.min = String(first);
     this.slider.max = String(last);
-    if (following) this.slider.value = String(last);
+    // Whoever follows sees where the picture is, which may take longer to draw than to come.
+    if (following) this.slider.value = String(drawn?.number ?? last);
+    setText(this.shown, drawn === null ? "" : formatBytes(drawn.bytes));
     const at = moments.find(({ number }) => number === Number(this.slider.value));
-    setText(this.shown, at === undefined ? "" : formatBytes(at.bytes));
     this.slider.setAttribute("aria-valuetext", at === undefined ? "nothing yet" : momentText(at, unit));
     setText(this.button, this.canStop ? "Stop" : progress.state === "failed" ? "Try again" : "Continue");
     this.button.hidden = isWhole(state);
@@ -187,53 +177,6 @@ export class FocusPanel {
   }
 }
 
-/** An error with its unit. */
-export function errorText(value: number, unit: string): string {
-  if (Number.isNaN(value)) return "not yet known";
-  return `${formatNumber(value, 3)} ${unit}`.trim();
-}
-
 function momentText(moment: Moment, unit: string): string {
   return `${formatBytes(moment.bytes)} after ${formatSeconds(moment.seconds)}, RMS error ${errorText(moment.rms, unit)}`;
-}
-
-/** Whether nothing is missing: also when the last bytes came after the transmission was stopped. */
-function isWhole({ progress, moments }: FocusState): boolean {
-  return progress.state === "complete" || moments.at(-1)?.complete === true;
-}
-
-function statusText(state: FocusState): string {
-  const { progress, belowPixel, silent, info, moments } = state;
-  if (isWhole(state) && progress.state !== "failed")
-    return info?.exact === false || moments.at(-1)?.rms !== 0 ? "Complete" : "Complete: exact";
-  if (belowPixel) return "Below a pixel: paused";
-  switch (progress.state) {
-    case "connecting":
-      return "Connecting";
-    case "receiving":
-      return silent >= 3 ? `Waiting: no data for ${silent} s` : "Receiving";
-    case "waiting":
-      return "Waiting";
-    case "resuming":
-      return "Link lost: resuming";
-    case "stopped":
-      return "Stopped";
-    case "target":
-      return "Target met";
-    case "complete":
-      return "Complete";
-    case "failed":
-      return "Failed";
-  }
-}
-
-function detailText({ progress, info, drawn, drawnLevel }: FocusState): string {
-  const total = progress.planned || info?.size || 0;
-  const parts = [total > 0 ? `${formatBytes(progress.bytes)} of ${formatBytes(total)}` : formatBytes(progress.bytes)];
-  if (progress.state === "receiving" && progress.rate > 0) parts.push(`${formatBytes(progress.rate)}/s`);
-  if (drawn !== null && info !== null) {
-    const level = `level ${drawn.level} of ${info.levels}`;
-    parts.push(drawnLevel < drawn.level ? `${level} (drawn ${drawnLevel})` : level);
-  }
-  return [parts.join(" · "), progress.detail].filter((text) => text !== "").join(". ");
 }

@@ -38,6 +38,15 @@ export function formatWithin(value: number, [low, high]: readonly [number, numbe
   return String(Number(value.toFixed(places))).replace(/^-0$/, "0");
 }
 
+/** A number as it was stored: with the fewest digits that give the same float32, where it is one, and no more than 10. */
+export function formatStored(value: number): string {
+  if (Math.fround(value) !== value) return formatNumber(value, 10);
+  for (let digits = 1; digits < 9; digits += 1) {
+    if (Math.fround(Number(value.toPrecision(digits))) === value) return formatNumber(value, digits);
+  }
+  return formatNumber(value, 10);
+}
+
 /** Seconds as text: 0.42 s, 12 s, 3 min 20 s. */
 export function formatSeconds(seconds: number): string {
   if (seconds < 10) return `${seconds.toFixed(2)} s`;

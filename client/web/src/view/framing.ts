@@ -19,6 +19,8 @@ function triple(of: (axis: 0 | 1 | 2) => number): [number, number, number] {
 export class Framing {
   /** Half the drawn extent along each axis, before exaggeration. */
   readonly half: Triple;
+  /** The middle of what is drawn, before exaggeration. */
+  readonly centre: Triple;
   /** Half the drawn diagonal of the whole surface where what is drawn may still be smaller; else 0. */
   readonly whole: number;
 
@@ -27,19 +29,30 @@ export class Framing {
     box: Box,
     private readonly info: SurfaceInfo,
   ) {
-    this.half = triple((k) => ((box[1][k] - box[0][k]) / 2) * frame.scale[k]);
+    const half = triple((k) => ((box[1][k] - box[0][k]) / 2) * frame.scale[k]);
+    this.centre = triple((k) => ((box[0][k] + box[1][k]) / 2 - frame.origin[k]) * frame.scale[k]);
+    // Of heights the range is known before any of them.
+    if (info.heights) half[2] = (info.extent / 2) * frame.scale[2];
+    this.half = half;
     // Where z has a scale of its own, the diagonal says nothing.
     this.whole = info.heights || frame.scale[0] !== frame.scale[2] ? 0 : (info.extent / 2) * frame.scale[0];
   }
 
   /** How far from 0 anything is drawn, before exaggeration. */
   get radius(): number {
-    return 1.5 * Math.max(Math.hypot(...this.half), this.whole);
+    return Math.hypot(...this.centre) + 1.5 * Math.max(Math.hypot(...this.half), this.whole);
   }
 
   /** By how much heights are exaggerated where nobody says it. */
   get exaggeration(): number {
     return defaultExaggeration(this.half, this.info.heights);
+  }
+
+  /** Whether heights have a scale of their own, since they have another unit than x and y. */
+  get isFitted(): boolean {
+    const { scale } = this.frame;
+    const own = this.info.geographic ? scale[1] / DEGREE : scale[1];
+    return Math.abs(scale[2] - own) > 1e-9 * own;
   }
 
   /** Whether another frame draws coordinates elsewhere. */
@@ -49,8 +62,19 @@ export class Framing {
 
   /** The camera that sees all. @param aspect - Width of the view by its height. */
   home(exaggeration: number, aspect: number): Orbit {
+    return this.info.heights ? this.fitted(exaggeration, aspect, -90, 42) : this.fitted(exaggeration, aspect, -60, 25);
+  }
+
+  /** Likewise, from above with y upwards. */
+  above(exaggeration: number, aspect: number): Orbit {
+    return this.fitted(exaggeration, aspect, -90, 89.9);
+  }
+
+  private fitted(exaggeration: number, aspect: number, azimuth: number, elevation: number): Orbit {
     const [x, y, z] = this.half;
-    return fitted([x, y, z * exaggeration], this.whole, aspect, this.info.heights);
+    const [a, b, c] = this.centre;
+    const orbit = fitted([x, y, z * exaggeration], this.whole, aspect, azimuth, elevation);
+    return { ...orbit, target: [a, b, c * exaggeration] };
   }
 
   /** A point as it is drawn. */

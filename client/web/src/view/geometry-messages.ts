@@ -7,7 +7,10 @@ import type { Grid, Region } from "./source";
 /** What the surface is coloured by. */
 export type Field =
   | { readonly kind: "height" | "slope" | "change" | "none" }
-  | { readonly kind: "attribute"; readonly name: string; readonly component: number };
+  | { readonly kind: "attribute"; readonly name: string; readonly component: Component };
+
+/** One of an attribute's numbers at a point, from 0; or the length of the vector that all of them are. */
+export type Component = number | "magnitude";
 
 /** What decides at which strides patches are drawn. */
 export interface Eye {
@@ -27,7 +30,7 @@ export interface PatchBuffers {
   /** [node, xyz]; what it was a picture before; null: the same. */
   readonly positions: Float32Array;
   readonly from: Float32Array | null;
-  /** [node, xyz0], -127 to 127; likewise. */
+  /** [node, xyz and 127 for a line], -127 to 127; likewise. */
   readonly normals: Int8Array;
   readonly fromNormals: Int8Array | null;
   /** [node], 0 to 1 over the span of `Colouring`; far below 0 where there is no value; likewise. */
@@ -36,6 +39,8 @@ export interface PatchBuffers {
   /** [node, row and column], in lines of the level in hand. */
   readonly places: Float32Array;
   readonly triangles: Uint16Array | Uint32Array;
+  /** Ends of the pieces of a line, two by two, of a block of one row or column; null: there are triangles. */
+  readonly pieces: Uint32Array | null;
   /** Centre and radius. */
   readonly sphere: readonly [number, number, number, number];
 }

@@ -65,8 +65,8 @@ function send({ patches, triangles }: Change, fresh: boolean): void {
 }
 
 function buffersOf(patch: PatchBuffers): Transferable[] {
-  const { positions, from, normals, fromNormals, values, fromValues, places, triangles } = patch;
-  return [positions, from, normals, fromNormals, values, fromValues, places, triangles].flatMap((array) =>
+  const { positions, from, normals, fromNormals, values, fromValues, places, triangles, pieces } = patch;
+  return [positions, from, normals, fromNormals, values, fromValues, places, triangles, pieces].flatMap((array) =>
     array === null ? [] : [array.buffer as ArrayBuffer],
   );
 }

@@ -6,7 +6,7 @@ import { extremes, type FieldInput, fieldBefore, fieldValues, inner, NO_VALUE } 
 import type { Box, Colouring, Eye, Field, Hit, PatchBuffers } from "./geometry-messages";
 import { type Frame, latticeBetween, latticeOf, placesOf } from "./lattice";
 import { normalSums, packedNormals } from "./normals";
-import { linesOf, type Patch, patchesOf, patchSize, quadsOf } from "./patches";
+import { isLine, linesOf, type Patch, patchesOf, patchSize, piecesOf, quadsOf } from "./patches";
 import { pick } from "./picking";
 import type { Grid, Region } from "./source";
 import { type StridesBeside, stitched } from "./stitching";
@@ -210,12 +210,14 @@ export class Geometry {
     const beside = patch.beside.map((other) => (other < 0 ? 0 : this.strides[other]!)) as unknown as StridesBeside;
     const triangles = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
     const { centre, half } = this.bounds[number]!;
+    const line = isLine(patch);
     return {
       patch: number,
+      pieces: line ? piecesOf(nodes.valid) : null,
       positions: Float32Array.from(nodes.points),
       from: blended === null ? null : merged(blended.points, blended.valid, nodes.points),
-      normals: packedNormals(normals),
-      fromNormals: blended === null || beforeAround === null ? null : packedNormals(normalSums(beforeAround)),
+      normals: packedNormals(normals, line),
+      fromNormals: blended === null || beforeAround === null ? null : packedNormals(normalSums(beforeAround), line),
       values,
       fromValues: valuesBefore === null ? null : this.packed(valuesBefore),
       places: placesOfNodes(rows, columns),

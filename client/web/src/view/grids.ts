@@ -6,7 +6,7 @@ import type { Metadata } from "../container/sections";
 import { evaluate, type RulePlane } from "../coordinates/coordinate-rules";
 import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../coordinates/height-fields";
 import type { Block, PointArray } from "../types";
-import type { AttributeGrid, Grid } from "./source";
+import type { AttributeGrid, AttributeInfo, Grid } from "./source";
 
 /** Whether the points are heights that the header gives no x and y for. */
 export function areHeights(header: Header): boolean {
@@ -128,10 +128,13 @@ function attributesOf(block: Block, values: Float64Array): AttributeGrid[] {
   return result;
 }
 
-/** Names of `attributesOf`, from the header alone. */
-export function attributeNames(header: Header): string[] {
+/** Names and components of `attributesOf`, from the header alone. */
+export function attributesIn(header: Header): AttributeInfo[] {
   const channels = Array.from({ length: Math.max(0, header.pointChannels - 3) }, (_, k) => `channel ${k + 3}`);
-  return [...channels, ...header.attributes.map(({ name }) => name)];
+  return [
+    ...channels.map((name) => ({ name, components: 1 })),
+    ...header.attributes.map(({ name, components }) => ({ name, components: Math.max(components, 1) })),
+  ];
 }
 
 /** x and y of one node of heights at full resolution. */

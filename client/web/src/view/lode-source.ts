@@ -1,6 +1,6 @@
 /** The source of containers: a surface of a server, or a container file of any host. Everything happens in a worker. */
 
-import type { DetailWindow, Grid, NodeValues, Region, Source, SourceEvents, Target } from "./source";
+import type { DetailWindow, MomentGrids, NodeValues, Region, Source, SourceEvents, Target } from "./source";
 import type { FromSource, Question, ToSource } from "./source-messages";
 import SourceWorker from "./source-worker?worker&inline";
 
@@ -29,6 +29,7 @@ export class LodeSource implements Source {
       if (data.kind === "info") events.info(data.info);
       else if (data.kind === "moment") events.moment(data.moment);
       else if (data.kind === "progress") events.progress(data.progress);
+      else if (data.kind === "refined") events.refined();
       else {
         const waiting = this.waiting.get(data.id);
         this.waiting.delete(data.id);
@@ -43,9 +44,10 @@ export class LodeSource implements Source {
     this.post({ kind: "open", url: this.url, token: this.token });
   }
 
-  async grids(moment: number, level: number, window: DetailWindow | null): Promise<Grid[]> {
+  async grids(moment: number | null, level: number, window: DetailWindow | null): Promise<MomentGrids> {
     const answer = await this.ask({ kind: "grids", moment, level, window });
-    return answer.kind === "grids" ? answer.grids : [];
+    if (answer.kind !== "grids") throw new Error(`expected grids, got ${answer.kind}`);
+    return answer.picture;
   }
 
   async valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues> {

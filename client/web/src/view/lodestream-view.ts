@@ -1,13 +1,13 @@
 /** `<lodestream-view>`: a surface that comes into focus, with its controls. */
 
-import { type Orbit, positionOf } from "./camera";
-import { html, setText } from "./dom";
+import { positionOf } from "./camera";
+import { html, isStill, setText } from "./dom";
 import { FocusPanel } from "./focus-panel";
 import { Framing } from "./framing";
 import type { FromGeometry } from "./geometry-messages";
 import { type Command, listen } from "./gestures";
 import { Legend, ScaleBar } from "./legend";
-import { fieldName, type Look, legendOf, mapFor, shownRange } from "./look";
+import { fieldsOf, type Look, legendOf, mapFor, sameField, shownRange } from "./look";
 import { LookPanel } from "./look-panel";
 import { Probe } from "./probe";
 import { Session } from "./session";
@@ -16,6 +16,7 @@ import type { Moment, Source, SurfaceInfo } from "./source";
 import { Stage } from "./stage";
 import { styles } from "./styles";
 import type { SharedView } from "./url-state";
+import { Viewpoint } from "./viewpoint";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -49,9 +50,8 @@ export class LodestreamView extends HTMLElement {
   private readonly sharing = new Sharing(() => this.sharedView());
   private stage: Stage | null = null;
   private session: Session | null = null;
-  private orbit: Orbit | null = null;
-  private home: Orbit | null = null;
-  private framing: Framing | null = null;
+  private viewpoint = this.newViewpoint();
+  private gliding = 0;
   private latest: Patches | null = null;
   private look: Look = { field: { kind: "height" }, map: "viridis", range: null, exaggeration: 1, lines: false };
   private shared: SharedView = {};
@@ -134,6 +134,7 @@ export class LodestreamView extends HTMLElement {
     }
     const watcher = new ResizeObserver(() => {
       this.stage?.resize();
+      this.viewpoint.resize(this.aspect);
       this.session?.viewChanged();
     });
     watcher.observe(this.canvas);
@@ -141,8 +142,8 @@ export class LodestreamView extends HTMLElement {
     listen(
       this.canvas,
       {
-        orbit: () => this.orbit ?? { azimuth: 0, elevation: 30, distance: 5, target: [0, 0, 0] },
-        setOrbit: (orbit) => this.setOrbit(orbit),
+        orbit: () => this.viewpoint.orbit ?? { azimuth: 0, elevation: 30, distance: 5, target: [0, 0, 0] },
+        setOrbit: (orbit) => this.viewpoint.place(orbit),
         anchor: () => this.anchor(),
         point: (at) => this.point(at),
         command: (name) => this.command(name),
@@ -160,6 +161,8 @@ export class LodestreamView extends HTMLElement {
 
   disconnectedCallback(): void {
     this.life?.abort();
+    cancelAnimationFrame(this.gliding);
+    this.gliding = 0;
     this.session?.close();
     this.session = null;
     this.stage?.dispose();
@@ -181,9 +184,7 @@ export class LodestreamView extends HTMLElement {
   private open(): void {
     this.session?.close();
     this.session = null;
-    this.orbit = null;
-    this.home = null;
-    this.framing = null;
+    this.viewpoint = this.newViewpoint();
     this.latest = null;
     this.notice.textContent = "";
     const { src, stage } = this;
@@ -210,6 +211,7 @@ export class LodestreamView extends HTMLElement {
           this.failed = progress.state === "failed";
           this.changed("progress", progress);
         },
+        refined: () => this.session !== null && this.probe.again(this.session),
         drawn: (patches, moment) => this.drawn(patches, moment),
         failed: (detail) => setText(this.notice, detail),
       },
@@ -235,11 +237,8 @@ export class LodestreamView extends HTMLElement {
       `Surface ${name}. Arrow keys turn it, plus and minus zoom.`.replace("  ", " "),
     );
     this.lookPanel.offer(info);
-    if (info.blocks.every(({ shape }) => Math.min(...shape) < 2)) {
-      setText(this.notice, "This is a line of points: there is no surface to draw.");
-    }
     const { field } = this.look;
-    if (field.kind === "attribute" && !info.attributes.includes(field.name))
+    if (!fieldsOf(info).some((other) => sameField(other, field)))
       this.setLook({ ...this.look, field: { kind: "height" } });
     this.setLook({
       ...this.look,
@@ -253,9 +252,7 @@ export class LodestreamView extends HTMLElement {
     const { stage, session } = this;
     if (stage === null || session?.info == null) return;
     this.latest = patches;
-    if (this.framing === null || this.framing.differs(patches.frame)) {
-      this.reframe(new Framing(patches.frame, patches.box, session.info));
-    }
+    if (patches.fresh) this.follow(new Framing(patches.frame, patches.box, session.info));
     this.colour();
     this.canvas.dataset.triangles = String(patches.triangles);
     this.refresh();
@@ -266,18 +263,35 @@ export class LodestreamView extends HTMLElement {
     );
   }
 
-  /** Places the camera: to see all, or where it was if it has been moved. */
-  private reframe(framing: Framing): void {
-    const { orbit, home, framing: before, stage, shared } = this;
-    const { exaggeration } = this.look;
-    const kept = orbit !== null && orbit !== home ? before?.toSurface(orbit, exaggeration) : shared.camera;
-    this.framing = framing;
-    stage?.setRadius(framing.radius);
-    if (before === null) this.setLook({ ...this.look, exaggeration: shared.exaggeration ?? framing.exaggeration });
-    const [width, height] = stage?.size ?? [1, 1];
-    this.home = framing.home(this.look.exaggeration, width / height);
-    this.setOrbit(kept === undefined ? this.home : framing.toDrawn(kept, this.look.exaggeration));
+  private get aspect(): number {
+    const [width, height] = this.stage?.size ?? [1, 1];
+    return width / height;
+  }
+
+  private newViewpoint(): Viewpoint {
+    return new Viewpoint(({ orbit, exaggeration }) => {
+      this.stage?.setOrbit(orbit);
+      this.stage?.setExaggeration(exaggeration);
+      this.session?.viewChanged();
+      this.sharing.later();
+    });
+  }
+
+  /** Camera and exaggeration follow what the picture shows of the surface, unless somebody has set them. */
+  private follow(framing: Framing): void {
+    const { viewpoint } = this;
+    this.stage?.setRadius(framing.radius);
+    viewpoint.take(framing, this.aspect, isStill() ? null : performance.now(), this.shared);
     this.shared = {};
+    this.look = { ...this.look, exaggeration: viewpoint.exaggeration };
+    if (this.gliding === 0) this.glide();
+  }
+
+  private glide(): void {
+    this.gliding = requestAnimationFrame(() => {
+      this.gliding = 0;
+      if (this.viewpoint.advance(performance.now())) this.glide();
+    });
   }
 
   private changed(kind: "info" | "moment" | "progress", detail: unknown): void {
@@ -312,17 +326,14 @@ export class LodestreamView extends HTMLElement {
   }
 
   private setLook(look: Look): void {
-    const { session, stage } = this;
+    const { session } = this;
     const before = this.look;
     if (look.field !== before.field) {
       session?.setField(look.field);
       look = { ...look, map: mapFor(look.field, session?.info ?? null), range: null };
     }
     this.look = look;
-    if (look.exaggeration !== before.exaggeration) {
-      stage?.setExaggeration(look.exaggeration);
-      session?.viewChanged();
-    }
+    if (look.exaggeration !== before.exaggeration) this.viewpoint.exaggerate(look.exaggeration);
     this.colour();
     this.sharing.later();
   }
@@ -331,23 +342,17 @@ export class LodestreamView extends HTMLElement {
   private colour(): void {
     const { latest, look, session, stage } = this;
     const range = latest === null ? null : shownRange(look, latest.colouring);
-    this.lookPanel.draw(look, range ?? [Number.NaN, Number.NaN]);
+    this.lookPanel.draw(look, range ?? [Number.NaN, Number.NaN], this.viewpoint.framing?.isFitted ?? false);
     if (latest === null || range === null || stage === null) return;
     const { low, span } = latest.colouring;
     stage.setLook(look, (range[0] - low) / span, (range[1] - low) / span);
-    this.legend.draw(legendOf(look, range, session?.info?.unit ?? ""));
-  }
-
-  private setOrbit(orbit: Orbit): void {
-    this.orbit = orbit;
-    this.stage?.setOrbit(orbit);
-    this.session?.viewChanged();
-    this.sharing.later();
+    this.legend.draw(legendOf(look, range, session?.info ?? null));
   }
 
   /** Draws what lies over the picture: scale, north, and the place whose values are shown. */
   private drawOver(): void {
-    const { orbit, framing, session, stage } = this;
+    const { session, stage } = this;
+    const { orbit, framing } = this.viewpoint;
     if (orbit === null || framing === null || stage === null || session?.info == null) return;
     const { pixels, unit } = framing.scale(orbit, stage.size[1]);
     this.scales.draw(pixels, unit, session.info.georeferenced ? orbit.azimuth : null);
@@ -362,10 +367,10 @@ export class LodestreamView extends HTMLElement {
     const { session } = this;
     switch (name) {
       case "home":
-        if (this.home !== null) this.setOrbit(this.home);
+        this.viewpoint.goHome();
         break;
       case "top":
-        if (this.home !== null) this.setOrbit({ ...this.home, azimuth: -90, elevation: 89.9 });
+        this.viewpoint.goAbove();
         break;
       case "stop":
         if (this.focusPanel.canStop) session?.stop();
@@ -406,23 +411,31 @@ export class LodestreamView extends HTMLElement {
   /** The last place under the pointer, as it is drawn. */
   private anchor(): [number, number, number] | null {
     const { at } = this.probe;
-    return at === null || this.framing === null ? null : this.framing.drawn(at, this.look.exaggeration);
+    const { framing } = this.viewpoint;
+    return at === null || framing === null ? null : framing.drawn(at, this.look.exaggeration);
   }
 
-  /** The view as it is shared. */
+  /** The view as it is shared: what nobody has set is left to follow the surface there too. */
   private sharedView(): SharedView | null {
-    const { framing, orbit, look } = this;
+    const { framing, orbit, isHeld, isChosen } = this.viewpoint;
     if (!this.isConnected || !this.hasAttribute("share") || orbit === null || framing === null) return null;
-    const { field, map, range, exaggeration, lines } = look;
-    const camera = framing.toSurface(orbit, exaggeration);
-    return { camera, field, map, exaggeration, lines, ...(range === null ? {} : { range }) };
+    const { field, map, range, exaggeration, lines } = this.look;
+    return {
+      ...(isHeld ? { camera: framing.toSurface(orbit, exaggeration) } : {}),
+      field,
+      map,
+      ...(isHeld || isChosen ? { exaggeration } : {}),
+      lines,
+      ...(range === null ? {} : { range }),
+    };
   }
 
   /** Shows the view of an address that the user has entered. */
   private takeShared({ camera, field, map, range, exaggeration, lines }: SharedView): void {
-    if (this.framing === null) return;
+    const { framing } = this.viewpoint;
+    if (framing === null) return;
     const { look } = this;
-    if (field !== undefined && fieldName(field) !== fieldName(look.field)) this.setLook({ ...look, field });
+    if (field !== undefined && !sameField(field, look.field)) this.setLook({ ...look, field });
     const kept = this.look;
     this.setLook({
       ...kept,
@@ -431,11 +444,12 @@ export class LodestreamView extends HTMLElement {
       exaggeration: exaggeration ?? kept.exaggeration,
       lines: lines ?? false,
     });
-    if (camera !== undefined) this.setOrbit(this.framing.toDrawn(camera, this.look.exaggeration));
+    if (camera !== undefined) this.viewpoint.place(framing.toDrawn(camera, this.look.exaggeration));
   }
 
   /** Where the camera is, in drawn coordinates; for tests. */
   get cameraPosition(): [number, number, number] | null {
-    return this.orbit === null ? null : positionOf(this.orbit);
+    const { orbit } = this.viewpoint;
+    return orbit === null ? null : positionOf(orbit);
   }
 }

@@ -2,9 +2,9 @@
 
 import { COLOUR_MAPS, isColourMap } from "./colour-maps";
 import { html, setText } from "./dom";
-import { formatNumber } from "./format";
+import { formatNumber, formatWithin } from "./format";
 import type { Field } from "./geometry-messages";
-import { fieldName, type Look } from "./look";
+import { fieldName, fieldsOf, type Look, sameField } from "./look";
 import type { SurfaceInfo } from "./source";
 
 const KEYS: readonly (readonly [string, string])[] = [
@@ -108,34 +108,33 @@ export class LookPanel {
 
   /** Offers what a surface has. */
   offer(info: SurfaceInfo): void {
-    this.fields = [
-      { kind: "height" },
-      { kind: "slope" },
-      { kind: "change" },
-      ...info.attributes.map((name): Field => ({ kind: "attribute", name, component: 0 })),
-      { kind: "none" },
-    ];
-    this.field.replaceChildren(...this.fields.map((field, k) => html("option", { value: k }, fieldName(field))));
-    if (this.look !== null) this.draw(this.look, [Number.NaN, Number.NaN]);
+    this.fields = fieldsOf(info);
+    this.field.replaceChildren(...this.fields.map((field, k) => html("option", { value: k }, fieldName(field, info))));
+    if (this.look !== null) this.draw(this.look, [Number.NaN, Number.NaN], false);
   }
 
-  /** Shows a look, and the range that colours have now. */
-  draw(look: Look, range: readonly [number, number]): void {
+  /**
+   * Shows a look, and the range that colours have now.
+   *
+   * @param fitted - Heights have another unit than x and y: what they are exaggerated by is no ratio of lengths.
+   */
+  draw(look: Look, range: readonly [number, number], fitted: boolean): void {
     this.look = look;
-    const same = (a: Field, b: Field): boolean => JSON.stringify(a) === JSON.stringify(b);
-    this.field.value = String(this.fields.findIndex((field) => same(field, look.field)));
+    this.field.value = String(this.fields.findIndex((field) => sameField(field, look.field)));
     this.map.value = look.map;
     const root = this.element.getRootNode() as ShadowRoot;
     for (const [input, value] of [
       [this.low, range[0]],
       [this.high, range[1]],
     ] as const) {
-      if (root.activeElement !== input && Number.isFinite(value)) input.value = String(Number(value.toPrecision(5)));
+      if (root.activeElement !== input && Number.isFinite(value))
+        input.value = look.range === null ? formatWithin(value, range) : formatNumber(value, 7);
     }
-    this.auto.disabled = look.range === null;
+    this.auto.hidden = look.range === null;
     this.exaggeration.value = String(Math.log10(look.exaggeration));
-    setText(this.times, `× ${formatNumber(look.exaggeration, 2)}`);
-    this.exaggeration.setAttribute("aria-valuetext", `times ${formatNumber(look.exaggeration, 2)}`);
+    const times = formatNumber(look.exaggeration, 3);
+    setText(this.times, fitted ? (times === "1" ? "fitted" : `fitted × ${times}`) : `× ${times}`);
+    this.exaggeration.setAttribute("aria-valuetext", fitted ? `fitted, times ${times}` : `times ${times}`);
     this.lines.checked = look.lines;
     this.rangeRow.hidden = look.field.kind === "none";
     this.mapRow.hidden = look.field.kind === "none";

@@ -1,7 +1,7 @@
 /** How a surface looks: what it is coloured by, with which map and range. */
 
 import { type ColourMapName, rangeOf } from "./colour-maps";
-import type { Colouring, Field } from "./geometry-messages";
+import type { Colouring, Component, Field } from "./geometry-messages";
 import type { LegendData } from "./legend";
 import type { SurfaceInfo } from "./source";
 
@@ -27,8 +27,27 @@ export function isCentred(field: Field): boolean {
   return field.kind === "change";
 }
 
-/** How a field is called. */
-export function fieldName(field: Field): string {
+/** The most components of one attribute that can be chosen. */
+const MOST_COMPONENTS = 16;
+
+/** What a surface can be coloured by. */
+export function fieldsOf(info: SurfaceInfo): Field[] {
+  const attributes = info.attributes.flatMap(({ name, components }) => {
+    const each = Array.from({ length: Math.min(components, MOST_COMPONENTS) }, (_, component) => component);
+    const all: Component[] = components > 1 ? ["magnitude", ...each] : each;
+    return all.map((component): Field => ({ kind: "attribute", name, component }));
+  });
+  return [{ kind: "height" }, { kind: "slope" }, { kind: "change" }, ...attributes, { kind: "none" }];
+}
+
+/** Whether two fields are the same. */
+export function sameField(a: Field, b: Field): boolean {
+  if (a.kind !== "attribute" || b.kind !== "attribute") return a.kind === b.kind;
+  return a.name === b.name && a.component === b.component;
+}
+
+/** How a field of a surface is called. */
+export function fieldName(field: Field, info: SurfaceInfo | null): string {
   switch (field.kind) {
     case "none":
       return "Shading only";
@@ -39,7 +58,8 @@ export function fieldName(field: Field): string {
     case "change":
       return "Last change";
     case "attribute":
-      return field.component === 0 ? field.name : `${field.name}, component ${field.component}`;
+      if ((info?.attributes.find(({ name }) => name === field.name)?.components ?? 1) === 1) return field.name;
+      return field.component === "magnitude" ? `${field.name}, magnitude` : `${field.name}[${field.component}]`;
   }
 }
 
@@ -49,9 +69,14 @@ export function shownRange(look: Look, { range }: Colouring): [number, number] {
 }
 
 /** What the legend says of a look; null: nothing. */
-export function legendOf({ field, map }: Look, range: readonly [number, number], unit: string): LegendData | null {
+export function legendOf(
+  { field, map }: Look,
+  range: readonly [number, number],
+  info: SurfaceInfo | null,
+): LegendData | null {
   if (field.kind === "none") return null;
+  const unit = info?.unit ?? "";
   const own = field.kind === "slope" ? "degrees" : field.kind === "attribute" ? "" : unit;
   const note = field.kind === "attribute" ? "Grey: no value" : "";
-  return { title: fieldName(field), unit: own, map, range, note };
+  return { title: fieldName(field, info), unit: own, map, range, note };
 }

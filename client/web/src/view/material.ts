@@ -7,7 +7,7 @@ const VERTEX = `
 precision highp float;
 uniform mat4 modelViewMatrix, projectionMatrix;
 uniform mat3 viewNormals;
-uniform float morph, exaggeration;
+uniform float morph, exaggeration, thickness;
 in vec3 position, from;
 in vec4 upright, fromUpright;
 in float shown, fromShown;
@@ -15,6 +15,7 @@ in vec2 place;
 out vec3 normalInView, inView;
 out float value;
 out vec2 line;
+out float thin;
 void main() {
   vec4 seen = modelViewMatrix * vec4(mix(from, position, morph), 1.0);
   vec3 up = mix(fromUpright.xyz, upright.xyz, morph);
@@ -23,6 +24,8 @@ void main() {
   value = mix(fromShown, shown, morph);
   if (min(fromShown, shown) < -1e20) value = shown;
   line = place;
+  thin = upright.w;
+  gl_PointSize = thickness;
   gl_Position = projectionMatrix * seen;
 }`;
 
@@ -35,6 +38,7 @@ uniform vec3 light, blank, ink;
 in vec3 normalInView, inView;
 in float value;
 in vec2 line;
+in float thin;
 out vec4 colour;
 void main() {
   vec3 normal = normalize(normalInView);
@@ -51,7 +55,8 @@ void main() {
     vec2 drawn = (1.0 - smoothstep(0.4, 1.3, off)) * fade;
     shade = mix(shade, ink, 0.55 * max(drawn.x, drawn.y));
   }
-  colour = vec4(shade, 1.0);
+  // A line has no side that light falls on.
+  colour = vec4(thin > 0.5 ? base * 0.85 : shade, 1.0);
 }`;
 
 /** The material of all patches. */
@@ -70,6 +75,7 @@ export class SurfaceMaterial extends RawShaderMaterial {
         viewNormals: { value: null },
         morph: { value: 1 },
         exaggeration: { value: 1 },
+        thickness: { value: 3 },
         map: { value: map },
         range: { value: new Vector2(0, 1) },
         lines: { value: 0 },
@@ -83,7 +89,7 @@ export class SurfaceMaterial extends RawShaderMaterial {
   }
 
   /** Sets a uniform. */
-  set(name: "morph" | "exaggeration" | "lines" | "plain", value: number): void {
+  set(name: "morph" | "exaggeration" | "lines" | "plain" | "thickness", value: number): void {
     this.uniforms[name]!.value = value;
   }
 

@@ -48,15 +48,17 @@ function cross(p: Float64Array, a: number, b: number, c: number, d: number, out:
  * Normals as the graphics card takes them.
  *
  * @param sums - [node, xyz] of any length.
- * @returns [node, xyz and 0], each from -127 to 127; upwards where the sum is 0.
+ * @param line - Of nodes of a line, which has none.
+ * @returns [node, xyz and whether it is a line], each from -127 to 127; upwards where the sum is 0.
  */
-export function packedNormals(sums: Float64Array): Int8Array {
+export function packedNormals(sums: Float64Array, line = false): Int8Array {
   const packed = new Int8Array((sums.length / 3) * 4);
   for (let node = 0; 3 * node < sums.length; node += 1) {
     const [x, y, z] = [sums[3 * node]!, sums[3 * node + 1]!, sums[3 * node + 2]!];
     const length = Math.hypot(x, y, z);
     packed[4 * node] = length > 0 ? Math.round((127 * x) / length) : 0;
     packed[4 * node + 1] = length > 0 ? Math.round((127 * y) / length) : 0;
+    packed[4 * node + 3] = line ? 127 : 0;
     packed[4 * node + 2] = length > 0 ? Math.round((127 * z) / length) : 127;
   }
   return packed;

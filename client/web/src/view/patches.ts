@@ -13,7 +13,10 @@ export function quadsOf(shape: readonly [number, number], closed: readonly [bool
   }) as [number, number];
 }
 
-/** A rectangle of quads of one block; `rows[1]` and `columns[1]` are their last lines of nodes, not past them. */
+/**
+ * A rectangle of quads of one block; `rows[1]` and `columns[1]` are their last lines of nodes, not past them. Of a block
+ * of a single row or column it is a piece of that line: both lines of nodes are the same.
+ */
 export interface Patch {
   readonly block: number;
   readonly rows: readonly [number, number];
@@ -32,7 +35,8 @@ const MOST_PATCHES = 1024;
  */
 export function patchSize(quads: readonly (readonly [number, number])[]): number {
   for (let size = 32; ; size *= 2) {
-    const count = quads.reduce((sum, [a, b]) => sum + Math.ceil(a / size) * Math.ceil(b / size), 0);
+    const across = (count: number): number => Math.max(1, Math.ceil(count / size));
+    const count = quads.reduce((sum, [a, b]) => sum + across(a) * across(b), 0);
     if (count <= Math.max(MOST_PATCHES, quads.length) || size >= 256) return size;
   }
 }
@@ -50,7 +54,7 @@ export function patchesOf(
   first: number,
 ): Patch[] {
   const quads = quadsOf(shape, closed);
-  const [down, across] = quads.map((count) => Math.ceil(count / size)) as [number, number];
+  const [down, across] = quads.map((count) => Math.max(1, Math.ceil(count / size))) as [number, number];
   const number = (row: number, column: number): number => {
     if (closed[0]) row = (row + down) % down;
     if (closed[1]) column = (column + across) % across;
@@ -76,6 +80,27 @@ export function linesOf([first, last]: readonly [number, number], stride: number
   for (let k = first; k < last; k += stride) lines.push(k);
   lines.push(last);
   return lines;
+}
+
+/** Whether a patch is a piece of a line of nodes. */
+export function isLine({ rows, columns }: Patch): boolean {
+  return rows[0] === rows[1] || columns[0] === columns[1];
+}
+
+/**
+ * What is drawn of a line of nodes.
+ *
+ * @param valid - [node], 0 at holes.
+ * @returns the two ends of each piece; a node without neighbours is both ends of one.
+ */
+export function piecesOf(valid: Uint8Array): Uint32Array {
+  const ends: number[] = [];
+  valid.forEach((own, node) => {
+    if (own === 0) return;
+    if (valid[node + 1] === 1) ends.push(node, node + 1);
+    else if (valid[node - 1] !== 1) ends.push(node, node);
+  });
+  return Uint32Array.from(ends);
 }
 
 /** Triangles of a patch at a stride, if none is left out. */

@@ -2,11 +2,14 @@
 
 import type { Hit } from "./geometry-messages";
 import { type Frame, latticeOf, placesOf } from "./lattice";
-import { linesOf } from "./patches";
+import { isLine, linesOf } from "./patches";
 import type { Grid } from "./source";
 import type { PatchBounds } from "./strides";
 
 type Triple = readonly [number, number, number];
+
+/** A line is met by rays that pass it by no more than this share of the distance, a few pixels. */
+const BESIDE = 0.012;
 
 /**
  * The nearest place at which a ray meets a surface.
@@ -24,16 +27,28 @@ export function pick(
   direction: Triple,
 ): Hit | null {
   const met = bounds
-    .map((of) => ({ of, enters: entry(of, origin, direction) }))
+    .map((of) => ({ of, enters: isLine(of.patch) ? 0 : entry(of, origin, direction) }))
     .filter(({ enters }) => enters < Number.POSITIVE_INFINITY)
     .sort((a, b) => a.enters - b.enters);
-  let found: Hit | null = null;
+  let found: Met | null = null;
   for (const { of, enters } of met) {
-    if (found !== null && found.distance < enters) break;
-    const hit = inPatch(grids[of.patch.block]!, of, frame, origin, direction);
-    if (hit !== null && (found === null || hit.distance < found.distance)) found = hit;
+    if (found !== null && found.hit.distance < enters) break;
+    const find = isLine(of.patch) ? onLine : inPatch;
+    const met = find(grids[of.patch.block]!, of, frame, origin, direction);
+    if (met !== null && (found === null || isBetter(met, found))) found = met;
   }
-  return found;
+  return found?.hit ?? null;
+}
+
+/** A hit, and by which share of its distance a ray passes beside it; null: it meets a triangle. */
+interface Met {
+  readonly hit: Hit;
+  readonly off: number | null;
+}
+
+/** Of surfaces the nearest one, of lines the one that the ray passes more closely. */
+function isBetter(a: Met, b: Met): boolean {
+  return a.off !== null && b.off !== null ? a.off < b.off : a.hit.distance < b.hit.distance;
 }
 
 /** How many directions along the ray its first point inside a box is; infinite where it misses. */
@@ -53,7 +68,7 @@ function entry(of: PatchBounds, origin: Triple, direction: Triple): number {
   return first <= last ? first : Number.POSITIVE_INFINITY;
 }
 
-function inPatch(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, direction: Triple): Hit | null {
+function inPatch(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, direction: Triple): Met | null {
   const [rows, columns] = [linesOf(of.patch.rows, 1), linesOf(of.patch.columns, 1)];
   const lattice = latticeOf(grid, rows, columns, frame);
   const node = (k: number): Triple => [lattice.points[3 * k]!, lattice.points[3 * k + 1]!, lattice.points[3 * k + 2]!];
@@ -75,7 +90,44 @@ function inPatch(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, dire
       }
     }
   }
-  if (best === null) return null;
+  return best === null ? null : { hit: hitAt(grid, of, frame, origin, direction, best), off: null };
+}
+
+/** The point of a line that a ray passes nearest to, if it is near. */
+function onLine(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, direction: Triple): Met | null {
+  const [rows, columns] = [linesOf(of.patch.rows, 1), linesOf(of.patch.columns, 1)];
+  const { points, valid } = latticeOf(grid, rows, columns, frame);
+  const node = (k: number): Triple => [points[3 * k]!, points[3 * k + 1]!, points[3 * k + 2]!];
+  let least = BESIDE;
+  let best: { distance: number; row: number; column: number } | null = null;
+  for (let k = 0; k < valid.length; k += 1) {
+    if (valid[k] === 0) continue;
+    const [a, b] = [node(k), node(valid[k + 1] === 1 ? k + 1 : k)];
+    const [v, w] = [minus(b, a), minus(origin, a)];
+    const [uu, uv, vv] = [dot(direction, direction), dot(direction, v), dot(v, v)];
+    const [uw, vw] = [dot(direction, w), dot(v, w)];
+    const spread = uu * vv - uv * uv;
+    const share = spread > 0 ? Math.min(Math.max((uu * vw - uv * uw) / spread, 0), 1) : 0;
+    const distance = (uv * share - uw) / uu;
+    const gap = Math.hypot(...([0, 1, 2] as const).map((i) => w[i] + distance * direction[i] - share * v[i]));
+    const off = gap / (distance * Math.sqrt(uu));
+    if (distance <= 0 || off >= least) continue;
+    least = off;
+    best = rows.length === 1 ? { distance, row: 0, column: k + share } : { distance, row: k + share, column: 0 };
+  }
+  return best === null ? null : { hit: hitAt(grid, of, frame, origin, direction, best), off: least };
+}
+
+/** @param best - Distance along the ray, and lines of the patch. */
+function hitAt(
+  grid: Grid,
+  of: PatchBounds,
+  frame: Frame,
+  origin: Triple,
+  direction: Triple,
+  best: { readonly distance: number; readonly row: number; readonly column: number },
+): Hit {
+  const [rows, columns] = [linesOf(of.patch.rows, 1), linesOf(of.patch.columns, 1)];
   const [rowsAt, columnsAt] = [
     placesOf(rows, grid.rowsAt, grid.full[0], grid.closed[0]),
     placesOf(columns, grid.columnsAt, grid.full[1], grid.closed[1]),
@@ -88,6 +140,7 @@ function inPatch(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, dire
 }
 
 function along(places: readonly number[], at: number): number {
+  if (places.length === 1) return places[0]!;
   const below = Math.min(Math.floor(at), places.length - 2);
   return places[below]! + (places[below + 1]! - places[below]!) * (at - below);
 }

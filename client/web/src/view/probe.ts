@@ -1,10 +1,10 @@
 /** The values under the pointer, as text. */
 
 import { html } from "./dom";
-import { errorText } from "./focus-panel";
-import { formatAt, formatNumber } from "./format";
+import { formatAt, formatNumber, formatStored } from "./format";
 import type { Session } from "./session";
 import type { Moment, NodeValues, SurfaceInfo } from "./source";
+import { errorText } from "./status";
 
 type Ray = { origin: [number, number, number]; direction: [number, number, number] };
 
@@ -81,7 +81,7 @@ export class Probe {
       html("span", {}, html("span", { class: "dim" }, `${name} `), html("b", {}, value));
     // As many digits as the error leaves, of a surface that is not exact.
     const step = of.max > 0 ? of.max / 10 : 0;
-    const text = (value: number): string => (step > 0 ? formatAt(value, step) : formatNumber(value, 10));
+    const text = (value: number): string => (step > 0 ? formatAt(value, step) : formatStored(value));
     const names = ["x", "y", info.heights ? "height" : "z"];
     const unit = (k: number): string => (k === 2 || !info.geographic ? info.unit : "°");
     this.element.replaceChildren(
@@ -94,10 +94,19 @@ export class Probe {
         ),
       ),
       ...of.attributes.map(([name, values]) =>
-        part(name, values.map((value) => (Number.isNaN(value) ? "none" : formatNumber(value, 6))).join(", ")),
+        part(name, values.map((value) => (Number.isNaN(value) ? "none" : formatStored(value))).join(", ")),
       ),
       part("error at most", moment.complete && of.max === 0 ? "0: exact" : errorText(of.max, info.unit)),
       part("RMS", errorText(of.rms, info.unit)),
+      html("span", { class: "dim" }, whereText(of)),
     );
+    // The picture above does not change its size with every other number of lines.
+    this.element.style.minHeight = `${Math.max(this.element.offsetHeight, Number.parseFloat(this.element.style.minHeight) || 0)}px`;
   }
+}
+
+/** What the errors that are told belong to. */
+function whereText({ within, max }: NodeValues): string {
+  if (!(max > 0)) return "";
+  return within === null ? "errors of the whole surface" : `errors of the ${within.join(" × ")} points around it`;
 }

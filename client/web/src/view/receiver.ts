@@ -6,12 +6,14 @@ import type { View } from "../decoding/view";
 import { RemoteError } from "../errors";
 import { loadKernels } from "../kernels/instance";
 import { makeTarget, type TargetOptions } from "../planning/target";
+import type { WindowErrors } from "../planning/window-errors";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
 import { composed, thinned } from "./compose";
 import { type Description, describe, infoOf, NO_DESCRIPTION } from "./description";
 import { areHeights, gridOf, placeOf } from "./grids";
-import type { DetailWindow, Grid, NodeValues, Progress, Region, SourceEvents, Target } from "./source";
+import { localErrors } from "./local-errors";
+import type { DetailWindow, MomentGrids, NodeValues, Progress, Region, SourceEvents, Target } from "./source";
 
 /** Milliseconds over which the rate is measured. */
 const RATE_SPAN = 2000;
@@ -32,6 +34,8 @@ export class Receiver {
   private began = 0;
   private failure: { detail: string; code: string } | null = null;
   private history: { at: number; bytes: number }[] = [];
+  private windows: WindowErrors | null = null;
+  private askedForErrors = false;
   private whole: { moment: number; surface: Surface } | null = null;
   private headerCame: (header: Header) => void = () => {};
 
@@ -69,15 +73,16 @@ export class Receiver {
   }
 
   /** The grids of a moment, see `Source.grids`. */
-  grids(moment: number, level: number, window: DetailWindow | null): Grid[] {
+  grids(asked: number | null, level: number, window: DetailWindow | null): MomentGrids {
     const header = this.decoder!.header!;
+    const moment = asked ?? this.views.length - 1;
     const view = this.views[moment]!;
     const surface = view.surface(level === header.levels ? undefined : level);
     const grids = surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
-    if (window === null) return grids;
+    if (window === null) return { moment, grids };
     const [part] = view.window(window.region).blocks;
     const fine = gridOf(part!, 0, header, header.levels, this.metadata);
-    return [composed(grids[0]!, thinned(fine, window.stride))];
+    return { moment, grids: [composed(grids[0]!, thinned(fine, window.stride))] };
   }
 
   /** The values of a node, see `Source.valuesAt`. */
@@ -104,7 +109,23 @@ export class Receiver {
       const count = Math.max(array.components, 1);
       return [name, Array.from({ length: count }, (_, k) => Number(array.values[node * count + k]))] as const;
     });
-    return { block, row, column, point, attributes, rms: view.rms, max: view.maxError };
+    this.askForErrors();
+    const errors = localErrors(view, header, this.windows, this.description?.prices ?? null, row, column);
+    return { block, row, column, point, attributes, ...errors };
+  }
+
+  /** Asks for the errors of windows, once somebody looks at values; until they are there, those of the whole hold. */
+  private askForErrors(): void {
+    const { description } = this;
+    if (this.askedForErrors || description === null) return;
+    this.askedForErrors = true;
+    description.windows().then(
+      (windows) => {
+        this.windows = windows;
+        if (windows !== null) this.events.refined();
+      },
+      () => {},
+    );
   }
 
   /** See `Source`. */

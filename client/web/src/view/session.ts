@@ -1,5 +1,6 @@
 /** A surface coming into focus on a stage: moments in, pictures out; what the view asks for back to the source. */
 
+import { isStill } from "./dom";
 import type { Field, FromGeometry, Hit, ToGeometry } from "./geometry-messages";
 import GeometryWorker from "./geometry-worker?worker&inline";
 import { belowPixel, firstLevel } from "./levels";
@@ -14,6 +15,8 @@ export interface SessionEvents {
   info(info: SurfaceInfo): void;
   moment(moment: Moment): void;
   progress(progress: Progress): void;
+  /** See `SourceEvents`. */
+  refined(): void;
   /** Something else is drawn: a picture (`fresh`), or the same in other patches or colours. */
   drawn(patches: Patches, moment: Moment): void;
   failed(detail: string): void;
@@ -74,6 +77,7 @@ export class Session {
         this.progress = progress;
         events.progress(progress);
       },
+      refined: () => events.refined(),
     });
   }
 
@@ -195,8 +199,13 @@ export class Session {
     if (shown?.moment.number === moment.number && had >= finer && (window === null || window === shown.window)) return;
     this.busy = true;
     try {
-      const grids = await this.source.grids(moment.number, level, window);
+      const { grids, moment: number } = await this.source.grids(
+        this.chosen === null ? null : moment.number,
+        level,
+        window,
+      );
       if (this.closed) return;
+      const taken = this.moments.find((other) => other.number === number) ?? moment;
       const came = new Promise<Patches>((take, fail) => {
         this.awaited = { take, fail };
       });
@@ -207,18 +216,19 @@ export class Session {
       );
       const { geographic, heights } = info;
       const joined = info.joined || info.blocks.length > 1;
-      const diagonal = heights ? 0 : info.extent;
-      const options = { joined, geographic, heights, diagonal, fresh: shown === null };
+      const [diagonal, relief] = heights ? [0, info.extent] : [info.extent, 0];
+      const options = { joined, geographic, heights, diagonal, relief, fresh: shown === null };
       const drawn = window === null ? level : info.levels - Math.log2(window.stride);
-      this.post({ kind: "picture", picture: moment.number, level: drawn, grids, options }, [...new Set(buffers)]);
+      this.post({ kind: "picture", picture: number, level: drawn, grids, options }, [...new Set(buffers)]);
       const patches = await came;
       if (this.closed) return;
-      this.shown = { moment, level, window };
-      const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-      const blended = !still && patches.patches.some(({ from }) => from !== null);
+      this.shown = { moment: taken, level, window };
+      // What is to be followed by another at once is not worth the time.
+      const superseded = this.chosen === null && this.moments.at(-1) !== taken;
+      const blended = !isStill() && !superseded && patches.patches.some(({ from }) => from !== null);
       await new Promise<void>((resolve) => {
         this.stage.show(patches.patches, true, blended, resolve);
-        this.events.drawn(patches, moment);
+        this.events.drawn(patches, taken);
       });
     } catch (error) {
       if (!this.closed) this.events.failed(error instanceof Error ? error.message : String(error));

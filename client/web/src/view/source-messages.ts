@@ -1,10 +1,15 @@
 /** What `LodeSource` and its worker say to each other; arrays are transferred, not copied. */
 
-import type { DetailWindow, Grid, Moment, NodeValues, Progress, Region, SurfaceInfo, Target } from "./source";
+import type { DetailWindow, Moment, MomentGrids, NodeValues, Progress, Region, SurfaceInfo, Target } from "./source";
 
 /** A question that has an answer. */
 export type Question =
-  | { readonly kind: "grids"; readonly moment: number; readonly level: number; readonly window: DetailWindow | null }
+  | {
+      readonly kind: "grids";
+      readonly moment: number | null;
+      readonly level: number;
+      readonly window: DetailWindow | null;
+    }
   | {
       readonly kind: "values";
       readonly moment: number;
@@ -27,6 +32,7 @@ export type FromSource =
   | { readonly kind: "info"; readonly info: SurfaceInfo }
   | { readonly kind: "moment"; readonly moment: Moment }
   | { readonly kind: "progress"; readonly progress: Progress }
-  | { readonly kind: "grids"; readonly id: number; readonly grids: Grid[] }
+  | { readonly kind: "grids"; readonly id: number; readonly picture: MomentGrids }
   | { readonly kind: "values"; readonly id: number; readonly values: NodeValues }
+  | { readonly kind: "refined" }
   | { readonly kind: "refused"; readonly id: number; readonly detail: string };

@@ -11,6 +11,7 @@ const receiver = new Receiver({
   info: (info) => scope.postMessage({ kind: "info", info }),
   moment: (moment) => scope.postMessage({ kind: "moment", moment }),
   progress: (progress) => scope.postMessage({ kind: "progress", progress }),
+  refined: () => scope.postMessage({ kind: "refined" }),
 });
 
 scope.onmessage = ({ data }) => {
@@ -46,13 +47,13 @@ function answer({ id, question }: Extract<ToSource, { kind: "question" }>): void
       scope.postMessage({ kind: "values", id, values: receiver.valuesAt(moment, block, row, column) });
       return;
     }
-    const grids = receiver.grids(question.moment, question.level, question.window);
-    const buffers = grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
+    const picture = receiver.grids(question.moment, question.level, question.window);
+    const buffers = picture.grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
       [points, mask, rowsAt, columnsAt, ...attributes.map(({ values }) => values)].flatMap((array) =>
         array === null ? [] : [array.buffer as ArrayBuffer],
       ),
     );
-    scope.postMessage({ kind: "grids", id, grids }, [...new Set(buffers)]);
+    scope.postMessage({ kind: "grids", id, picture }, [...new Set(buffers)]);
   } catch (error) {
     scope.postMessage({ kind: "refused", id, detail: error instanceof Error ? error.message : String(error) });
   }

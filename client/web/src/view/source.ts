@@ -34,6 +34,12 @@ export interface BlockInfo {
   readonly closed: readonly [boolean, boolean];
 }
 
+/** An array beside the points: its name, and its numbers at a point, at least 1. */
+export interface AttributeInfo {
+  readonly name: string;
+  readonly components: number;
+}
+
 /** What is known of a surface before its values. */
 export interface SurfaceInfo {
   readonly name: string;
@@ -53,7 +59,7 @@ export interface SurfaceInfo {
   readonly unit: string;
   /** Whether the end is exact. */
   readonly exact: boolean;
-  readonly attributes: readonly string[];
+  readonly attributes: readonly AttributeInfo[];
   /** Bytes of the container. */
   readonly size: number;
   /** The price list, or null while it is not known. */
@@ -102,6 +108,13 @@ export interface Moment {
   readonly complete: boolean;
 }
 
+/** The points of all blocks at a moment. */
+export interface MomentGrids {
+  /** Number of the moment. */
+  readonly moment: number;
+  readonly grids: readonly Grid[];
+}
+
 /** What is known of a node of the full surface. */
 export interface NodeValues {
   readonly block: number;
@@ -111,9 +124,11 @@ export interface NodeValues {
   readonly point: readonly number[];
   /** Names with the values of their components; NaN where there is none. */
   readonly attributes: readonly (readonly [string, readonly number[]])[];
-  /** What errors around here do not exceed, or else those of the whole; NaN where they are not known. */
+  /** RMS and maximum error of what `within` says, or what they do not exceed; NaN where they are not known. */
   readonly rms: number;
   readonly max: number;
+  /** Rows and columns of the part around the node for which the errors hold; null: the whole surface. */
+  readonly within: readonly [number, number] | null;
 }
 
 /** A part of a surface that is drawn in more detail than the rest. */
@@ -144,6 +159,8 @@ export interface SourceEvents {
   info(info: SurfaceInfo): void;
   moment(moment: Moment): void;
   progress(progress: Progress): void;
+  /** More is known of the errors at each place: values may be asked for again. */
+  refined(): void;
 }
 
 /** A surface on its way. Computes nothing on the thread that uses it. */
@@ -153,12 +170,13 @@ export interface Source {
   /**
    * The grids of all blocks as they were at a moment.
    *
-   * @param moment - Number of a moment.
+   * @param moment - Number of a moment; null: the latest when it comes to computing them, so that whoever draws more
+   * slowly than moments come misses those between.
    * @param level - 0 to `levels`.
    * @param window - Of the only block, a part that the grid shows in more detail; null: none.
    * @throws Error if they cannot be computed, e.g. because the data are damaged.
    */
-  grids(moment: number, level: number, window: DetailWindow | null): Promise<Grid[]>;
+  grids(moment: number | null, level: number, window: DetailWindow | null): Promise<MomentGrids>;
   /** The values of a node at full resolution, as they are known at a moment, and the errors that hold there. */
   valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues>;
   /** Asks for a region before the rest; null: no longer. Without effect on surfaces of several blocks. */

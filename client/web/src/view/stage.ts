@@ -4,10 +4,12 @@ import {
   BufferAttribute,
   BufferGeometry,
   Group,
+  LineSegments,
   Matrix3,
   Matrix4,
   Mesh,
   PerspectiveCamera,
+  Points,
   Scene,
   Sphere,
   Vector3,
@@ -17,6 +19,8 @@ import { clipping, type Orbit, positionOf, VIEW_ANGLE } from "./camera";
 import type { Eye, PatchBuffers } from "./geometry-messages";
 import type { Look } from "./look";
 import { SurfaceMaterial } from "./material";
+
+type Drawable = Mesh<BufferGeometry, SurfaceMaterial> | LineSegments<BufferGeometry, SurfaceMaterial>;
 
 /** Milliseconds in which new detail is blended in. */
 const BLEND = 350;
@@ -28,7 +32,7 @@ export class Stage {
   private readonly scene = new Scene();
   private readonly group = new Group();
   private readonly camera = new PerspectiveCamera(VIEW_ANGLE, 1, 0.01, 100);
-  private readonly meshes = new Map<number, Mesh<BufferGeometry, SurfaceMaterial>>();
+  private readonly meshes = new Map<number, Drawable>();
   private orbit: Orbit = { azimuth: 0, elevation: 30, distance: 5, target: [0, 0, 0] };
   private radius = 2;
   private exaggeration = 1;
@@ -60,6 +64,7 @@ export class Stage {
   resize(): void {
     const [width, height] = this.size;
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.material.set("thickness", 3 * this.renderer.getPixelRatio());
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.draw();
@@ -80,7 +85,7 @@ export class Stage {
     for (const patch of patches) {
       const before = this.meshes.get(patch.patch);
       if (before !== undefined) this.forget(before);
-      const mesh = new Mesh(geometryOf(patch), this.material);
+      const mesh = this.drawable(patch);
       this.meshes.set(patch.patch, mesh);
       this.group.add(mesh);
     }
@@ -169,7 +174,16 @@ export class Stage {
     this.renderer.dispose();
   }
 
-  private forget(mesh: Mesh<BufferGeometry, SurfaceMaterial>): void {
+  /** Triangles; or the nodes of a line, and what joins them. */
+  private drawable(patch: PatchBuffers): Drawable {
+    const geometry = geometryOf(patch);
+    if (patch.pieces === null) return new Mesh(geometry, this.material);
+    const line = new LineSegments(geometry, this.material);
+    line.add(new Points(geometry, this.material));
+    return line;
+  }
+
+  private forget(mesh: Drawable): void {
     this.group.remove(mesh);
     mesh.geometry.dispose();
   }
@@ -221,7 +235,7 @@ function geometryOf(patch: PatchBuffers): BufferGeometry {
   set("upright", patch.normals, 4, patch.fromNormals);
   set("shown", patch.values, 1, patch.fromValues);
   set("place", patch.places, 2);
-  geometry.setIndex(new BufferAttribute(patch.triangles, 1));
+  geometry.setIndex(new BufferAttribute(patch.pieces ?? patch.triangles, 1));
   const [x, y, z, radius] = patch.sphere;
   geometry.boundingSphere = new Sphere(new Vector3(x, y, z), radius);
   return geometry;

@@ -37,7 +37,7 @@ canvas:focus-visible { outline: 2px solid var(--accent); outline-offset: -3px }
 .notice { position: absolute; left: 50%; top: 14px; transform: translateX(-50%); max-width: calc(100% - 28px); padding: 6px 14px;
   border-radius: 6px; background: var(--sheet); border: 1px solid var(--line); color: var(--warn); box-shadow: 0 2px 10px #0001 }
 .notice:empty { display: none }
-.values { grid-column: 1; border-top: 1px solid var(--line); background: var(--sheet); padding: 7px 14px; min-height: 2.6em; margin: 0;
+.values { grid-column: 1; border-top: 1px solid var(--line); background: var(--sheet); padding: 7px 14px; min-height: 4.2em; margin: 0; align-content: start;
   display: flex; flex-wrap: wrap; gap: 2px 18px }
 .values b { font-weight: 600 } .values .dim { color: var(--soft) }
 .panel { grid-row: 1 / 3; grid-column: 2; overflow-y: auto; border-left: 1px solid var(--line); background: var(--sheet); padding: 4px 16px 16px }

@@ -22,7 +22,9 @@ function short(value: number, step: number): string {
 }
 
 function fieldText(field: Field): string {
-  return field.kind === "attribute" ? `a:${field.component}:${encodeURIComponent(field.name)}` : field.kind;
+  if (field.kind !== "attribute") return field.kind;
+  const component = field.component === "magnitude" ? "m" : field.component;
+  return `a:${component}:${encodeURIComponent(field.name)}`;
 }
 
 /** The text of a view, such as `v=-90,42,12000,500000,4200000,900&c=slope&x=2`. */
@@ -54,10 +56,11 @@ function numbersOf(text: string | null, count: number): number[] | null {
 
 function fieldOf(text: string | null): Field | undefined {
   if (text === "height" || text === "slope" || text === "change" || text === "none") return { kind: text };
-  const found = /^a:(\d{1,6}):(.+)$/s.exec(text ?? "");
+  const found = /^a:(\d{1,6}|m):(.+)$/s.exec(text ?? "");
   if (found === null) return undefined;
   try {
-    return { kind: "attribute", component: Number(found[1]), name: decodeURIComponent(found[2]!) };
+    const component = found[1] === "m" ? "magnitude" : Number(found[1]);
+    return { kind: "attribute", component, name: decodeURIComponent(found[2]!) };
   } catch {
     return undefined;
   }

@@ -5,6 +5,7 @@ import type {
   BlockInfo,
   Grid,
   Moment,
+  MomentGrids,
   NodeValues,
   Price,
   Source,
@@ -66,8 +67,9 @@ export class ArtificialSource implements Source {
     this.next();
   }
 
-  grids(moment: number, level: number): Promise<Grid[]> {
-    return Promise.resolve(this.info.blocks.map((of, block) => this.grid(of, block, moment, level)));
+  grids(asked: number | null, level: number): Promise<MomentGrids> {
+    const moment = asked ?? Math.max(0, this.number - 1);
+    return Promise.resolve({ moment, grids: this.info.blocks.map((of, block) => this.grid(of, block, moment, level)) });
   }
 
   valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues> {
@@ -76,10 +78,10 @@ export class ArtificialSource implements Source {
     const point = this.surface.point(block, i, j, moment / this.info.levels);
     if (point === null) return Promise.reject(new Error("expected a point, got a hole"));
     const attributes = this.info.attributes.map(
-      (name) => [name, [this.surface.attribute?.(block, i, j) ?? 0]] as const,
+      ({ name }) => [name, [this.surface.attribute?.(block, i, j) ?? 0]] as const,
     );
     const { rms, max } = this.info.prices![moment]!;
-    return Promise.resolve({ block, row, column, point, attributes, rms, max });
+    return Promise.resolve({ block, row, column, point, attributes, rms, max, within: null });
   }
 
   focus(): void {}
@@ -148,7 +150,7 @@ export class ArtificialSource implements Source {
         values[node] = this.surface.attribute?.(block, share(row, 0), share(column, 1)) ?? 0;
       });
     });
-    const attributes: AttributeGrid[] = this.info.attributes.map((name) => ({ name, components: 1, values }));
+    const attributes: AttributeGrid[] = this.info.attributes.map(({ name }) => ({ name, components: 1, values }));
     const holes = mask.includes(0) ? mask : null;
     return { rowsAt, columnsAt, full: of.shape, closed: of.closed, points, mask: holes, attributes };
   }
@@ -166,7 +168,7 @@ export const MOUNTAINS: ArtificialSurface = {
     extent: 1500,
     heights: true,
     georeferenced: true,
-    attributes: ["moisture"],
+    attributes: [{ name: "moisture", components: 1 }],
   },
   point: (_, row, column, detail) => {
     const [x, y] = [10 * column, 12 * row];

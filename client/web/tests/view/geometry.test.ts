@@ -2,6 +2,7 @@ import { describe, expect, it } from "vitest";
 import { NO_VALUE } from "../../src/view/fields";
 import { Geometry } from "../../src/view/geometry";
 import type { Eye, PatchBuffers } from "../../src/view/geometry-messages";
+import { piecesOf } from "../../src/view/patches";
 import type { Grid } from "../../src/view/source";
 import { ArtificialSource, type ArtificialSurface, BLOCKS, MOUNTAINS, SPHERE, TORUS } from "./artificial";
 import { areaOf, edgesOf, eulerNumber, openEdges } from "./meshes";
@@ -44,7 +45,14 @@ class Drawn {
   picture(grids: Grid[], joined = false): this {
     this.patches.clear();
     return this.take(
-      this.geometry.setPicture(grids, { joined, geographic: false, heights: false, diagonal: 0, fresh: false }).patches,
+      this.geometry.setPicture(grids, {
+        joined,
+        geographic: false,
+        heights: false,
+        diagonal: 0,
+        relief: 0,
+        fresh: false,
+      }).patches,
     );
   }
 
@@ -63,7 +71,7 @@ class Drawn {
 }
 
 async function grids(surface: ArtificialSurface, level = 7, moment = 7): Promise<Grid[]> {
-  return new ArtificialSource(surface).grids(moment, level);
+  return [...(await new ArtificialSource(surface).grids(moment, level)).grids];
 }
 
 describe("patches of different strides", () => {
@@ -195,7 +203,8 @@ describe("holes", () => {
 describe("blending", () => {
   it("begins with what was drawn: a coarser surface, without cracks", async () => {
     const source = new ArtificialSource(TORUS);
-    const drawn = new Drawn().picture(await source.grids(3, 3)).picture(await source.grids(4, 4));
+    const [coarse, fine] = [await source.grids(3, 3), await source.grids(4, 4)];
+    const drawn = new Drawn().picture([...coarse.grids]).picture([...fine.grids]);
     const edges = edgesOf(drawn.patches.values(), ({ from }) => from!);
     expect(openEdges(edges)).toEqual([]);
   });
@@ -263,5 +272,48 @@ describe("colours and values", () => {
     expect(hit?.column).toBeCloseTo(55, 6);
     expect(hit?.at[2]).toBeCloseTo(grid.points[3 * (17 * 70 + 55) + 2]!, 9);
     expect(towards(40, 30)).toBeNull();
+  });
+});
+
+describe("lines of points", () => {
+  const line = (rows: number, columns: number, hole = -1) =>
+    plane(rows, columns, (i, j) => (i + j === hole ? null : Math.sin((i + j) / 10)));
+
+  it.each([
+    [1, 300],
+    [300, 1],
+  ])("%i x %i are drawn from end to end, at any stride", (rows, columns) => {
+    const drawn = new Drawn().picture([line(rows, columns)]);
+    for (const focal of [1e5, 20]) {
+      drawn.eye(eyeAt([0, -2, 0.5], focal));
+      let length = 0;
+      for (const { pieces, positions, triangles } of drawn.patches.values()) {
+        expect(triangles).toHaveLength(0);
+        for (let k = 0; k < pieces!.length; k += 2) {
+          const [a, b] = [3 * pieces![k]!, 3 * pieces![k + 1]!];
+          length += Math.hypot(positions[b]! - positions[a]!, positions[b + 1]! - positions[a + 1]!);
+        }
+      }
+      expect(length).toBeCloseTo(2, 4);
+    }
+  });
+
+  it("leave holes out, and draw a point that stands alone", () => {
+    expect([...piecesOf(Uint8Array.of(1, 1, 0, 1, 0, 0, 1, 1, 1))]).toEqual([0, 1, 3, 3, 6, 7, 7, 8]);
+    expect([...piecesOf(Uint8Array.of(1))]).toEqual([0, 0]);
+    const drawn = new Drawn().picture([plane(1, 1, () => 5)]);
+    expect([...drawn.patches.get(0)!.pieces!]).toEqual([0, 0]);
+  });
+
+  it("are found by a ray that passes close by", () => {
+    const { geometry } = new Drawn().picture([line(1, 90, 40)]);
+    const towards = (column: number, off: number) => {
+      const { origin, scale } = geometry.frame;
+      return geometry.pick([(column - origin[0]) * scale[0], off, 5], [0, 0, -1]);
+    };
+    const hit = towards(17, 0.01);
+    expect([hit?.row, hit?.column]).toEqual([0, expect.closeTo(17, 6)]);
+    expect(towards(17, 0.5)).toBeNull();
+    expect(towards(62.25, 0)?.column).toBeCloseTo(62.25, 6);
   });
 });

@@ -2,7 +2,7 @@ import { beforeAll, describe, expect, it } from "vitest";
 import { Decoder } from "../../src/decoding/decoder";
 import { loadKernels } from "../../src/kernels/instance";
 import { Geometry } from "../../src/view/geometry";
-import { areHeights, attributeNames, gridOf, placeOf } from "../../src/view/grids";
+import { areHeights, attributesIn, gridOf, placeOf } from "../../src/view/grids";
 import { containerOf, NAMES } from "../golden";
 
 let kernels: WebAssembly.Module;
@@ -32,10 +32,10 @@ describe.each(NAMES)("the grids of %s", (name) => {
         }
         const holes = grid.points.filter((value, k) => !Number.isFinite(value) && grid.mask?.[Math.floor(k / 3)] !== 0);
         expect(holes).toHaveLength(0);
-        expect(grid.attributes.map((attribute) => attribute.name)).toEqual(attributeNames(header));
+        expect(grid.attributes.map(({ name, components }) => ({ name, components }))).toEqual(attributesIn(header));
       });
       const geometry = new Geometry();
-      const options = { joined: true, geographic: false, heights: true, diagonal: 0, fresh: true };
+      const options = { joined: true, geographic: false, heights: true, diagonal: 0, relief: 0, fresh: true };
       const { patches } = geometry.setPicture(grids, options);
       expect(
         patches.every(({ positions, triangles }) => triangles.every((node) => Number.isFinite(positions[3 * node]))),

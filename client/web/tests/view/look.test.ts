@@ -1,12 +1,24 @@
+import { PerspectiveCamera, Vector3 } from "three";
 import { describe, expect, it } from "vitest";
-import { fitted, panned, positionOf, turned, wrapped, zoomed } from "../../src/view/camera";
+import { fitted, panned, positionOf, turned, VIEW_ANGLE, wrapped, zoomed } from "../../src/view/camera";
 import { COLOUR_MAPS, colourAt, rangeOf, stopsOf, textureOf } from "../../src/view/colour-maps";
-import { logScale } from "../../src/view/error-curve";
+import { logScale, withZero } from "../../src/view/error-curve";
 import { defaultExaggeration } from "../../src/view/exaggeration";
 import { extremes } from "../../src/view/fields";
-import { formatAt, formatBytes, formatNumber, formatSeconds, formatWithin, roundBelow } from "../../src/view/format";
+import {
+  formatAt,
+  formatBytes,
+  formatNumber,
+  formatSeconds,
+  formatStored,
+  formatWithin,
+  roundBelow,
+} from "../../src/view/format";
+import { Geometry } from "../../src/view/geometry";
+import type { Component } from "../../src/view/geometry-messages";
 import { belowPixel, finestDrawn, firstLevel, pointsAt } from "../../src/view/levels";
-import type { Moment, SurfaceInfo } from "../../src/view/source";
+import { fieldName, fieldsOf, sameField } from "../../src/view/look";
+import type { Grid, Moment, SurfaceInfo } from "../../src/view/source";
 import { formatView, parseView, type SharedView, withView } from "../../src/view/url-state";
 
 describe("colour maps", () => {
@@ -122,8 +134,28 @@ describe("the camera", () => {
   });
 
   it("sees a whole box, of narrow views too", () => {
-    expect(fitted([1, 1, 1], 0, 0.5, false).distance).toBeCloseTo(2 * fitted([1, 1, 1], 0, 2, false).distance, 12);
-    expect(fitted([0, 0, 1], 1.7, 1, false).distance).toBeGreaterThan(4);
+    for (const aspect of [0.5, 1, 2]) {
+      for (const [azimuth, elevation] of [
+        [-90, 42],
+        [-60, 25],
+        [-90, 89.9],
+      ] as const) {
+        const orbit = fitted([1, 0.7, 0.2], 0, aspect, azimuth, elevation);
+        const seen = [0, 1, 2, 3, 4, 5, 6, 7].map((corner) => {
+          const at = [1, 0.7, 0.2].map((half, k) => (corner & (1 << k) ? half : -half));
+          const camera = new PerspectiveCamera(VIEW_ANGLE, aspect, 0.01, 100);
+          camera.up.set(0, 0, 1);
+          camera.position.set(...positionOf(orbit));
+          camera.lookAt(0, 0, 0);
+          camera.updateMatrixWorld();
+          const place = new Vector3(...at).project(camera);
+          return Math.max(Math.abs(place.x), Math.abs(place.y));
+        });
+        expect(Math.max(...seen)).toBeCloseTo(0.9, 6);
+      }
+    }
+    expect(fitted([0, 0, 1], 1.7, 1, -60, 25).distance).toBeGreaterThan(4);
+    expect(fitted([0, 0, 0], 0, 1, -60, 25).distance).toBeGreaterThan(1);
   });
 });
 
@@ -196,6 +228,17 @@ describe("numbers", () => {
     expect([0.7, 1, 3, 77].map(roundBelow)).toEqual([0.5, 1, 2, 50]);
   });
 
+  it("as they were stored, without digits that float32 has not", () => {
+    expect([503.3, 0.1, -1e-7, 16777217, 1 / 3].map((value) => formatStored(Math.fround(value)))).toEqual([
+      "503.3",
+      "0.1",
+      "-1.0e-7",
+      "16777216",
+      "0.33333334",
+    ]);
+    expect([1 / 3, 503.3].map(formatStored)).toEqual(["0.3333333333", "503.3"]);
+  });
+
   it("within a range", () => {
     expect(formatWithin(2.8e-17, [-0.4, 0.4])).toBe("0");
     expect(formatWithin(-1e-9, [-1, 1])).toBe("0");
@@ -209,5 +252,75 @@ describe("numbers", () => {
     expect([scale.low, scale.high]).toEqual([0, 3]);
     expect([0, 1, 10, 1000, 1e9].map((value) => Math.round(scale.place(value)))).toEqual([0, 0, 100, 300, 300]);
     expect(logScale([], 0, 1).high).toBe(1);
+  });
+
+  it("0 has a place of its own below the least error", () => {
+    const scale = withZero([0, 0.1, 100], 130, 8);
+    expect([scale.zero, scale.place(0)]).toEqual([true, 130]);
+    expect(scale.place(0.1)).toBe(114);
+    expect(scale.place(100)).toBe(8);
+    expect(withZero([0.1, 100], 130, 8).place(0.1)).toBe(130);
+  });
+});
+
+describe("an attribute of several components", () => {
+  const info: SurfaceInfo = {
+    name: "",
+    blocks: [{ shape: [2, 2], closed: [false, false] }],
+    levels: 1,
+    extent: 1,
+    heights: true,
+    georeferenced: false,
+    geographic: false,
+    joined: false,
+    unit: "m",
+    exact: true,
+    attributes: [
+      { name: "wind", components: 2 },
+      { name: "wet", components: 1 },
+    ],
+    size: 0,
+    prices: null,
+  };
+
+  it("offers each, and the length of all", () => {
+    expect(fieldsOf(info).map((field) => fieldName(field, info))).toEqual([
+      "Height",
+      "Slope",
+      "Last change",
+      "wind, magnitude",
+      "wind[0]",
+      "wind[1]",
+      "wet",
+      "Shading only",
+    ]);
+    const [first, second] = fieldsOf(info).filter(({ kind }) => kind === "attribute");
+    expect(sameField(first!, second!)).toBe(false);
+    expect(parseView(formatView({ field: first! })).field).toEqual(first);
+  });
+
+  it("colours by one of them", () => {
+    const grid: Grid = {
+      rowsAt: Float64Array.of(0, 1),
+      columnsAt: Float64Array.of(0, 1),
+      full: [2, 2],
+      closed: [false, false],
+      points: new Float64Array(12),
+      mask: null,
+      attributes: [{ name: "wind", components: 2, values: Float64Array.of(3, 4, -6, 8, 0, -1, Number.NaN, 2) }],
+    };
+    const of = (component: Component) => {
+      const geometry = new Geometry();
+      const options = { joined: false, geographic: false, heights: true, diagonal: 0, relief: 0, fresh: true };
+      geometry.setPicture([grid], options);
+      geometry.setField({ kind: "attribute", name: "wind", component });
+      return geometry.colouring().range;
+    };
+    expect([of(0), of(1), of("magnitude")]).toEqual([
+      [-6, 3],
+      [-1, 8],
+      [1, 10],
+    ]);
+    expect(of(2)).toEqual([Number.NaN, Number.NaN]);
   });
 });

@@ -8,8 +8,12 @@ import { type Answer, buffersOf, type Call, type Port, type Request } from "./me
 export function serveDecoder(port: Port): void {
   let decoder: Decoder | null = null;
   let told = 0; // views that the other end knows of
+  let last = Promise.resolve(); // a call waits for the one before it
   port.addEventListener("message", ({ data }) => {
-    const { id, call } = data as Request;
+    last = last.then(() => carry(data as Request));
+  });
+
+  async function carry({ id, call }: Request): Promise<void> {
     let surface: Surface | null = null;
     let error: Answer["error"] = null;
     try {
@@ -19,7 +23,7 @@ export function serveDecoder(port: Port): void {
       } else if (decoder === null) {
         throw new Error("expected a decoder to be opened first");
       } else {
-        surface = carryOut(decoder, call);
+        surface = await carryOut(decoder, call);
       }
     } catch (caught) {
       error = plainError(caught);
@@ -28,10 +32,10 @@ export function serveDecoder(port: Port): void {
     told += views.length;
     const answer: Answer = { id, views, metadata: decoder?.metadata ?? null, surface, error };
     port.postMessage(answer, surface ? buffersOf(surface) : []);
-  });
+  }
 }
 
-function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): Surface | null {
+async function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): Promise<Surface | null> {
   switch (call.do) {
     case "feed":
       decoder.feed(call.data);
@@ -46,7 +50,7 @@ function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): Surfac
       decoder.finish();
       return null;
     case "surface":
-      return viewOf(decoder, call.view).surface(call.level ?? undefined);
+      return viewOf(decoder, call.view).surfaceAsync(call.level ?? undefined);
     case "window":
       return viewOf(decoder, call.view).window(call.region);
   }

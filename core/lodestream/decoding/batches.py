@@ -1,0 +1,85 @@
+"""Segments in the order in which they are decoded: the tiles of a level side by side, coarse levels first.
+
+What a segment decodes to depends on the segments of its tile before it, and on what its parent tile knows of the same
+bit-planes and of higher ones. So a tile takes all its segments in turn, while what they work on stays in the cache, and
+tiles of a level know nothing of each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+from typing import NamedTuple
+
+from ..entropy.tiles import Reading, Run, Tiles
+from ..grid.layout import Layout
+
+__all__ = ["Coded", "batch_length", "rounds_of"]
+
+#: Bytes of segments that are worth a thread's while.
+_WORTH = 1 << 12
+
+
+class Coded(NamedTuple):
+    """A segment with its bytes: ``passes`` passes of a tile down from ``first``; ``offset`` is its place."""
+
+    tile: int
+    channel: int
+    first: int
+    passes: int
+    data: bytes
+    offset: int
+
+
+def batch_length(layout: Layout, segments: Sequence[Coded]) -> int:
+    """How many of the segments may be decoded coarse levels first, at least 1.
+
+    A segment that comes after a child has looked for its planes in vain, as no writer of ours puts it, begins the next
+    batch: what it tells must not be known before.
+    """
+    lowest: dict[tuple[int, int], int] = {}  # the lowest plane that was looked at of a tile of a channel
+    for number, segment in enumerate(segments):
+        if segment.first >> 1 >= lowest.get((segment.tile, segment.channel), segment.first + 1):
+            return number
+        parent = layout.tiles[segment.tile].parent, segment.channel
+        plane = (segment.first - segment.passes + 1) >> 1
+        if parent[0] >= 0 and plane < lowest.get(parent, plane + 1):
+            lowest[parent] = plane
+    return len(segments)
+
+
+def rounds_of(channels: Sequence[Tiles], segments: Sequence[Coded]) -> list[list[Reading]]:
+    """What decodes a batch: rounds one after another, in each of them readings that may run at the same time."""
+    runs: list[list[Run]] = [[] for _ in channels]
+    for segment in segments:
+        last = segment.first - segment.passes + 1
+        runs[segment.channel].append(Run(segment.tile, segment.first, last, segment.data))
+    every = [list(_rounds(tiles, own)) for tiles, own in zip(channels, runs, strict=True) if own]
+    return [[reading for some in of for reading in some] for of in zip_longest(*every, fillvalue=())]
+
+
+def _rounds(tiles: Tiles, runs: list[Run]) -> Iterator[list[Reading]]:
+    """The rounds of one channel: one reading for all levels that have little, several for a level that has more."""
+    runs.sort(key=lambda run: run.tile)
+    levels = tiles.table.layout.tiles
+    ends: list[list[int]] = [[]]
+    begin = 0
+    while begin < len(runs):
+        level, end = levels[runs[begin].tile].level, begin
+        size, own = 0, []
+        while end < len(runs) and levels[runs[end].tile].level == level:
+            if size >= _WORTH and runs[end].tile != runs[end - 1].tile:
+                own.append(end)
+                size = 0
+            size += len(runs[end].data)
+            end += 1
+        own.append(end)
+        if len(own) == 1 and len(ends[-1]) < 2:
+            ends[-1] = own  # goes on with the reading of the levels below
+        else:
+            ends.append(own)
+        begin = end
+    made = iter(tiles.readings(runs, [end for own in ends for end in own]))
+    for own in ends:
+        if own:
+            yield [next(made) for _ in own]

@@ -1,0 +1,130 @@
+"""States reconstructed one after another, each from the finest coarse level that it shares with the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Header
+from ..entropy.dequantize import UNANNOUNCED
+from ..entropy.tiles import Tiles
+from ..grid.layout import Layout
+from ..transform.lifting import FRACTION_BITS
+from ..transform.pyramid import PADDING, inverse
+
+__all__ = ["Canvases", "StateReconstructor"]
+
+#: Levels of at most this share of the points are kept, which all together take a twelfth of a canvas.
+_KEPT = 16
+
+#: Room for reconstructions: int32, shape (coordinate, row, column and `PADDING` more), of each grid.
+Canvases = list[NDArray[np.int32]]
+
+
+@dataclass
+class _Kept:
+    """Coarse levels of one channel in the state that was reconstructed last.
+
+    Attributes
+    ----------
+    state : int8, shape (tile,)
+    grids : list of lists of int32 arrays, shape (row, column)
+        Copies of the grids of each level, from 0 on; of those that are kept.
+    """
+
+    state: NDArray[np.int8]
+    grids: list[list[NDArray[np.int32]]] = field(default_factory=list)
+
+
+class StateReconstructor:
+    """Reconstructs coordinates and other channels in any states; each thread has its own.
+
+    Most layers change tiles of fine levels alone: what is coarser than these is taken from the state before.
+
+    Parameters
+    ----------
+    header : Header
+    tiles : sequence of Tiles, one for each channel
+        All that a reader knows in the end.
+
+    Attributes
+    ----------
+    canvases : Canvases
+        What was reconstructed last.
+    """
+
+    def __init__(self, header: Header, tiles: Sequence[Tiles]) -> None:
+        layout = header.layout
+        shapes = [grid.shape for grid in layout.grids]
+        self.canvases: Canvases = [
+            np.empty((header.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes
+        ]
+        self._header, self._tiles = header, tiles
+        most = layout.points(layout.levels) // _KEPT
+        self._levels = [level for level in range(layout.levels) if layout.points(level) <= most]
+        self._kept: dict[int, _Kept] = {}
+
+    def reconstruct(self, place: int, channel: int, state: NDArray[np.int8]) -> int:
+        """Reconstruct a channel into the canvases of a coordinate; it stands over two to the power returned.
+
+        Parameters
+        ----------
+        place : int
+            The coordinate.
+        channel : int
+        state : int8, shape (tile,)
+            Passes that remain of each tile.
+        """
+        header, layout = self._header, self._header.layout
+        arrays = [canvas[place, :, :-PADDING] for canvas in self.canvases]
+        whole = _whole_levels(layout, state)
+        kept = self._kept.get(channel)
+        levels = 0 if kept is None else min(_first_changed(layout, kept.state, state), len(kept.grids))
+        self._kept[channel] = kept = _Kept(state.copy(), [] if kept is None else kept.grids[:levels])
+        start = levels - 1 if levels else None
+        if start is not None:
+            for array, grid in zip(arrays, kept.grids[start], strict=True):
+                array[: grid.shape[0], : grid.shape[1]] = grid
+        bare = _bare_levels(layout, state)
+        self._tiles[channel].spread_above(start, state, arrays, whole, bare)
+        rules, coordinate = header.predictors[channel], channel < header.geometric
+        for level in self._levels[levels:]:
+            inverse(arrays, layout, rules, level, whole, coordinate, start, bare)
+            start = level
+            corners = zip(arrays, (layout.shape(k, level) for k in range(len(arrays))), strict=True)
+            kept.grids.append([array[:rows, :columns].copy() for array, (rows, columns) in corners])
+        inverse(arrays, layout, rules, layout.levels, whole, coordinate, start, bare)
+        return FRACTION_BITS if whole < layout.levels else 0
+
+
+def _whole_levels(layout: Layout, state: NDArray[np.int8]) -> int:
+    """The finest level up to which all details are known."""
+    whole = 0
+    while whole < layout.levels and not state[_tiles(layout, whole + 1)].any():
+        whole += 1
+    return whole
+
+
+def _bare_levels(layout: Layout, state: NDArray[np.int8]) -> list[int]:
+    """Levels without details; none where sides come from interfaces, which tell the details along them."""
+    if layout.shared:
+        return []
+    return [level for level in range(1, layout.levels + 1) if (state[_tiles(layout, level)] >= UNANNOUNCED).all()]
+
+
+def _first_changed(layout: Layout, before: NDArray[np.int8], after: NDArray[np.int8]) -> int:
+    """The coarsest level of which anything else is known; one more than there are where nothing is.
+
+    Levels below it stand over the same power of two in both states: the coarsest level that is not known whole is this
+    one, or the same as before.
+    """
+    changed = np.flatnonzero(before != after)
+    return layout.tiles[changed[0]].level if changed.size else layout.levels + 1
+
+
+def _tiles(layout: Layout, level: int) -> slice:
+    tiles = layout.tiles_of(level)
+    return slice(tiles.start, tiles.stop)
