@@ -119,6 +119,35 @@ def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.Monke
 
 
 @given(
+    dtype=st.sampled_from(["int8", "int16", "uint8", "uint16", "int32", "float32"]),
+    origin=st.integers(-(2**20) - 1, 2**20 + 1),
+    step=st.integers(1, 2**20 + 1),
+    fraction=st.integers(0, 9),
+    shape=st.tuples(st.integers(1, 5), st.integers(1, 300)),
+    masked=st.booleans(),
+    seed=st.integers(0, 2**32),
+)
+def test_distances_on_a_lattice_of_whole_numbers_are_those_of_float64(
+    dtype: str, origin: int, step: int, fraction: int, shape: tuple[int, int], masked: bool, seed: int
+) -> None:
+    """Integers of 16 bits are compared in integers, and nothing leaves their range: not even the farthest values."""
+    rng = np.random.default_rng(seed)
+    lattice = Lattice("affine", float(origin), float(step))
+    low, high = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype[0] != "f" else (-(2**15), 2**15)
+    original = rng.integers(max(low, -(2**17)), min(high, 2**17) + 1, (*shape, 1)).astype(dtype)
+    near = np.rint((original[..., 0].astype(np.float64) - origin) / step * 2**fraction) + rng.integers(-3, 4, shape)
+    farthest = rng.choice(np.array([-(2**31), -(2**26), 0, 2**26, 2**31 - 1]), shape)
+    numbers = np.where(rng.random(shape) < 0.3, farthest, near).clip(-(2**31), 2**31 - 1).astype(np.int32)[None]
+    counted = rng.random(shape) < 0.8 if masked else None
+    if counted is not None:
+        counted[0, 0] = True
+    shown = np.zeros((*shape, 1), dtype)
+    store_values(lattice, (numbers[0], fraction), shown, 0)
+    expected = plain_distances(original, shown, np.ones(shape, np.bool_) if counted is None else counted)
+    assert coordinate_distances([Original(original, counted)], [lattice], [numbers], [fraction]) == [expected]
+
+
+@given(
     shape=st.tuples(st.integers(1, 9), st.integers(1, 30), st.integers(1, 3)),
     dtype=st.sampled_from(DTYPES),
     decimal=st.booleans(),
