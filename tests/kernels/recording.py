@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import struct
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lodestream.kernels import INTEGER, VALUE_TYPES, Array, Kernel, Plane, Values
+from lodestream.parallel import VARIABLE
 
 from .declared import declarations, digest
 
@@ -165,9 +168,12 @@ def recorded(
     most_calls: int | None = None,
     names: Collection[str] | None = None,
 ) -> Iterator[Recorder]:
-    """Record the calls of kernels in this process meanwhile, as a `Recorder` does."""
+    """Record the calls of kernels in this process meanwhile, as a `Recorder` does.
+
+    One thread works meanwhile: a second one would change memory of a call that is being written down.
+    """
     call = Kernel.__call__
-    with path.open("wb") as file:
+    with path.open("wb") as file, mock.patch.dict(os.environ, {VARIABLE: "1"}):
         recorder = Recorder(file, most_bytes, most_calls, names)
 
         def record(self: Kernel, *values: Any) -> int:
