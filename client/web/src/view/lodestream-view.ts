@@ -1,6 +1,6 @@
 /** `<lodestream-view>`: a surface that comes into focus, with its controls. */
 
-import { positionOf } from "./camera";
+import type { Orbit } from "./camera";
 import { html, isStill, setText } from "./dom";
 import { FocusPanel } from "./focus-panel";
 import { Framing } from "./framing";
@@ -417,11 +417,11 @@ export class LodestreamView extends HTMLElement {
 
   /** The view as it is shared: what nobody has set is left to follow the surface there too. */
   private sharedView(): SharedView | null {
-    const { framing, orbit, isHeld, isChosen } = this.viewpoint;
-    if (!this.isConnected || !this.hasAttribute("share") || orbit === null || framing === null) return null;
+    const { camera, isHeld, isChosen } = this.viewpoint;
+    if (!this.isConnected || !this.hasAttribute("share") || camera === null) return null;
     const { field, map, range, exaggeration, lines } = this.look;
     return {
-      ...(isHeld ? { camera: framing.toSurface(orbit, exaggeration) } : {}),
+      ...(isHeld ? { camera } : {}),
       field,
       map,
       ...(isHeld || isChosen ? { exaggeration } : {}),
@@ -447,9 +447,8 @@ export class LodestreamView extends HTMLElement {
     if (camera !== undefined) this.viewpoint.place(framing.toDrawn(camera, this.look.exaggeration));
   }
 
-  /** Where the camera is, in drawn coordinates; for tests. */
-  get cameraPosition(): [number, number, number] | null {
-    const { orbit } = this.viewpoint;
-    return orbit === null ? null : positionOf(orbit);
+  /** Where the surface is seen from, in its own coordinates; null before the first picture. */
+  get camera(): Orbit | null {
+    return this.viewpoint.camera;
   }
 }
