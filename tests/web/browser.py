@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Locator
 
 from lodestream import page as built
 
-__all__ = ["ABOVE", "SIZE", "WAIT", "Heard", "Tab", "chromium", "missing", "tab"]
+__all__ = ["ABOVE", "SIZE", "WAIT", "Camera", "Heard", "Tab", "chromium", "missing", "tab"]
 
 #: Of a window whose picture is 480 pixels wide: drawing is done by the processor.
 SIZE = (800, 420)
@@ -58,7 +58,7 @@ _STATE = """view => ({
   info: view.info,
   moments: view.moments.map(({number, level, bytes, rms, max, complete}) =>
     ({number, level, bytes, rms: String(rms), max: String(max), complete})),
-  camera: view.cameraPosition,
+  camera: view.camera,
 })"""
 
 
@@ -78,6 +78,21 @@ def chromium() -> Iterator[Browser]:
             yield browser
         finally:
             browser.close()
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a surface is seen from: angles in degrees, distance and target in its own coordinates."""
+
+    azimuth: float
+    elevation: float
+    distance: float
+    target: list[float]
+
+    @property
+    def numbers(self) -> list[float]:
+        """All of it, in the order of the address."""
+        return [self.azimuth, self.elevation, self.distance, *self.target]
 
 
 @dataclass
@@ -172,9 +187,9 @@ class Tab:
         return [{**moment, "rms": float(moment["rms"]), "max": float(moment["max"])} for moment in moments]
 
     @property
-    def camera(self) -> list[float]:
-        """Where the camera is, in drawn coordinates."""
-        return list(self._state()["camera"])
+    def camera(self) -> Camera:
+        """Where the surface is seen from."""
+        return Camera(**self._state()["camera"])
 
     def _state(self) -> dict[str, Any]:
         return dict(self.view.evaluate(_STATE))

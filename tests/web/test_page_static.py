@@ -21,7 +21,7 @@ from lodestream_client.program import main
 from lodestream_client.sync import upload
 from tests.client.files import ranged
 
-from .browser import Heard
+from .browser import WAIT, Heard
 from .conftest import Tabs
 from .shown import Shelf, surface
 
@@ -90,18 +90,30 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
             assert tab.point(0.5, 0.55)["row"]
 
 
-def test_a_container_cut_short_is_told(tabs: Tabs, host: Path) -> None:
+@pytest.mark.parametrize("tags", [False, True], ids=["no tags", "tags"])
+def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tabs, host: Path, tags: bool) -> None:
     path = host / "surface.lode"
     whole = path.read_bytes()
     path.write_bytes(whole[:-5000])
     with ranged(host) as server:
-        server.tags = False  # else it is another file that is there in the end
+        server.tags = tags
         tab = tabs(f"{server.url}/index.html")
         tab.view.get_by_label("Stop when below a pixel").uncheck()
         tab.shown("Failed")
         expect(tab.notice).to_contain_text("the file was cut short")
         expect(tab.notice).to_contain_text(str(len(whole) - 5000))
         assert not any(moment["complete"] for moment in tab.moments)
+        tab.choose("Colour map", "cividis")
+        tab.button("Try again").click()
+        tab.shown("Failed")
+        expect(tab.notice).to_contain_text("the file was cut short")
+        path.write_bytes(whole)
+        tab.button("Try again").click()
+        tab.shown("Complete: exact")
+        expect(tab.notice).to_be_empty()
+        expect(tab.rms).to_have_text("0 m", timeout=WAIT)
+        assert tab.view.get_by_label("Colour map").input_value() == "cividis"
+        assert not tab.view.get_by_label("Stop when below a pixel").is_checked()
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import UnavailableError
+from lodestream.errors import OptionError, UnavailableError
 from lodestream.page import HOW_TO_BUILD, assets
+from lodestream.quality import Quality
 
 from ..requests.addresses import is_url
 from ..terminal.interrupts import Terminated, interruptible
@@ -229,6 +230,7 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
     from ..viewer.sources import FileSource, RemoteSource
 
     if is_url(options.files[0]):
+        _refuse_options(options.surface, "an address")
         remote = RemoteSource(options.files[0], options.token)
         try:
             yield lambda _: remote
@@ -241,6 +243,7 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
         with first.open("rb") as file:
             ready = len(files.paths) == 1 and file.read(len(_MAGIC)) == _MAGIC
         if ready:
+            _refuse_options(options.surface, "a container")
             yield lambda _: FileSource(first, options.name)
             return
         # By the names of what was copied, since standard input cannot be read twice.
@@ -254,6 +257,14 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
             return FileSource(container, options.name)
 
         yield encoded
+
+
+def _refuse_options(options: SurfaceOptions, what: str) -> None:
+    """Of what is encoded already, options of encoding would change nothing, without a word."""
+    if options.quality != Quality() or options.closed != "auto" or options.format_options:
+        raise OptionError(
+            f"expected a file to encode with --precision, --rms, --closed or -o, got {what}, which is shown as it is"
+        )
 
 
 @contextmanager

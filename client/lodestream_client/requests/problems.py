@@ -91,6 +91,10 @@ def passes(error: LodestreamError) -> bool:
     """Whether the same request may succeed a little later."""
     if isinstance(error, RemoteError):
         return error.code in _PASSING
+    from lodestream.transfer.range_download import CutShortError
+
+    if isinstance(error, CutShortError):
+        return False
     return isinstance(error, UnreachableError | SilenceError | TruncatedStreamError) or _broke_off(error)
 
 

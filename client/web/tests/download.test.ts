@@ -230,7 +230,9 @@ describe.each(KINDS)("%s", (kind) => {
             }
             if (received.ended !== undefined) break;
           }
-          const chosen = plan(INDEX[kind]!, target);
+          // The region that comes first is the last one asked for: without one, no index comes for its sake.
+          const { first: _, ...rest } = target;
+          const chosen = plan(INDEX[kind]!, rest);
           expect(received.ended).toBe(chosen.ended);
           expect(received.dataBytes).toBe(received.cached.total);
           for (const { offset, length } of slicesOf(chosen)) expect(received.cached.covers(offset, length)).toBe(true);
@@ -242,7 +244,11 @@ describe.each(KINDS)("%s", (kind) => {
           }
         },
       ),
-      { numRuns: Number(process.env.RUNS ?? 60) },
+      {
+        numRuns: Number(process.env.RUNS ?? 60),
+        // The region is taken back before the server has heard of it.
+        examples: [[{ first: FAR }, undefined, 900, [[0, undefined]], [], false, fc.stream(zeros())]],
+      },
     );
   }, 180_000);
 
@@ -307,6 +313,11 @@ describe.each(KINDS)("%s", (kind) => {
     );
   }, 180_000);
 });
+
+/** The first of what is possible, always. */
+function* zeros(): Generator<number> {
+  for (;;) yield 0;
+}
 
 /** Answer requests little by little, now of the first and now of the second, some of them broken off. */
 function serveRanges(

@@ -19,7 +19,7 @@ from .receiver_state import ReceiverState
 if TYPE_CHECKING:
     from .receiver_state import DownloadEvent
 
-__all__ = ["RangeDownload", "RangeRequest"]
+__all__ = ["CutShortError", "RangeDownload", "RangeRequest"]
 
 # The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
 # reconstructions come with them, and more where it is known that more is wanted. The last ones, some and a share of the
@@ -33,6 +33,10 @@ _TAIL_MOST = 64 * 1024
 
 _CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d{1,18})-(\d{1,18})/(\d{1,18})\s*")
 _CONTAINER_TAG = re.compile(r'"([0-9a-f]{64})"')
+
+
+class CutShortError(TruncatedStreamError):
+    """A file that its host says is shorter than the container that it begins: asking again does not help."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,7 @@ class RangeDownload:
 
         Raises
         ------
-        CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+        CorruptStreamError, CutShortError, UnsupportedVersionError
             If the file is not a container that can be read.
         OptionError
             If the container cannot meet the target.
@@ -158,7 +162,7 @@ class RangeDownload:
             If the server does not support Range, or the answer does not match the request.
         RemoteError
             With the code ``other-container`` if the file has changed.
-        TruncatedStreamError
+        CutShortError
             If the file ends before what was asked for.
         """
         asked = self._asked
@@ -167,7 +171,7 @@ class RangeDownload:
         self._answered_at = now
         self._check_same(headers, status)
         if status == 416:
-            raise TruncatedStreamError(f"expected a container of at least {asked.offset + 1} bytes, got a shorter file")
+            raise CutShortError(f"expected a container of at least {asked.offset + 1} bytes, got a shorter file")
         if status != 206:
             raise RemoteProtocolError(
                 f"expected part of the file (status 206), got all of it (status {status}): "
@@ -309,6 +313,9 @@ class RangeDownload:
         except _MissingError as missing:
             self._needed = missing.place
             return []
+        except TruncatedStreamError as error:
+            # All bytes that the host has were looked at: others would not follow.
+            raise CutShortError(f"the file was cut short: {error}") from error
         return [*self.reception.follow(index)]
 
     def _next_slices(self) -> tuple[int, int] | None:

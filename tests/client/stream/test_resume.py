@@ -345,6 +345,27 @@ def test_a_file_without_a_version_is_not_kept(
     assert parts(folder) == []
 
 
+def test_a_file_that_is_cut_short_is_asked_for_once(
+    run: Run, tmp_path: Path, container_file: Path, asynchronous: bool, terrain: Terrain
+) -> None:
+    whole = container_file.read_bytes()
+    path = tmp_path / "cut.lode"
+    with ranged(tmp_path) as web:
+        for left in (len(whole) - 1000, 5000, 40, 0):
+            path.write_bytes(whole[:left])
+            web.requests.clear()
+            with pytest.raises(ls.TruncatedStreamError, match=r"the file was cut short|shorter file"):
+                follow(f"{web.url}/cut.lode", asynchronous)
+            asked = [part for _, part in web.requests]
+            assert len(asked) == len(set(asked)) <= 3
+        code, _, stderr = run("pull", f"{web.url}/cut.lode", tmp_path / "o.npy")
+        assert code == 1
+        assert "shorter file" in stderr
+        path.write_bytes(whole)
+        assert run("pull", f"{web.url}/cut.lode", tmp_path / "o.npy")[0] == 0
+    assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
+
+
 def test_seconds_and_the_metadata_are_kept_too(run: Run, surface: str, folder: Path, tmp_path: Path) -> None:
     figures, _ = pull(run, surface, tmp_path / "a.npy", "--seconds", "1.2", "--limit-rate", "64kbit")
     assert figures["ended"] == "seconds"

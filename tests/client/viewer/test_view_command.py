@@ -168,6 +168,17 @@ def test_wrong_command_lines(container: Path, arguments: list[str]) -> None:
     assert ended.value.code == 2
 
 
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize("option", [["--closed", "both"], ["--precision", "1"], ["--rms", "1"], ["-o", "variable=z"]])
+def test_of_what_is_encoded_already_nothing_is_chosen(
+    tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str], option: list[str]
+) -> None:
+    for shown, what in ((str(container), "a container"), ("http://127.0.0.1:1/a.lode", "an address")):
+        assert main(["view", shown, "--static", str(tmp_path / "out"), *option]) == 1
+        assert f"got {what}, which is shown as it is" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+
 def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Path) -> None:
     with ranged(tmp_path) as host:
         source = RemoteSource(f"{host.url}/{container.name}", None)

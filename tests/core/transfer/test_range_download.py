@@ -21,7 +21,7 @@ from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.protocol.messages import BASE_CREDIT, MIN_WINDOW
 from lodestream.transfer.download import Download
-from lodestream.transfer.range_download import RangeDownload, RangeRequest
+from lodestream.transfer.range_download import CutShortError, RangeDownload, RangeRequest
 from lodestream.transfer.receiver_state import MemoryStore, ReceiverState
 from lodestream.transfer.sender import Sender
 
@@ -220,7 +220,7 @@ def test_an_answer_that_is_not_what_was_asked_for(status: int, headers: dict[str
 
 
 def test_a_file_without_bytes() -> None:
-    with pytest.raises(TruncatedStreamError, match="shorter file"):
+    with pytest.raises(CutShortError, match="shorter file"):
         started({}, 416)
 
 

@@ -108,6 +108,12 @@ export class FocusPanel {
     return state === "connecting" || state === "receiving" || state === "resuming" || state === "waiting";
   }
 
+  /** Asks another session for what is chosen, as far as that is not what it does anyway. */
+  begin(): void {
+    if (this.target.value !== "all") this.sendTarget();
+    if (Number(this.rate.value) > 0) this.actions.throttle(Number(this.rate.value));
+  }
+
   /** Says whether it stops below a pixel. */
   setBelowPixel(on: boolean): void {
     this.below.checked = on;

@@ -1,6 +1,6 @@
 /** `<lodestream-view>`: a surface that comes into focus, with its controls. */
 
-import { positionOf } from "./camera";
+import type { Orbit } from "./camera";
 import { html, isStill, setText } from "./dom";
 import { FocusPanel } from "./focus-panel";
 import { Framing } from "./framing";
@@ -68,7 +68,7 @@ export class LodestreamView extends HTMLElement {
     root.adoptedStyleSheets = [styles()];
     this.focusPanel = new FocusPanel({
       stop: () => this.session?.stop(),
-      resume: () => this.session?.resume(),
+      resume: () => this.goOn(),
       show: (moment) => this.session?.show(moment),
       setTarget: (target) => this.session?.setTarget(target),
       throttle: (rate) => this.session?.source.throttle(rate),
@@ -220,6 +220,20 @@ export class LodestreamView extends HTMLElement {
     this.stopBelowPixel(this.getAttribute("autostop") !== "off");
     this.look = { ...this.look, field: this.shared.field ?? { kind: "height" }, range: this.shared.range ?? null };
     this.session.setField(this.look.field);
+    this.focusPanel.begin();
+  }
+
+  /** Goes on; where what has come is of no use, from the beginning, seen as it is now. */
+  private goOn(): void {
+    const { session } = this;
+    if (session?.progress.state !== "failed" || session.progress.useless !== true) {
+      session?.resume();
+      return;
+    }
+    const below = session.stopsBelowPixel;
+    this.shared = this.view();
+    this.open();
+    this.stopBelowPixel(below);
   }
 
   private stopBelowPixel(on: boolean): void {
@@ -374,7 +388,7 @@ export class LodestreamView extends HTMLElement {
         break;
       case "stop":
         if (this.focusPanel.canStop) session?.stop();
-        else session?.resume();
+        else this.goOn();
         break;
       case "lines":
         this.setLook({ ...this.look, lines: !this.look.lines });
@@ -415,13 +429,16 @@ export class LodestreamView extends HTMLElement {
     return at === null || framing === null ? null : framing.drawn(at, this.look.exaggeration);
   }
 
-  /** The view as it is shared: what nobody has set is left to follow the surface there too. */
   private sharedView(): SharedView | null {
-    const { framing, orbit, isHeld, isChosen } = this.viewpoint;
-    if (!this.isConnected || !this.hasAttribute("share") || orbit === null || framing === null) return null;
+    return this.isConnected && this.hasAttribute("share") && this.camera !== null ? this.view() : null;
+  }
+
+  /** The view as it can be shown again: what nobody has set is left to follow the surface then too. */
+  private view(): SharedView {
+    const { camera, isHeld, isChosen } = this.viewpoint;
     const { field, map, range, exaggeration, lines } = this.look;
     return {
-      ...(isHeld ? { camera: framing.toSurface(orbit, exaggeration) } : {}),
+      ...(isHeld && camera !== null ? { camera } : {}),
       field,
       map,
       ...(isHeld || isChosen ? { exaggeration } : {}),
@@ -447,9 +464,8 @@ export class LodestreamView extends HTMLElement {
     if (camera !== undefined) this.viewpoint.place(framing.toDrawn(camera, this.look.exaggeration));
   }
 
-  /** Where the camera is, in drawn coordinates; for tests. */
-  get cameraPosition(): [number, number, number] | null {
-    const { orbit } = this.viewpoint;
-    return orbit === null ? null : positionOf(orbit);
+  /** Where the surface is seen from, in its own coordinates; null before the first picture. */
+  get camera(): Orbit | null {
+    return this.viewpoint.camera;
   }
 }

@@ -3,10 +3,11 @@
 import type { Header } from "../container/header";
 import { Decoder } from "../decoding/decoder";
 import type { View } from "../decoding/view";
-import { RemoteError } from "../errors";
+import { CorruptStreamError, RemoteError, UnsupportedVersionError } from "../errors";
 import { loadKernels } from "../kernels/instance";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { WindowErrors } from "../planning/window-errors";
+import { CutShortError } from "../transfer/problems";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
 import { composed, thinned } from "./compose";
@@ -32,7 +33,7 @@ export class Receiver {
   private rate: number | null = null;
   private running = false;
   private began = 0;
-  private failure: { detail: string; code: string } | null = null;
+  private failure: Pick<Progress, "detail" | "code" | "useless"> | null = null;
   private history: { at: number; bytes: number }[] = [];
   private windows: WindowErrors | null = null;
   private askedForErrors = false;
@@ -73,11 +74,11 @@ export class Receiver {
   }
 
   /** The grids of a moment, see `Source.grids`. */
-  grids(asked: number | null, level: number, window: DetailWindow | null): MomentGrids {
+  async grids(asked: number | null, level: number, window: DetailWindow | null): Promise<MomentGrids> {
     const header = this.decoder!.header!;
     const moment = asked ?? this.views.length - 1;
     const view = this.views[moment]!;
-    const surface = view.surface(level === header.levels ? undefined : level);
+    const surface = await view.surfaceAsync(level === header.levels ? undefined : level);
     const grids = surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
     if (window === null) return { moment, grids };
     const [part] = view.window(window.region).blocks;
@@ -86,11 +87,11 @@ export class Receiver {
   }
 
   /** The values of a node, see `Source.valuesAt`. */
-  valuesAt(moment: number, block: number, row: number, column: number): NodeValues {
+  async valuesAt(moment: number, block: number, row: number, column: number): Promise<NodeValues> {
     const header = this.decoder!.header!;
     const view = this.views[moment]!;
     const single = header.blocks.length === 1 && header.arrangement === null;
-    if (!single && this.whole?.moment !== moment) this.whole = { moment, surface: view.surface() };
+    if (!single && this.whole?.moment !== moment) this.whole = { moment, surface: await view.surfaceAsync() };
     const surface = single
       ? view.window([
           [row, row + 1],
@@ -228,7 +229,8 @@ export class Receiver {
 
   private fail(error: unknown): void {
     const detail = error instanceof Error ? error.message : String(error);
-    this.failure = { detail, code: error instanceof RemoteError ? error.code : "" };
+    const code = error instanceof RemoteError ? error.code : "";
+    this.failure = { detail, code, useless: isUseless(error) };
     this.progress();
   }
 
@@ -242,9 +244,9 @@ export class Receiver {
     this.events.progress({ bytes: received, planned: planned ?? 0, rate: Math.max(rate, 0), ...this.state() });
   }
 
-  private state(): Pick<Progress, "state" | "detail" | "code"> {
+  private state(): Pick<Progress, "state" | "detail" | "code" | "useless"> {
     const { stream, failure } = this;
-    if (failure !== null) return { state: "failed", detail: failure.detail, code: failure.code };
+    if (failure !== null) return { state: "failed", ...failure };
     const { phase, problem, pause, ended } = stream?.state ?? { phase: "connecting" as const };
     if (phase === "streaming") return { state: "receiving", detail: "" };
     if (phase === "reconnecting") {
@@ -255,4 +257,10 @@ export class Receiver {
     if (ended === "stopped") return { state: "stopped", detail: "" };
     return { state: ended === "complete" ? "complete" : "target", detail: "" };
   }
+}
+
+/** Whether bytes that have come do not fit to those that another attempt would bring: only another file can help. */
+function isUseless(error: unknown): boolean {
+  if (error instanceof RemoteError) return error.code === "other-container";
+  return [CorruptStreamError, CutShortError, UnsupportedVersionError].some((kind) => error instanceof kind);
 }

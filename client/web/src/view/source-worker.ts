@@ -1,5 +1,6 @@
 /** The worker of `LodeSource`: stream, decoder and conversion to grids share one thread that is not the page's. */
 
+import { Answers } from "./answers";
 import { Receiver } from "./receiver";
 import type { FromSource, ToSource } from "./source-messages";
 
@@ -13,6 +14,7 @@ const receiver = new Receiver({
   progress: (progress) => scope.postMessage({ kind: "progress", progress }),
   refined: () => scope.postMessage({ kind: "refined" }),
 });
+const answers = new Answers(receiver, (answer, transfer) => scope.postMessage(answer, transfer));
 
 scope.onmessage = ({ data }) => {
   switch (data.kind) {
@@ -20,7 +22,7 @@ scope.onmessage = ({ data }) => {
       void receiver.open(data.url, data.token);
       break;
     case "question":
-      answer(data);
+      answers.take(data.id, data.question);
       break;
     case "focus":
       receiver.focus(data.region);
@@ -39,22 +41,3 @@ scope.onmessage = ({ data }) => {
       break;
   }
 };
-
-function answer({ id, question }: Extract<ToSource, { kind: "question" }>): void {
-  try {
-    if (question.kind === "values") {
-      const { moment, block, row, column } = question;
-      scope.postMessage({ kind: "values", id, values: receiver.valuesAt(moment, block, row, column) });
-      return;
-    }
-    const picture = receiver.grids(question.moment, question.level, question.window);
-    const buffers = picture.grids.flatMap(({ points, mask, rowsAt, columnsAt, attributes }) =>
-      [points, mask, rowsAt, columnsAt, ...attributes.map(({ values }) => values)].flatMap((array) =>
-        array === null ? [] : [array.buffer as ArrayBuffer],
-      ),
-    );
-    scope.postMessage({ kind: "grids", id, picture }, [...new Set(buffers)]);
-  } catch (error) {
-    scope.postMessage({ kind: "refused", id, detail: error instanceof Error ? error.message : String(error) });
-  }
-}

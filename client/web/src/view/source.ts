@@ -151,6 +151,8 @@ export interface Progress {
   readonly detail: string;
   /** A machine's word for a failure, such as `no-token`. */
   readonly code?: string;
+  /** Whether what has come is of no use to another attempt, as where the file has changed: it has to begin anew. */
+  readonly useless?: boolean;
 }
 
 /** What a source tells, as it happens. */

@@ -41,6 +41,12 @@ export class Viewpoint {
     return this.pose?.orbit ?? null;
   }
 
+  /** The same in the surface's coordinates. */
+  get camera(): Orbit | null {
+    const { pose, framing } = this;
+    return pose === null || framing === null ? null : framing.toSurface(pose.orbit, pose.exaggeration);
+  }
+
   /** The exaggeration that holds, or towards which the picture is moving. */
   get exaggeration(): number {
     return this.aim?.exaggeration ?? this.chosen ?? 1;
