@@ -67,6 +67,19 @@ describe("the camera that nobody has touched", () => {
     expect(seen.poses).toHaveLength(2);
   });
 
+  it("is told in the surface's own coordinates, on its way too", () => {
+    const { at } = new Seen();
+    expect(at.camera).toBeNull();
+    at.take(framing(COARSE), 1, 0, { exaggeration: 4 });
+    expect(at.camera?.distance).toBeCloseTo(2 * at.orbit!.distance);
+    at.take(framing([COARSE[0], [3, 3, 5]]), 1, 1000);
+    at.advance(1250);
+    expect(at.camera?.target[0]).toBeCloseTo(0.5);
+    expect(at.camera?.target[2]).toBeCloseTo(1);
+    for (let now = 1250; at.advance(now); now += 16);
+    expect(at.camera?.target).toEqual([1, 1, 2]);
+  });
+
   it("takes the same view into another frame before it follows", () => {
     const { at } = new Seen();
     at.take(framing(COARSE), 1, 0);
