@@ -241,7 +241,9 @@ class Download:
 
     def _open(self, cached: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
         self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
-        return self._connection.send(Open(self.reception.target, self.window.size, cached, container))
+        target = self.reception.target
+        asks = None if target.region is None else True
+        return self._connection.send(Open(target, self.window.size, cached, container, window_errors=asks))
 
     def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:
         self.answer = event
@@ -250,7 +252,8 @@ class Download:
         self.window.allow(self._connection.most)
         self._grant(now)
         self.reception.identify(event.container, event.size)
-        return [*self.reception.expect(event.planned, event.index, event.metadata, event.prefix)]
+        places = event.index, event.metadata, event.window_errors
+        return [*self.reception.expect(event.planned, *places, prefix=event.prefix)]
 
     def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
         stopped = self._connection.state is State.STOPPING

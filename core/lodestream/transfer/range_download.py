@@ -295,6 +295,7 @@ class RangeDownload:
     def _read_index(self) -> list[DownloadEvent]:
         from ..container import read_index
         from ..container.capacity import Capacity
+        from ..planning.window_errors import read_window_errors
 
         store, size = self.reception.keep(), self.reception.size or 0
 
@@ -303,13 +304,15 @@ class RangeDownload:
                 raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
 
-        self._needed = None
+        self._needed, windows = None, None
         try:
             index = read_index(read, size, Capacity(self.reception.decoder.capacity.max_vertices))
+            if self.reception.target.region is not None:
+                windows = read_window_errors(index, read)
         except _MissingError as missing:
             self._needed = missing.place
             return []
-        return [*self.reception.follow(index)]
+        return [*self.reception.follow(index, windows)]
 
     def _next_slices(self) -> tuple[int, int] | None:
         """The next slice that is missing, with those after it that are near and nothing between that is cached."""

@@ -200,7 +200,9 @@ export class Download<View extends ViewInfo> {
   private openWith(held: readonly Place[] = [], container?: string, token?: string): Uint8Array {
     const credit = this.window.size;
     this.window.grant(credit);
-    return this.connection.send({ type: "open", target: this.reception.target, credit, held, container, token });
+    const { target } = this.reception;
+    const window_errors = target.region === undefined ? undefined : true;
+    return this.connection.send({ type: "open", target, credit, held, container, token, window_errors });
   }
 
   private begin(event: Header, now: number | undefined): View[] {
@@ -211,7 +213,7 @@ export class Download<View extends ViewInfo> {
     this.reception.identify(event.container, event.size);
     // What answers the last target says nothing of the one that is asked for next.
     if (this.aiming) return [];
-    return this.reception.expect(event.planned, event.index, event.metadata, event.prefix);
+    return this.reception.expect(event);
   }
 
   private take(event: Segments, now: number | undefined): View[] {
