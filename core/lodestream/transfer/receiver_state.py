@@ -310,10 +310,13 @@ class ReceiverState:
                 views += self.decoder.feed_at(start, new)
         return views + self._advance()
 
-    def missing(self) -> Iterator[tuple[int, int]]:
-        """The bytes that are still to come, as (offset, length) in order; once the index is known."""
+    def missing(self, cached: RangeSet | None = None) -> Iterator[tuple[int, int]]:
+        """The bytes that are still to come, as (offset, length) in order; once the index is known.
+
+        ``cached`` is what is not asked for again, by default what is cached.
+        """
         for place in self._order or ():
-            yield from self.cached.missing(*place)
+            yield from (self.cached if cached is None else cached).missing(*place)
 
     def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
         """The parts of a range that the target needs, cached or not; before that is known, the whole range."""
