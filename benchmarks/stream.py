@@ -74,7 +74,7 @@ def serve(server: str, points: Any) -> Served:
 
 def noise() -> Any:
     """Float32, shape (row, column): numbers without any pattern."""
-    return np.random.default_rng(4).integers(0, 2**31, SHAPE, np.uint32).view(np.float32)
+    return np.random.default_rng(4).integers(0, 0x7F000000, SHAPE, np.uint32).view(np.float32)
 
 
 def gate_table(large: Served, small: Served) -> None:
