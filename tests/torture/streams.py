@@ -221,8 +221,8 @@ async def _one(
     turning = random.random() < 0.3
     async with Link(url, faults_of(random, len(container))) as link:
         address = link.url if not path else link.url.partition("/v1/")[0] + path
-        times = {"silence": silence, "deadline": _DEADLINES * silence, "close_timeout": silence}
-        stream = aio.connect(address, target=target, **times, **options)
+        options |= {"silence": silence, "deadline": _DEADLINES * silence, "close_timeout": silence}
+        stream = aio.connect(address, target=target, **options)
         try:
             async with stream:
                 async for _ in stream:

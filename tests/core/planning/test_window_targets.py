@@ -30,8 +30,7 @@ CONTAINERS: dict[tuple[str, int, bool], tuple[ls.Surface, bytes]] = {}
 def encoded(kind: str, shape: int, single: bool) -> tuple[ls.Surface, bytes]:
     if (kind, shape, single) not in CONTAINERS:
         surface = surface_of(kind, *SHAPES[shape])
-        quality = {"rms": "1e-3d"} if single else {}
-        CONTAINERS[kind, shape, single] = surface, ls.encode(surface, **quality)
+        CONTAINERS[kind, shape, single] = surface, ls.encode(surface, rms="1e-3d" if single else None)
     return CONTAINERS[kind, shape, single]
 
 
@@ -43,7 +42,8 @@ def within(surface: ls.Surface, found: ls.Surface, region: Region) -> tuple[floa
     """RMS and maximum of the distances of a window from the original."""
     place = slice(*region[0]), slice(*region[1])
     wanted, got = (np.asarray(array, np.float64) for array in (surface.points[place], found.points))
-    valid: NDArray[Any] = np.isfinite(wanted) if wanted.ndim == 2 else np.isfinite(wanted).all(axis=2)
+    finite = np.isfinite(wanted)
+    valid: NDArray[Any] = finite if wanted.ndim == 2 else np.all(finite, axis=2)
     if surface.mask is not None:
         valid &= surface.mask[place]
     apart = wanted[valid] - got[valid]
@@ -82,7 +82,7 @@ def test_what_is_told_holds_and_no_stop_comes_too_early(
     left, right = sorted(int(corner * (columns - 2)) for corner in corners[2:])
     region = (top, bottom + 1), (left, right + 2)  # a surface has two points
     tolerance = 10**share * index.header.extent
-    target = ls.Target(region=region, order=order, **{limit: ls.Tolerance(tolerance)})
+    target = replace(ls.Target(region=region, order=order), **{limit: ls.Tolerance(tolerance)})
     windows = windows_of(container, index) if with_own else None
     views = views_of(container, index, target, windows)
     place = slice(*region[0]), slice(*region[1])

@@ -63,9 +63,9 @@ def talk(reception: ReceiverState, *, earlier_server: bool = False, pieces: int 
             if earlier_server:
                 fields.pop("window_errors", None)
             server.receive(msgpack.packb(fields))
-        while (message := server.next_message()) is not None:
-            said.append(parse(message))
-            shown += client.receive(message)
+        while (answer := server.next_message()) is not None:
+            said.append(parse(answer))
+            shown += client.receive(answer)
         if (wanted := server.wanted()) is not None:
             server.provide(wanted, read(wanted.offset, wanted.length))
     return said, shown
