@@ -61,6 +61,7 @@ class Download:
         self._connection = Connection(Side.CLIENT)
         self._opened: float | None = None
         self._turning = False  # this end has stopped in order to open again
+        self._reopened = False
         # Of a container that is not known by name, nothing can be said to be cached.
         known = self.reception.container is not None
         cached = _largest(self.reception) if known else ()
@@ -127,6 +128,7 @@ class Download:
                 self._turning = False
                 # The server knows what it has sent, and that nothing more of the last grants will come.
                 self.window.restart()
+                self._reopened = True
                 self._outbox.append(self._open())
                 return []
             self._outbox.append(self._connection.send(Bye()))
@@ -249,6 +251,8 @@ class Download:
         self.answer = event
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
+            if not self._reopened:
+                self.window.began(self._opened)
         self.window.allow(self._connection.most)
         self._grant(now)
         self.reception.identify(event.container, event.size)

@@ -82,7 +82,8 @@ def test_what_is_told_holds_and_no_stop_comes_too_early(
     left, right = sorted(int(corner * (columns - 2)) for corner in corners[2:])
     region = (top, bottom + 1), (left, right + 2)  # a surface has two points
     tolerance = 10**share * index.header.extent
-    target = replace(ls.Target(region=region, order=order), **{limit: ls.Tolerance(tolerance)})
+    limits: dict[str, Any] = {limit: ls.Tolerance(tolerance)}
+    target = ls.Target(region=region, order=order, **limits)
     windows = windows_of(container, index) if with_own else None
     views = views_of(container, index, target, windows)
     place = slice(*region[0]), slice(*region[1])

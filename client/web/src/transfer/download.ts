@@ -42,6 +42,7 @@ export class Download<View extends ViewInfo> {
   private readonly connection = new Connection("client");
   private openedAt: number | undefined;
   private turning = false; // this end has stopped in order to open again
+  private reopened = false;
   private aiming = false; // with another target, even if the last one is met
   private outbox: Uint8Array[];
 
@@ -207,7 +208,10 @@ export class Download<View extends ViewInfo> {
 
   private begin(event: Header, now: number | undefined): View[] {
     this.header = event;
-    if (now !== undefined && this.openedAt !== undefined) this.window.heard(now - this.openedAt);
+    if (now !== undefined && this.openedAt !== undefined) {
+      this.window.heard(now - this.openedAt);
+      if (!this.reopened) this.window.began(this.openedAt);
+    }
     this.window.allow(this.connection.most);
     this.grant(now);
     this.reception.identify(event.container, event.size);
@@ -236,6 +240,7 @@ export class Download<View extends ViewInfo> {
       this.turning = this.aiming = false;
       // The server knows what it has sent, and that nothing more of the last grants will come.
       this.window.restart();
+      this.reopened = true;
       this.outbox.push(this.openWith());
       return;
     }
