@@ -23,6 +23,7 @@ SECTIONS = (
     "meshes",
     "blocks",
     "formats",
+    "stream",
 )
 
 # Before numpy is loaded: every figure is of one core, but where another number of threads is named.

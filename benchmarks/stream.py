@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 
 import lodestream as ls
 from lodestream.protocol.messages import BASE_CREDIT
@@ -25,13 +26,17 @@ from lodestream_server import running_server
 from tests.links import Fault, Link
 
 from .arrays import Array, fractal, load
-from .measure import note, table
+from .measure import gate, note, table
 from .rate import layers_of
 
 ROUND_TRIP = 0.1
 RATES: dict[str, float | None] = {"64 kbit/s": 8e3, "256 kbit/s": 32e3, "10 Mbit/s": 1.25e6, "unlimited": None}
 REPEATS = 3
 DEMS: tuple[str, ...] = ("jacksboro", "bigtujunga")
+
+# Noise, which is stored as it is: of 50 MB, so that the beginning of a stream is a small part of it.
+FAST, SHAPE = 12.5e6, (3200, 3907)
+SHARE_AIM, TRIPS_AIM, SLOW_AIM = 0.85, 1.2, 32 * 1024
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
         large = serve(server, fractal(1537))
         list(sync.connect(large.url, target=ls.Target(max_bytes=20_000)))  # compiles what decoding needs
+        gate_table(serve(server, noise()), large)
         stop_table(large)
         dems = {name: serve(server, arrays[name].points) for name in DEMS if name in arrays}
         first_table({"fractal": large, **dems})
@@ -64,6 +70,49 @@ def main() -> None:
 def serve(server: str, points: Any) -> Served:
     surface = sync.upload(server, ls.Surface(points))
     return Served(surface.url, sync.fetch_range(surface.url, 0, int(surface.details["bytes"])))
+
+
+def noise() -> Any:
+    """Float32, shape (row, column): numbers without any pattern."""
+    return np.random.default_rng(4).integers(0, 0x7F000000, SHAPE, np.uint32).view(np.float32)
+
+
+def gate_table(large: Served, small: Served) -> None:
+    """A long stream over a fast and distant link; what comes after a stop there, and on a slow one."""
+    shares, trips, slow = [], [], []
+    for _ in range(REPEATS):
+        shares.append(asyncio.run(share_of_link(large)))
+        trips.append(asyncio.run(stopped(large, FAST, None, 20_000_000))[1] / (FAST * ROUND_TRIP))
+        slow.append(asyncio.run(stopped(small, RATES["256 kbit/s"], None))[1])
+    figures = (
+        ("50 MB, share of the link at 100 Mbit/s", shares, (SHARE_AIM, None), ""),
+        ("after a stop at 100 Mbit/s, round trips' worth", trips, (None, TRIPS_AIM), ""),
+        ("after a stop at 256 kbit/s", slow, (None, SLOW_AIM), " bytes"),
+    )
+    rows = []
+    for name, found, (least, most), unit in figures:
+        middle = statistics.median(found)
+        verdict = gate(f"4. {name}", middle, at_least=least, at_most=most, unit=unit)
+        rows.append([name, *(f"{each:,.4g}" for each in (min(found), middle, max(found), least or most or 0)), verdict])
+    table("Gate 4: 100 ms round trip, WebSocket", ["figure", "least", "median", "most", "aim", ""], rows)
+
+
+async def followed(stream: aio.Stream) -> None:
+    """Receive to the end."""
+    async for _ in stream:
+        pass
+
+
+async def share_of_link(served: Served) -> float:
+    """Bytes of a whole stream over those that the link carries from the TCP connection to the last view."""
+    fault = Fault(delay=ROUND_TRIP / 2, rate=FAST)
+    async with Link(served.url, lambda _: fault) as link:
+        started = time.monotonic()
+        async with aio.connect(link.url, transport="ws") as stream:
+            async for view in stream:
+                if view.complete:
+                    return stream.wire_bytes / FAST / (time.monotonic() - started)
+    raise AssertionError("expected a complete surface")
 
 
 def stop_table(served: Served) -> None:
@@ -87,19 +136,20 @@ def stop_table(served: Served) -> None:
     note("Aim for the bytes after the stop: at most the outstanding credit; at 256 kbit/s at most 32,768 bytes.")
 
 
-async def stopped(served: Served, rate: float | None, window: int | None) -> tuple[int, int, float, int]:
+async def stopped(
+    served: Served, rate: float | None, window: int | None, most: int = 600_000
+) -> tuple[int, int, float, int]:
     """Credit and bytes received at the stop; bytes after it, and how long they took."""
     fault = Fault(delay=ROUND_TRIP / 2, rate=rate)
     async with Link(served.url, lambda _: fault) as link, aio.connect(link.url, window=window) as stream:
-        until = time.monotonic() + 2.0
-        async for _ in stream:
-            if time.monotonic() >= until or stream.received > 600_000:
-                break
+        # Not by views: of noise there are few.
+        following, until = asyncio.create_task(followed(stream)), time.monotonic() + 2.0
+        while time.monotonic() < until and stream.received <= most and not following.done():
+            await asyncio.sleep(0.001)
         assert stream._session.download is not None
         credit, before, now = stream._session.download.credit, stream.data_bytes, time.monotonic()
         await stream.stop()
-        async for _ in stream:
-            pass
+        await following
         return credit, stream.data_bytes - before, time.monotonic() - now, before
 
 

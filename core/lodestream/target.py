@@ -95,7 +95,8 @@ class Target:
     level : int or None
         Levels up to this one and nothing finer; cannot be combined with the other limits.
     until_rms, until_max : Tolerance or None
-        Stop at the first layer with an error of at most this.
+        Stop at the first layer with an error of at most this. Of a region, the error inside counts, as far as its bound
+        tells (`View.bound`).
     max_bytes : int or None
         Stop at the last layer that ends within so many bytes of the container.
     seconds : float or None

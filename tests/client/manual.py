@@ -51,11 +51,12 @@ What all commands have in common:
 - If a limit such as `--until-rms` cannot be reached, the result is the complete surface, with a note.
 - `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
-  combined with each other and with the limits; `--roi` cannot be combined with `--level`. `rms` and `max` of a window
-  are null until it is complete.
+  combined with each other and with the limits; `--roi` cannot be combined with `--level`.
+- Errors of a window are bounds until it is exact: `--until-rms` and `--until-max` stop where the error inside is at
+  most the limit for certain. `info` tells errors of the whole surface only.
 - With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that
-  was read or received), `level`, `rms`, `max`, `seconds` and `ended`: complete, level, rms, max, bytes, seconds,
-  stopped or truncated.
+  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `seconds` and `ended`: complete,
+  level, rms, max, bytes, seconds, stopped or truncated.
 
 An interrupted `pull`:
 

@@ -14,6 +14,7 @@ import lodestream_client as client
 from lodestream.container import read_index
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
+from lodestream.planning.window_errors import read_window_errors
 from lodestream_client import sync
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, linked
@@ -120,21 +121,41 @@ def test_it_is_what_cutting_the_whole_gives(
     ("limit", "ended"),
     [
         ({"max_bytes": 6000}, "bytes"),
+        ({"region": WINDOW, "until_rms": ls.Tolerance(1e-2, True)}, "rms"),
+        ({"region": WINDOW, "until_max": ls.Tolerance(3e-2, True), "attributes": ()}, "max"),
+        ({"region": WINDOW, "until_max": ls.Tolerance(0.1, True), "order": "level"}, "max"),
         ({"until_rms": ls.Tolerance(2e-2, True), "attributes": ("kind",)}, "rms"),
         ({"level": 4, "attributes": ("speed",)}, "level"),
     ],
     ids=repr,
 )
 def test_limits_of_a_part(
-    address: str, container: bytes, asynchronous: bool, transport: str, limit: dict[str, Any], ended: str
+    address: str,
+    container: bytes,
+    given: ls.Surface,
+    asynchronous: bool,
+    transport: str,
+    limit: dict[str, Any],
+    ended: str,
 ) -> None:
-    chosen = limit if "attributes" in limit else {"region": WINDOW, **limit}
+    chosen = limit if "attributes" in limit else {**limit, "region": WINDOW}
     target = ls.Target(**chosen)
     stream = follow(address, asynchronous, transport, target)
     assert stream.ended == ended
     # A reader with the whole file at hand, given what the plan says and nothing else.
     index = read_index(lambda offset, length: container[offset : offset + length], len(container))
-    expected = plan(index, target)
+    windows = read_window_errors(index, lambda offset, length: container[offset : offset + length])
+    assert windows is not None
+    expected = plan(index, target, windows=windows)
+    told = [(view.bytes, view.rms, view.max_error) for view in stream.decoder.layers]
+    assert [(mark.bytes, mark.rms, mark.max_error) for mark in expected.marks][-1] == told[-1]
+    if target.region is not None:
+        found, wanted = stream.decoder.surface().points, cut(given.points, WINDOW)
+        squares = ((found.astype(float) - wanted) ** 2).sum(axis=2)
+        last = stream.decoder.layers[-1]
+        assert last.bound
+        assert np.sqrt(squares.mean()) <= last.rms
+        assert np.sqrt(squares.max()) <= last.max_error
     assert (stream.decoder.bytes, stream.planned) == (expected.bytes, expected.bytes)
     decoder = ls.Decoder(selection_of(target))
     for place in expected.slices:

@@ -16,6 +16,7 @@ from lodestream.container.fields import told
 from lodestream.decoding.decoder import Decoder, View
 from lodestream.encoding import large_units
 from lodestream.planning.plan import Plan
+from lodestream.planning.selection import Selection
 
 __all__ = [
     "SAMPLES",
@@ -128,9 +129,11 @@ def figures(view: View) -> tuple[int, int, int, float, float, bool]:
     return view.number, view.level, view.bytes, view.rms, view.max_error, view.complete
 
 
-def follow(container: bytes, plan: Plan, pieces: int = 2**62) -> tuple[Decoder, list[View]]:
+def follow(
+    container: bytes, plan: Plan, pieces: int = 2**62, selection: Selection | None = None
+) -> tuple[Decoder, list[View]]:
     """A decoder that was given all slices of a plan, cut into pieces of so many bytes, and its views."""
-    decoder, views = Decoder(), []
+    decoder, views = Decoder(selection), []
     for place in (*plan.before, *plan.ranges, *plan.after):
         for start in range(place.offset, place.end, pieces):
             views += decoder.feed_at(start, container[start : min(start + pieces, place.end)])

@@ -20,6 +20,7 @@ from lodestream.errors import OptionError
 from lodestream.planning.byte_ranges import RangeSet
 from lodestream.planning.plan import Plan
 from lodestream.planning.planner import plan
+from lodestream.planning.window_errors import WindowErrors, read_window_errors
 from lodestream.target import Region, Target, Tolerance
 from tests.core.surfaces import index_of, terrain
 
@@ -28,7 +29,7 @@ _TARGETS = 40
 
 def container(random: Random) -> bytes:
     """A random surface: of one or two blocks, with holes, attributes, wrapping axes or a precision."""
-    shape = random.choice([(2, 1), (9, 7), (33, 20), (70, 64), (150, 41), (240, 201)])
+    shape = random.choice([(2, 1), (9, 7), (33, 20), (70, 64), (150, 41), (240, 201), (20, 600), (300, 270)])
     seed = random.randrange(2**30)
     heights = terrain(shape, seed)
     kind = random.choice(["float", "integers", "holes", "attributes", "precision", "wraps", "blocks", "points"])
@@ -79,14 +80,18 @@ def target(random: Random, index: Index) -> Target:
         options["max_bytes"] = random.choice([1, 200, random.randrange(1, index.size + 100), index.surface_end])
     if kind == "region":
         options["region"] = _region(random, header.shape)
+        if random.random() < 0.6:
+            limit = Tolerance(10 ** random.uniform(-4, 0), relative=True)
+            options[random.choice(["until_rms", "until_max"])] = limit
     if kind == "attributes" or (kind in ("region", "level") and random.random() < 0.3):
         names = [attribute.name for attribute in header.attributes]
         options["attributes"] = tuple(name for name in [*names, "nothing"] if random.random() < 0.4)
     return Target(**options)
 
 
-def case(random: Random, index: Index) -> dict[str, Any]:
-    """A target, what is held, and the plan or the error."""
+def case(random: Random, index: Index, windows: WindowErrors | None) -> dict[str, Any]:
+    """A target, what is held, and the plan or the error; with the container's bounds of windows or without, or none."""
+    mode = random.choice(["own", "own", "whole", "none"])
     asked = target(random, index)
     held = [
         (random.randrange(index.size), random.randrange(1, index.size)) for _ in range(random.choice([0, 0, 1, 3, 10]))
@@ -95,10 +100,11 @@ def case(random: Random, index: Index) -> dict[str, Any]:
         held = [(offset, max(length // 20, 1)) for offset, length in held]
     made: dict[str, Any]
     try:
-        made = {"plan": _told(plan(index, asked, RangeSet(held)))}
+        own = windows if mode == "own" else None
+        made = {"plan": _told(plan(index, asked, RangeSet(held), windows=own, bounded=mode != "none"))}
     except OptionError as error:
         made = {"error": str(error)}
-    return {"target": _options(asked), "held": held, **made}
+    return {"target": _options(asked), "held": held, "windows": mode, **made}
 
 
 def _region(random: Random, shape: tuple[int, int]) -> Region:
@@ -159,7 +165,8 @@ def main(seed: int, count: int) -> None:
     for _ in range(count):
         made = container(random)
         index = index_of(made)
-        cases = [case(random, index) for _ in range(_TARGETS)]
+        windows = read_window_errors(index, lambda offset, length, made=made: made[offset : offset + length])  # type: ignore[misc]
+        cases = [case(random, index, windows) for _ in range(_TARGETS)]
         print(json.dumps({"container": base64.b64encode(made).decode(), "cases": cases}))
 
 

@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import InputError
+from lodestream.planning.plan import Plan
 from lodestream.planning.planner import plan
+from lodestream.planning.selection import Selection, selection_of
+from lodestream.planning.window_errors import read_window_errors
 from lodestream.target import Order
 from tests.core.surfaces import all_large, follow, index_of, terrain, torus
 from tests.golden.generate import digests, expectations
@@ -43,6 +46,7 @@ def case(chance: Random, number: int) -> dict[str, Any]:
         "expected": expectations(container),
         "window": window(chance, container),
         "followed": followed(chance, container),
+        "followed_window": followed_window(chance, container),
     }
 
 
@@ -198,9 +202,24 @@ def followed(chance: Random, container: bytes) -> dict[str, Any]:
     target = ls.Target(order=order)
     if chance.random() < 0.3:
         target = ls.Target(order=order, level=chance.randrange(index.header.levels + 1))
-    made = plan(index, target)
-    pieces = chance.choice([37, 1000, 2**62])
-    decoder, views = follow(container, made, pieces)
+    return _views(container, plan(index, target), chance.choice([37, 1000, 2**62]), None)
+
+
+def followed_window(chance: Random, container: bytes) -> dict[str, Any] | None:
+    """As `followed`, of a window, with the bounds of its errors; None where `window` is."""
+    shown = window(chance, container)
+    if shown is None:
+        return None
+    orders: list[Order] = ["quality", "quality", "level"]
+    index, target = index_of(container), ls.Target(region=shown["region"], order=chance.choice(orders))
+    windows = read_window_errors(index, lambda offset, length: container[offset : offset + length])
+    made = plan(index, target, windows=windows)
+    views = _views(container, made, chance.choice([37, 1000, 2**62]), selection_of(target))
+    return {"region": shown["region"], **views}
+
+
+def _views(container: bytes, made: Plan, pieces: int, selection: Selection | None) -> dict[str, Any]:
+    decoder, views = follow(container, made, pieces, selection)
     return {
         "slices": [[place.offset, place.length] for place in (*made.before, *made.ranges, *made.after)],
         "pieces": min(pieces, 2**31),

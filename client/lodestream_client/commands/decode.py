@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
             raise named(error, options.container) from None
     view = job.view or job.decoder.view()
     assert job.decoder.header is not None, "there is a view, so there is a header"
-    note_unmet(target, job.ended, view.rms, view.max_error, job.decoder.header.extent)
+    note_unmet(target, job.ended, view, job.decoder.header.extent)
     outcome = Outcome(
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
@@ -110,6 +110,7 @@ def run(args: argparse.Namespace) -> int:
         view.level,
         view.rms,
         view.max_error,
+        view.bound,
         time.monotonic() - started,
         job.ended,
     )
@@ -184,8 +185,10 @@ class _Job:
 
     def _decode_planned(self, index: Index) -> None:
         from lodestream.planning.planner import plan
+        from lodestream.planning.window_errors import read_window_errors
 
-        chosen = plan(index, self._target)
+        windows = None if self._target.region is None else read_window_errors(index, self._read)
+        chosen = plan(index, self._target, windows=windows)
         self.ended = chosen.ended
         done = 0
         for place in (*chosen.before, *chosen.ranges, *chosen.after):

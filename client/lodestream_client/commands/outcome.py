@@ -15,6 +15,7 @@ from ..terminal.output import human_size, note, print_json, require_folder
 
 if TYPE_CHECKING:
     from lodestream.container import Header
+    from lodestream.decoding.decoder import View
     from lodestream.surface import Surface
 
 __all__ = ["Outcome", "check_grid", "check_out", "note_unmet"]
@@ -56,13 +57,14 @@ def check_grid(out: str, header: Header) -> None:
         raise FormatError(f"{'standard output' if out == '-' else out}: {error}") from None
 
 
-def note_unmet(target: Target, ended: str, rms: float, max_error: float, extent: float) -> None:
-    """Report a limit that could not be reached although the whole surface arrived."""
+def note_unmet(target: Target, ended: str, view: View, extent: float) -> None:
+    """Report a limit that could not be reached although everything arrived."""
     if ended != "complete":
         return
-    for limit, found, name in ((target.until_rms, rms, "RMS"), (target.until_max, max_error, "maximum")):
+    what = "window is only known to have at most" if view.bound else "surface has"
+    for limit, found, name in ((target.until_rms, view.rms, "RMS"), (target.until_max, view.max_error, "maximum")):
         if limit is not None and found > limit.absolute(extent):
-            note(f"the requested {name} error cannot be reached: the complete surface has {found:.6g}")
+            note(f"the requested {name} error cannot be reached: the complete {what} {found:.6g}")
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class Outcome:
     level: int
     rms: float
     max_error: float
+    bound: bool
     seconds: float
     ended: str
 
@@ -97,12 +100,15 @@ class Outcome:
                     "level": self.level,
                     "rms": None if math.isnan(self.rms) else self.rms,
                     "max": None if math.isnan(self.max_error) else self.max_error,
+                    "bound": self.bound,
                     "seconds": round(self.seconds, 6),
                     "ended": self.ended,
                 }
             )
             return
+        within = "at most " if self.bound else ""
         note(
-            f"{self.ended}: level {self.level}, RMS error {self.rms:.6g}, maximum {self.max_error:.6g}, "
+            f"{self.ended}: level {self.level}, "
+            f"RMS error {within}{self.rms:.6g}, maximum {within}{self.max_error:.6g}, "
             f"{human_size(self.bytes)} of the surface ({human_size(self.wire_bytes)} read) in {self.seconds:.1f} s"
         )

@@ -253,9 +253,9 @@ def _outcome(options: PullOptions, kept: Kept, stream: Stream, started: float, *
     header, ended = decoder.header, stream.ended
     assert header is not None, "there is a view, so there is a header"
     assert ended is not None, "the iteration has ended"
-    note_unmet(target, ended, view.rms, view.max_error, header.extent)
+    note_unmet(target, ended, view, header.extent)
     surface = view.surface(target.level, metadata)
-    return Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, seconds, ended)
+    return Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, view.bound, seconds, ended)
 
 
 def _words(error: BaseException) -> str:

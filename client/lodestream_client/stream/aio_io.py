@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from ..requests import calls
 from ..requests.answers import Head
-from .effects import WAITS, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .effects import WAITS, Ahead, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ __all__ = ["AsyncIO"]
 
 
 class AsyncIO:
-    """One WebSocket or one answer over HTTP at a time.
+    """One WebSocket or one answer over HTTP at a time, and the answer after that.
 
     Parameters
     ----------
@@ -42,6 +42,7 @@ class AsyncIO:
         self._client: httpx.AsyncClient | None = None
         self._response: httpx.Response | None = None
         self._body: AsyncIterator[bytes] | None = None
+        self._ahead: tuple[Get, asyncio.Task[httpx.Response]] | None = None
 
     async def perform(self, effect: Effect) -> Any:
         """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
@@ -54,6 +55,8 @@ class AsyncIO:
                 return await self.send()
             case Get():
                 return await self._get(effect)
+            case Ahead(get):
+                return await self._ask_ahead(get)
             case Read():
                 assert self._body is not None, "a body is read of an open answer"
                 return await anext(self._body, b"")
@@ -73,6 +76,8 @@ class AsyncIO:
         match effect:
             case Send():
                 return await self.send()
+            case Ahead(get):
+                return await self._ask_ahead(get)
             case Hear():
                 message = await self._hear(0.0)
                 return WAITS if message is None else message
@@ -118,18 +123,52 @@ class AsyncIO:
                     await self._socket.send(message)
 
     async def _get(self, get: Get) -> Head:
-        import httpx
 
-        await self.hang_up(HangUp())
-        if self._client is None:
-            self._client = httpx.AsyncClient(**calls.client_options(self._session.url, asynchronous=True))
-        request = self._client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
-        self._response = await self._client.send(request, stream=True)
+        ahead = self._ahead
+        if ahead is None or not ahead[0].asks_as(get):
+            await self.hang_up(HangUp())
+            self._response = await self._ask(get)
+        else:
+            await self._leave(HangUp())
+            try:
+                self._response = await asyncio.shield(ahead[1])  # a cancelled iteration may be continued
+            except Exception:
+                self._ahead = None
+                raise
+            self._ahead = None
         self._body = self._response.aiter_raw()
         return Head.of(self._response)
 
+    async def _ask(self, get: Get) -> httpx.Response:
+        import httpx
+
+        if self._client is None:
+            self._client = httpx.AsyncClient(**calls.client_options(self._session.url, asynchronous=True))
+        request = self._client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
+        return await self._client.send(request, stream=True)
+
+    async def _ask_ahead(self, get: Get) -> None:
+        if self._ahead is None or not self._ahead[0].asks_as(get):
+            await self._forget()
+            self._ahead = get, asyncio.create_task(self._ask(get))
+
+    async def _forget(self) -> None:
+        """Give up the answer that was asked for ahead."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is None:
+            return
+        ahead[1].cancel()
+        (found,) = await asyncio.gather(ahead[1], return_exceptions=True)
+        if not isinstance(found, BaseException):
+            await found.aclose()
+
     async def hang_up(self, how: HangUp) -> None:
         """Carry out `HangUp`."""
+        await self._forget()
+        await self._leave(how)
+
+    async def _leave(self, how: HangUp) -> None:
+        """Close what is open, but for what was asked for ahead."""
         if self._socket is not None and how.abort:
             self._socket.transport.abort()
         elif self._socket is not None and how.wait:

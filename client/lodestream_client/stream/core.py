@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError, TruncatedStreamError
 
 from . import over_http, over_websocket
-from .effects import Dial, Effect, Flow, Get, HangUp, Hear, Read, Send, Wait
+from .effects import Ahead, Dial, Effect, Flow, Get, HangUp, Hear, Read, Send, Wait
 from .session import Session
 
 if TYPE_CHECKING:
@@ -68,11 +68,11 @@ class Core:
         return self._effect
 
     def next_view(self) -> View | None:
-        """The next view that nobody has taken; None if there is none now, or messages are to be sent first.
+        """The next view that nobody has taken; None if there is none now, or something is to be sent first.
 
-        So the server has its credit, and the link is busy, while somebody looks at the view.
+        So the server has its credit, or the next request, and the link is busy, while somebody looks at the view.
         """
-        view = None if isinstance(self._effect, Send) else self.session.next_view()
+        view = None if isinstance(self._effect, Send | Ahead) else self.session.next_view()
         if view is not None:
             self.shown()
         return view

@@ -10,7 +10,21 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
-__all__ = ["WAITS", "Dial", "DialError", "Dialled", "Effect", "Flow", "Get", "HangUp", "Hear", "Read", "Send", "Wait"]
+__all__ = [
+    "WAITS",
+    "Ahead",
+    "Dial",
+    "DialError",
+    "Dialled",
+    "Effect",
+    "Flow",
+    "Get",
+    "HangUp",
+    "Hear",
+    "Read",
+    "Send",
+    "Wait",
+]
 
 T = TypeVar("T")
 
@@ -96,6 +110,20 @@ class Get:
     headers: Mapping[str, str] = field(repr=False)
     seconds: float
 
+    def asks_as(self, other: Get) -> bool:
+        """Whether both ask for the same, however long they may take."""
+        return (self.url, self.headers) == (other.url, other.headers)
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """Send the GET request that comes next, beside the answer that is open, without waiting for its answer.
+
+    The next `Get`, of the same URL and headers, is given that answer. Result: None; if it fails, the `Get` does.
+    """
+
+    get: Get
+
 
 @dataclass(frozen=True)
 class Read:
@@ -125,7 +153,7 @@ class HangUp:
     abort: bool = False
 
 
-Effect: TypeAlias = Dial | Hear | Send | Get | Read | Wait | HangUp
+Effect: TypeAlias = Dial | Hear | Send | Get | Ahead | Read | Wait | HangUp
 
 #: In place of an effect's result: it cannot be carried out without waiting, and was not.
 WAITS = object()

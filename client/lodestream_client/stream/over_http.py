@@ -12,7 +12,7 @@ from lodestream.transfer.range_download import RangeDownload
 from ..errors import SilenceError
 from ..requests import addresses, problems
 from ..requests.answers import LONGEST_PROBLEM, Head, Incoming
-from .effects import Flow, Get, HangUp, Read
+from .effects import Ahead, Flow, Get, HangUp, Read
 
 if TYPE_CHECKING:
     from lodestream.transfer.range_download import RangeRequest
@@ -27,7 +27,7 @@ _OF_THE_FILE = {200, 206, 416}
 
 
 def receive(session: Session) -> Flow[None]:
-    """Request what is missing, one range after the other.
+    """Request what is missing, one range after the other, and the next one while the one before it comes.
 
     Raises
     ------
@@ -39,21 +39,28 @@ def receive(session: Session) -> Flow[None]:
     if session.ranges is None:
         session.ranges = RangeDownload(session.reception)
     download, url = session.ranges, addresses.container_url(session.url)
+    download.leave()
+    turns = session.turns
     while True:
         # First: what was asked to stop has stopped, even if all that there is has come.
         left = _tick(session, download)
         if session.ended is not None:
             break
+        if session.turns != turns:
+            download.leave()  # what was asked for ahead may not be what comes first now
         turns = session.turns
         request = _next_request(session, download)
         if request is None:
             break
         try:
-            head = yield from _answered(session, Get(url, request.headers, session.patience(left)))
+            get = _get(session, url, request, left)
+            if session.shows:
+                yield Ahead(get)  # before somebody looks at what is there
+            head = yield from _answered(session, get, beside=download.was_ahead)
             url = head.url
             download.answer(head.status, head.headers, session.clock())
             session.transports.met = True
-            yield from _body(session, download, turns)
+            yield from _body(session, download, turns, url)
         except SilenceError:
             _tick(session, download)
             if session.ended is None:
@@ -68,16 +75,21 @@ def receive(session: Session) -> Flow[None]:
     yield HangUp()
 
 
-def _answered(session: Session, request: Get) -> Flow[Head]:
+def _get(session: Session, url: str, request: RangeRequest, left: float | None) -> Get:
+    return Get(url, {**request.headers, **session.authorization(url)}, session.patience(left))
+
+
+def _answered(session: Session, request: Get, *, beside: bool) -> Flow[Head]:
     """The head of an answer that is about the file; any other is raised."""
     import httpx
 
-    headers = {**request.headers, **session.authorization(request.url)}
+    session.transports.beside = session.transports.beside and not beside
     try:
-        head: Head = yield Get(request.url, headers, request.seconds)
+        head: Head = yield request
         session.landed(request.url, head.url)
         session.connections += head.status in _OF_THE_FILE
         if head.status in _OF_THE_FILE:
+            session.transports.beside = session.transports.beside or beside
             return head
         incoming = Incoming(head, LONGEST_PROBLEM, request.url, session.url, None)
         while (chunk := (yield Read())) and incoming.take(chunk):
@@ -89,9 +101,14 @@ def _answered(session: Session, request: Get) -> Flow[Head]:
     raise failure
 
 
-def _body(session: Session, download: RangeDownload, turns: int) -> Flow[None]:
+def _body(session: Session, download: RangeDownload, turns: int, url: str) -> Flow[None]:
     """Read an answer to its end, or until the stream ends or something else comes first."""
-    while chunk := (yield from _chunk(session)):
+    while True:
+        if session.transports.beside and (request := download.ahead()) is not None:
+            yield Ahead(_get(session, url, request, None))
+        chunk = yield from _chunk(session)
+        if not chunk:
+            return
         yield from session.pace(len(chunk))
         session.take(partial(download.receive, chunk))
         _tick(session, download)

@@ -44,6 +44,9 @@ class Transports:
     met : bool
         Whether the server has answered as expected. Before that there are only three attempts, because a wrong URL
         should be reported soon.
+    beside : bool
+        Whether a request over HTTP may be made while the answer to another comes. A server that has refused one may
+        take only one at a time.
     """
 
     def __init__(self, url: str, transport: Transport, deadline: float) -> None:
@@ -59,6 +62,7 @@ class Transports:
         self._attempts = 0
         self._since = 0.0
         self.met = False
+        self.beside = True
 
     def start(self, now: float) -> None:
         """Begin the first attempt."""

@@ -136,6 +136,11 @@ class Session:
             return "stopped"
         return self.reception.ended
 
+    @property
+    def shows(self) -> bool:
+        """Whether there is a view that nobody has taken."""
+        return bool(self._views)
+
     def next_view(self) -> View | None:
         """The next view that nobody has taken; None if there is none now."""
         with self.lock:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, assert_never
 
 from ..requests import calls
 from ..requests.answers import Head
-from .effects import WAITS, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
+from .effects import WAITS, Ahead, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ __all__ = ["SyncIO"]
 
 
 class SyncIO:
-    """One WebSocket or one answer over HTTP at a time.
+    """One WebSocket or one answer over HTTP at a time, and the answer after that, which a thread waits for.
 
     Parameters
     ----------
@@ -44,6 +45,7 @@ class SyncIO:
         self._client: httpx.Client | None = None
         self._answer: httpx.Response | None = None
         self._body: Iterator[bytes] = iter(())
+        self._ahead: tuple[Get, Future[httpx.Response]] | None = None
 
     def perform(self, effect: Effect) -> Any:
         """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
@@ -56,6 +58,8 @@ class SyncIO:
                 return self.send()
             case Get():
                 return self._get(effect)
+            case Ahead(get):
+                return self._ask_ahead(get)
             case Read():
                 return next(self._body, b"")
             case Wait(until):
@@ -71,6 +75,8 @@ class SyncIO:
         match effect:
             case Send():
                 return self.send()
+            case Ahead(get):
+                return self._ask_ahead(get)
             case Hear():
                 message = self._hear(0.0)
                 return WAITS if message is None else message
@@ -118,19 +124,63 @@ class SyncIO:
                         connection.send(message)
 
     def _get(self, get: Get) -> Head:
-        import httpx
-
-        self.hang_up(HangUp())
-        if self._client is None:
-            self._client = httpx.Client(**calls.client_options(self._session.url))
-        answer = self._opened.enter_context(
-            self._client.stream("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
-        )
+        ahead = self._ahead
+        if ahead is None or not ahead[0].asks_as(get):
+            self.hang_up(HangUp())
+            answer = self._ask(get)
+        else:
+            self._leave(HangUp())
+            try:
+                answer = ahead[1].result()  # which ends, since each step of it has its time
+            except Exception:
+                self._ahead = None
+                raise
+            self._ahead = None
+        self._opened.callback(answer.close)
         self._answer, self._body = answer, answer.iter_raw()
         return Head.of(answer)
 
+    def _ask(self, get: Get) -> httpx.Response:
+        client = self._http()
+        request = client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
+        return client.send(request, stream=True)
+
+    def _http(self) -> httpx.Client:
+        import httpx
+
+        if self._client is None:
+            self._client = httpx.Client(**calls.client_options(self._session.url))
+        return self._client
+
+    def _ask_ahead(self, get: Get) -> None:
+        if self._ahead is not None and self._ahead[0].asks_as(get):
+            return
+        self._forget()
+        self._http()  # made by one thread only
+        coming: Future[httpx.Response] = Future()
+
+        def ask() -> None:
+            try:
+                coming.set_result(self._ask(get))
+            except BaseException as error:  # whoever wants the answer is told
+                coming.set_exception(error)
+
+        threading.Thread(target=ask, name="lodestream-ahead", daemon=True).start()
+        self._ahead = get, coming
+
+    def _forget(self) -> None:
+        """Give up the answer that was asked for ahead: it is closed when it comes."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            ahead[1].add_done_callback(_close)
+
     def hang_up(self, how: HangUp) -> None:
         """Carry out `HangUp`."""
+        self._forget()
+        self._leave(how)
+
+    def _leave(self, how: HangUp) -> None:
+        """Close what is open, but for what was asked for ahead."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -149,3 +199,8 @@ class SyncIO:
         self.hang_up(how)
         if self._client is not None:
             self._client.close()
+
+
+def _close(coming: Future[httpx.Response]) -> None:
+    if coming.exception() is None:
+        coming.result().close()

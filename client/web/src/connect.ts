@@ -44,6 +44,7 @@ export class SurfaceView implements ViewInfo {
   readonly bytes: number;
   readonly rms: number;
   readonly maxError: number;
+  readonly bound: boolean;
   readonly complete: boolean;
 
   constructor(
@@ -56,6 +57,7 @@ export class SurfaceView implements ViewInfo {
     this.bytes = info.bytes;
     this.rms = info.rms;
     this.maxError = info.maxError;
+    this.bound = info.bound;
     this.complete = info.complete;
   }
 

@@ -169,9 +169,11 @@ export interface ViewInfo {
   readonly level: number;
   /** Bytes received of header, layers and residual. */
   readonly bytes: number;
-  /** Measured errors at full resolution; NaN where they are not known. */
+  /** Errors at full resolution; NaN where they are not known. */
   readonly rms: number;
   readonly maxError: number;
+  /** Whether they are bounds, as in a window that is not exact; else they were measured. */
+  readonly bound: boolean;
   /** Whether this is the last state. */
   readonly complete: boolean;
 }

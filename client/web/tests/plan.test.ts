@@ -4,11 +4,14 @@ import { RangeSet } from "../src/planning/byte-ranges";
 import { endOf, type Plan } from "../src/planning/plan";
 import { plan } from "../src/planning/planner";
 import { makeTarget, type TargetOptions } from "../src/planning/target";
+import { readWindowErrors } from "../src/planning/window-errors";
 import { run } from "./python";
 
 interface Case {
   target: TargetOptions;
   held: [number, number][];
+  /** Whether the container's bounds of windows are used, those of the whole surface only, or none. */
+  windows: "own" | "whole" | "none";
   plan?: Plan;
   error?: string;
 }
@@ -27,15 +30,19 @@ describe(`plans of random containers, seed ${SEED}`, () => {
 
   it.each(given)("are those of Python", async ({ container, cases }) => {
     const data = new Uint8Array(Buffer.from(container, "base64"));
-    const index = await readIndex(async (offset, length) => data.subarray(offset, offset + length), data.length);
+    const read = async (offset: number, length: number) => data.subarray(offset, offset + length);
+    const index = await readIndex(read, data.length);
+    const own = await readWindowErrors(index, read);
     let made = 0;
-    for (const { target, held, plan: expected, error } of cases) {
-      const said = JSON.stringify({ target, held });
+    for (const { target, held, windows, plan: expected, error } of cases) {
+      const said = JSON.stringify({ target, held, windows });
+      const options = { windows: windows === "own" ? own : null, bounded: windows !== "none" };
       if (expected === undefined) {
-        expect(() => plan(index, makeTarget(target), new RangeSet(held)), said).toThrow(error?.replaceAll("'", ""));
+        const make = () => plan(index, makeTarget(target), new RangeSet(held), options);
+        expect(make, said).toThrow(error?.replaceAll("'", ""));
         continue;
       }
-      const found = plan(index, makeTarget(target), new RangeSet(held));
+      const found = plan(index, makeTarget(target), new RangeSet(held), options);
       expect(told(found), said).toEqual(expected);
       expect(endOf(found).bytes, said).toBe(endOf(expected).bytes);
       made += 1;

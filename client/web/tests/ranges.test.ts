@@ -13,6 +13,7 @@ import { run } from "./python";
 interface Recorded {
   most: number;
   heard: number;
+  begun: boolean;
   steps: [granted: number, arrived: number, now: number][];
   sizes: [size: number, due: number][];
 }
@@ -126,10 +127,11 @@ describe("the window", () => {
     const lines = run("tests.core.protocol.windows", 300).trim().split("\n");
     expect(lines).toHaveLength(300);
     for (const line of lines) {
-      const { most, heard, steps, sizes } = JSON.parse(line) as Recorded;
+      const { most, heard, begun, steps, sizes } = JSON.parse(line) as Recorded;
       const window = new Window();
       window.allow(most);
       window.heard(heard);
+      if (begun) window.began(0);
       const found = steps.map(([granted, arrived, now]) => {
         if (granted > 0) window.grant(granted, now);
         window.arrive(arrived, now);

@@ -16,13 +16,16 @@ interface Case {
   container: string;
   expected: Expected;
   window: { region: Region; layer: number; sha256: string[] } | null;
-  followed: {
-    slices: [number, number][];
-    pieces: number;
-    views: (number | null)[][];
-    complete: boolean;
-    sha256: string[][];
-  };
+  followed: Followed;
+  followed_window: (Followed & { region: Region }) | null;
+}
+
+interface Followed {
+  slices: [number, number][];
+  pieces: number;
+  views: (number | null)[][];
+  complete: boolean;
+  sha256: string[][];
 }
 
 let kernels: WebAssembly.Module;
@@ -56,7 +59,7 @@ describe("random surfaces", () => {
   });
 });
 
-function check({ container, expected, window, followed }: Case, name: string): void {
+function check({ container, expected, window, followed, followed_window }: Case, name: string): void {
   const data = new Uint8Array(Buffer.from(container, "base64"));
   expect(expectations(kernels, data), name).toEqual(expected);
   if (window) {
@@ -64,16 +67,22 @@ function check({ container, expected, window, followed }: Case, name: string): v
     decoder.feed(data);
     expect(digests(decoder.layers[window.layer]!.window(window.region)), `${name}, window`).toEqual(window.sha256);
   }
-  const decoder = new Decoder(kernels);
+  checkViews(data, followed, new Decoder(kernels), `${name}, views of a plan`);
+  if (followed_window === null) return;
+  const { region } = followed_window;
+  checkViews(data, followed_window, new Decoder(kernels, { region }), `${name}, views of the window ${region}`);
+}
+
+function checkViews(data: Uint8Array, followed: Followed, decoder: Decoder, name: string): void {
   const views: View[] = [];
   for (const [offset, length] of followed.slices) {
     for (let at = offset; at < offset + length; at += followed.pieces) {
       views.push(...decoder.feedAt(at, data.subarray(at, Math.min(at + followed.pieces, offset + length))));
     }
   }
-  expect(views.map(figures), `${name}, views of a plan`).toEqual(followed.views);
+  expect(views.map(figures), name).toEqual(followed.views);
   expect(decoder.complete).toBe(followed.complete);
   const every = Math.max(1, Math.floor(views.length / 4));
   const shown = views.filter((_, i) => i % every === 0).map((view) => digests(view.surface()));
-  expect(shown, `${name}, surfaces of a plan`).toEqual(followed.sha256);
+  expect(shown, name).toEqual(followed.sha256);
 }

@@ -19,7 +19,7 @@ __all__ = ["Slices", "State"]
 
 
 class State(NamedTuple):
-    """What a view is made of.
+    """What a view is made of; its errors are those that the whole surface has in this state.
 
     ``all_planes`` says that nothing but residual is missing; ``whole_level`` is the level to which, counted from the
     coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
@@ -47,16 +47,12 @@ class Slices:
         Those that are wanted, in file order.
     chunks : mapping of int to Chunk
         Those that are wanted, by their number.
-    partial : bool
-        They are not the whole surface: the errors of states on the way are not known (NaN).
     whole : bool
         They are all of the container.
     """
 
-    def __init__(
-        self, index: Index, segments: Sequence[Segment], chunks: Mapping[int, Chunk], partial: bool, whole: bool
-    ) -> None:
-        self._index, self._partial, self._whole = index, partial, whole
+    def __init__(self, index: Index, segments: Sequence[Segment], chunks: Mapping[int, Chunk], whole: bool) -> None:
+        self._index, self._whole = index, whole
         numbered = {chunk.range.offset: number for number, chunk in chunks.items()}
         self._numbers: Mapping[int, int] = numbered
         items: list[Segment | Chunk] = [*segments, *chunks.values()]
@@ -192,13 +188,12 @@ class Slices:
                 return self._end(layer)
             size = record.end if self._in_file else self._bytes
             finest = self._layer_level[layer]
-            figures = self._figures(record.rms, record.max_error)
-            return State(layer, finest, size, *figures, False, last and finest == self._index.header.levels)
+            all_planes = last and finest == self._index.header.levels
+            return State(layer, finest, size, record.rms, record.max_error, False, all_planes)
         level = self._by_level.whole(self._received)
         if level is not None and level < self._index.header.levels and not self._in_file:
             known = self._index.levels[level]
-            figures = self._figures(known.rms, known.max_error)
-            return State(level, level, self._bytes, *figures, False, False, level)
+            return State(level, level, self._bytes, known.rms, known.max_error, False, False, level)
         # Out of order, what is whole stands beside parts of what comes later.
         if not risen:
             return None
@@ -216,9 +211,6 @@ class Slices:
         """How far layers are whole everywhere and in the focus; and levels, where these are what comes in turn."""
         kinds = 1 if self._in_file else 2
         return [groups.reached for pair in ((self._by_layer, self._by_level), self._near) for groups in pair[:kinds]]
-
-    def _figures(self, rms: float, max_error: float) -> tuple[float, float]:
-        return (math.nan, math.nan) if self._partial else (rms, max_error)
 
     def _end(self, number: int) -> State:
         last = self._index.levels[-1]

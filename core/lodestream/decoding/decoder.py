@@ -24,6 +24,7 @@ from ..target import Region
 from .batches import Coded
 from .reconstruction import Progress, Reconstruction
 from .view import View
+from .window_state import WindowState
 
 __all__ = ["Decoder", "View", "decode"]
 
@@ -43,7 +44,7 @@ class Decoder:
     ----------
     selection : Selection, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
-        not known (NaN) before it is complete.
+        bounds before it is complete, see `View.bound`.
     max_vertices : int or None
         Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
         as fits this process's memory.
@@ -72,6 +73,7 @@ class Decoder:
         self._frames = FrameReader()
         self._pages: Frame | None = None  # of the index, before its root
         self._slices: Slices | None = None
+        self._window: WindowState | None = None
         self._focus: Region | None = None  # the region that comes first
         self._near: NDArray[np.bool_] | None = None  # its tiles, once the index is known
         self._turned = False
@@ -106,13 +108,13 @@ class Decoder:
         before = len(self.layers)
         if self._slices is not None:
             self.capacity.take(len(data))
-            self._take_slice(offset, bytes(data))
+            self._take_part(offset, bytes(data))
         elif offset == self._frames.position + self._frames.pending:
             self.feed(data)
             if self.header is not None and (self.header.holes or not self.header.masked):
                 early, self._early = self._early, []
                 for place, more in early:
-                    self._take_loose(place, more)
+                    self._take_part(place, more)
         else:
             self.capacity.take(len(data))
             if self.header is None or (self.header.masked and not self.header.holes):
@@ -247,7 +249,8 @@ class Decoder:
             self._begin(self.header)
 
     def _begin(self, header: Header) -> None:
-        self._wanted = self._selection.tiles(header)
+        region = self._selection.region
+        self._window = None if region is None else WindowState(header, region)
         self._progress = Progress(header)
         self._reconstruction = _reconstruction(header)
         self._level = 0
@@ -295,7 +298,9 @@ class Decoder:
 
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
-        length, state = self._reconstruction.length, self._progress.snapshot(made.all_planes)
+        window = self._window
+        all_planes = made.all_planes or (window is not None and window.is_last_layer(made))
+        length, state = self._reconstruction.length, self._progress.snapshot(all_planes)
         self.capacity.take(state.nbytes)
         if self.header is not None and made.whole_level >= 0:
             # The index says that there is nothing more of these levels.
@@ -303,16 +308,16 @@ class Decoder:
             levels[levels == UNANNOUNCED] = 0
         if made.whole_near and self._near is not None:
             state[self._near[:, None] & (state == UNANNOUNCED)] = 0
-        if self.header is not None and self._selection.region is not None:
-            # What lies outside has no part in the window.
-            state[~self._wanted] = 0
+        figures = made.rms, made.max_error, False
+        if window is not None:
+            window.put_outside(made, state)
+            figures = window.figures(made)
         self.layers.append(
             View(
                 made.number,
                 made.level,
                 made.bytes,
-                made.rms,
-                made.max_error,
+                *figures,
                 made.complete,
                 self._reconstruction,
                 length,
@@ -323,6 +328,13 @@ class Decoder:
                 self._selection,
             )
         )
+
+    def _take_part(self, offset: int, data: Bytes) -> None:
+        """Bytes of a plan, once the header is known."""
+        if self._slices is None:
+            self._take_loose(offset, data)
+        elif self._window is None or not self._window.take(offset, data):
+            self._take_slice(offset, data)
 
     def _take_loose(self, offset: int, data: Bytes) -> None:
         """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
@@ -347,8 +359,9 @@ class Decoder:
             self.capacity.take(INDEX_GROWTH * len(run))
             self.index = index_from(bytes(run), place, self.header)
             chosen = select(self.index, self._selection)
-            partial = self._selection.region is not None
-            self._slices = Slices(self.index, chosen.segments, chosen.chunks, partial, chosen.whole)
+            if self._window is not None:
+                self._window.follow(self.index)
+            self._slices = Slices(self.index, chosen.segments, chosen.chunks, chosen.whole)
             if self.layers or self._frames.pending:
                 # The file was read in its own order so far, and is not any more.
                 self._slices.continue_file(self._frames.position)

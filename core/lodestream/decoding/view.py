@@ -37,7 +37,10 @@ class View:
     bytes : int
         Bytes received of header, layers and residual.
     rms, max_error : float
-        Measured errors at full resolution, in the surface's unit.
+        Errors at full resolution, in the surface's unit; NaN where they are not known.
+    bound : bool
+        Whether they are bounds, which the errors do not exceed. They are where the view is a window and not exact: a
+        container tells errors of the whole surface, and bounds of those of its parts. Else they were measured.
     complete : bool
         Whether this is the last state.
     """
@@ -47,6 +50,7 @@ class View:
     bytes: int
     rms: float
     max_error: float
+    bound: bool
     complete: bool
     _reconstruction: Reconstruction = field(repr=False, compare=False)
     _length: int = field(repr=False, compare=False)

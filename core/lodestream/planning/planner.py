@@ -6,16 +6,18 @@ Only slices of the file are ever sent. So WebSocket streams, HTTP Range, resumin
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby
 
 from ..container.model import ByteRange, Index
 from ..errors import OptionError
-from ..target import Target
+from ..target import Region, Target
 from .byte_ranges import RangeSet
 from .plan import Mark, Plan, Reason
 from .region_first import region_first
 from .selection import select, selection_of
+from .window_errors import WindowErrors, WindowFigures, window_section
 
 __all__ = ["Mark", "Plan", "Reason", "plan"]
 
@@ -24,23 +26,40 @@ def plan(
     index: Index,
     target: Target = Target(),  # noqa: B008 - an immutable value
     cached: RangeSet | None = None,
+    *,
+    windows: WindowErrors | None = None,
+    bounded: bool = True,
 ) -> Plan:
     """The slices that a receiver with this target gets, if it has cached these bytes of the container.
+
+    Of a window, errors before its end are bounds, see `window_errors.WindowFigures`; limits are met where these are.
+
+    Parameters
+    ----------
+    index : Index
+    target : Target
+    cached : RangeSet or None
+    windows : WindowErrors or None
+        The container's own bounds of the errors of windows. Their section then comes behind the index, if the target
+        is a window.
+    bounded : bool
+        Whether errors of windows are told. False: they are NaN before the end, as receivers of
+        earlier releases expect.
 
     Raises
     ------
     OptionError
         If there is no such level or region, or not even the first layer fits into the allowed bytes.
     """
-    chosen = _whole(index, target)
+    chosen = _whole(index, target, windows, bounded)
     if target.first is not None:
         chosen = region_first(index, chosen, target.first)
     return _less(chosen, cached) if cached else chosen
 
 
-def _whole(index: Index, target: Target) -> Plan:
+def _whole(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
     if target.region is not None or target.attributes is not None:
-        return _selected(index, target)
+        return _selected(index, target, windows, bounded)
     if target.level is not None:
         finest = index.header.levels
         if target.level > finest:
@@ -131,10 +150,10 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
     return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 
 
-def _selected(index: Index, target: Target) -> Plan:
+def _selected(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
     """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
     chosen = select(index, selection_of(target))
-    tiles, partial = index.header.layout.tiles, target.region is not None
+    tiles, within = index.header.layout.tiles, _figures(index, target.region, windows, bounded)
     finest = index.header.levels if target.level is None else target.level
     if finest > index.header.levels:
         raise OptionError(f"expected a level of 0 to {index.header.levels}, got {finest}")
@@ -154,31 +173,43 @@ def _selected(index: Index, target: Target) -> Plan:
         if target.order == "level":
             if after is None or tiles[after.tile].level > own:
                 state = index.levels[own]
-                marks.append(_mark(size, own, own, state.rms, state.max_error, partial))
+                marks.append(Mark(size, own, own, size, *within(state.rms, state.max_error)))
         elif after is None or after.layer > segment.layer:
             # Layers of which nothing is wanted are there as well.
             record = index.layers[-1 if after is None else after.layer - 1]
             if target.level is None or level <= target.level:
-                marks.append(_mark(size, record.number, level, record.rms, record.max_error, partial))
+                figures = within(record.rms, record.max_error, record.number)
+                marks.append(Mark(size, record.number, level, size, *figures))
     if finest < index.header.levels:
         state = index.levels[finest]
-        last, ended = _mark(size, finest, finest, state.rms, state.max_error, partial), "level"
+        last, ended = Mark(size, finest, finest, size, state.rms, state.max_error), "level"
     else:
         for chunk in chosen.chunks.values():
             _append(ranges, chunk.range)
             size += chunk.range.length
         state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
-        last, ended = Mark(size, number, finest, size, state.rms, state.max_error), "complete"
+        figures = state.rms, state.max_error
+        if bounded or target.region is None:
+            figures = within(*figures, None if chosen.chunks else number)
+        last, ended = Mark(size, number, finest, size, *figures), "complete"
     # A state of the same bytes as the last is the last.
     marks = [mark for mark in marks if mark.sent < size] + [last]
     if target.level is None:
         marks, ended = _until(marks, target, index.header.extent)
-    return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
+    section = window_section(index) if target.region is not None and windows is not None and bounded else None
+    before = (index.index,) if section is None else (index.index, section)
+    return Plan(before, _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 
 
-def _mark(size: int, number: int, level: int, rms: float, max_error: float, partial: bool) -> Mark:
-    unknown = float("nan")  # layers tell errors of the whole surface: of a window on the way they say nothing
-    return Mark(size, number, level, size, *((unknown, unknown) if partial else (rms, max_error)))
+def _figures(
+    index: Index, region: Region | None, windows: WindowErrors | None, bounded: bool
+) -> Callable[..., tuple[float, float]]:
+    """What a receiver knows of the errors of its selection, from those of the whole surface (and the layer)."""
+    if region is None:
+        return lambda rms, max_error, layer=None: (rms, max_error)
+    if not bounded:
+        return lambda rms, max_error, layer=None: (math.nan, math.nan)
+    return WindowFigures(index.header, region, windows).within
 
 
 def _level_end(index: Index, level: int) -> Reason:

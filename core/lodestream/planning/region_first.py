@@ -63,7 +63,8 @@ def region_first(index: Index, chosen: Plan, region: Region) -> Plan:
             behind += place.length - size
         steps.append(_Step(mark, ahead, behind))
     ranges = (*head, *first, *rest)
-    return replace(chosen, before=(index.index,), ranges=ranges, marks=tuple(_marks(steps)), prefix=False)
+    before = (index.index, *(place for place in chosen.before if place != index.index))
+    return replace(chosen, before=before, ranges=ranges, marks=tuple(_marks(steps)), prefix=False)
 
 
 class _Step(NamedTuple):

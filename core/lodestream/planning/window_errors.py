@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..container.fields import FieldReader, FieldWriter
 from ..container.frames import whole_section
-from ..container.model import Header, Index
+from ..container.model import ByteRange, Header, Index
 from ..container.sections import check_of
 from ..errors import CorruptStreamError, OptionError
 from ..grid.support import check_region
@@ -25,12 +25,14 @@ __all__ = [
     "CELL",
     "KIND",
     "WindowErrors",
+    "WindowFigures",
     "is_divided",
     "layer_codes",
     "no_errors",
     "parse_window_errors",
     "read_window_errors",
     "serialize_window_errors",
+    "window_section",
 ]
 
 #: Kind of the section.
@@ -41,7 +43,11 @@ CELL = 8, 8
 # A code is a step of an eighth of an octave: 2**(-k / 8) over 2**16, rounded up.
 _STEPS = 65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734
 _LARGEST = 4.0  # times the extent: code 0
+# A section that is more of the container than this part of it costs a window more than it can save.
+_MOST_SHARE = 8
 _NOTHING = 255
+# Rounding of sums, quotients and roots is far below the steps of the codes; a bound stays one all the same.
+_UPWARDS = 1 + 2.0**-40
 _FRACTIONS = np.array([_LARGEST * _STEPS[k % 8] * 2.0 ** (-16 - k // 8) for k in range(_NOTHING)] + [0.0])
 
 Floats = NDArray[np.float64]
@@ -83,22 +89,91 @@ class WindowErrors:
         check_region(region, self.header.shape)
         if not 0 <= layer < self.codes.shape[1]:
             raise OptionError(f"expected a layer of 0 to {self.codes.shape[1] - 1}, got {layer}")
-        mask = self.header.masks[0]
-        (rows, columns), shape = region, self.header.shape
-        window = tuple(slice(a >> e, (b - 1 >> e) + 1) for (a, b), e in zip(region, self.cell, strict=True))
-        counts = _cell_counts(shape, self.cell, mask)
-        fractions = _FRACTIONS[self.codes[:, layer].reshape(*counts.shape, 2)[window]]
+        mask, (rows, columns) = self.header.masks[0], region
+        counts, fractions = self.cells(region, layer, mask)
         inside = (rows[1] - rows[0]) * (columns[1] - columns[0])
         if mask is not None:
             inside = int(np.count_nonzero(mask[slice(*rows), slice(*columns)]))
         if not inside:
             return 0.0, 0.0
         # A cell that the window only touches counts whole: all that its errors come from may lie inside.
-        squares = float((counts[window] * fractions[..., 0] ** 2).sum())
-        # Rounding of these sums is far below the steps of the codes; a bound stays one all the same.
-        rms = math.sqrt(squares / inside) * (1 + 2.0**-40)
+        squares = float((counts * fractions[..., 0] ** 2).sum())
+        rms = math.sqrt(squares / inside) * _UPWARDS
         worst = float(fractions[..., 1].max())
         return min(rms, worst) * self.header.extent, worst * self.header.extent
+
+    def cells(
+        self, region: Region, layer: int, mask: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.int64], Floats]:
+        """The cells that a window of the only block touches, after a layer.
+
+        Returns
+        -------
+        int64, shape (row of cells, column of cells)
+            Points of each, or those that ``mask`` (bool, shape (row, column)) has.
+        float64, shape (row of cells, column of cells, 2)
+            Bounds of RMS and maximum, over the surface's extent.
+        """
+        window = tuple(slice(a >> e, (b - 1 >> e) + 1) for (a, b), e in zip(region, self.cell, strict=True))
+        counts = _cell_counts(self.header.shape, self.cell, mask)
+        return counts[window], _FRACTIONS[self.codes[:, layer].reshape(*counts.shape, 2)[window]]
+
+
+class WindowFigures:
+    """What the errors of a window do not exceed, wherever those of the whole surface are known.
+
+    A maximum of the whole holds in each part. The squares of all errors are at least those of a part, so the RMS of n
+    of N vertices is at most sqrt(N / n) times that of all. Bounds of the cells of the window, where the container has
+    them, are nearer.
+
+    Masks are not looked at, so that whoever plans need not decode them: all holes may lie in the window. Other
+    programs make the same plans, so every sum is added up in the order of the cells.
+
+    Parameters
+    ----------
+    header : Header
+        Of a surface of one block, with the number of its holes.
+    region : ((int, int), (int, int))
+        Rows and columns, half-open.
+    windows : WindowErrors or None
+        The container's own bounds, if it has any and they have come.
+
+    Raises
+    ------
+    OptionError
+        If the surface has no such region.
+    """
+
+    def __init__(self, header: Header, region: Region, windows: WindowErrors | None = None) -> None:
+        check_region(region, header.shape)
+        self._region, self._windows, self._extent = region, windows, header.extent
+        (rows, columns), holes = region, sum(header.holes)
+        points, inside = header.shape[0] * header.shape[1], (rows[1] - rows[0]) * (columns[1] - columns[0])
+        self.whole = inside == points
+        # Points of a surface that touches itself are not all vertices: how many a window has is not counted.
+        self._least = 0 if header.arrangement is not None else max(inside - holes, 0)
+        self._root = math.sqrt((points - holes) / self._least) * _UPWARDS if self._least else math.inf
+
+    def within(self, rms: float, max_error: float, layer: int | None = None) -> tuple[float, float]:
+        """Bounds of the window's RMS and maximum error from those of the whole surface.
+
+        Parameters
+        ----------
+        rms, max_error : float
+            Of the whole surface; NaN where they are not known, and then the bounds are NaN.
+        layer : int or None
+            The layer whose errors these are, if it is one.
+        """
+        if math.isnan(rms) or self.whole:
+            return rms, max_error
+        rms = rms * self._root if rms else 0.0
+        if layer is not None and self._windows is not None:
+            counts, fractions = self._windows.cells(self._region, layer)
+            max_error = min(max_error, float(fractions[..., 1].max()) * self._extent)
+            if self._least:
+                squares = float(np.add.accumulate((counts * fractions[..., 0] ** 2).ravel())[-1])
+                rms = min(rms, math.sqrt(squares / self._least) * _UPWARDS * self._extent)
+        return min(rms, max_error), max_error
 
 
 def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np.bool_] | None) -> NDArray[np.int64]:
@@ -187,8 +262,14 @@ def parse_window_errors(payload: memoryview, offset: int, header: Header) -> Win
     return WindowErrors(header, cell, rows[:, :size].reshape(cells, header.layer_count, 2))
 
 
+def window_section(index: Index) -> ByteRange | None:
+    """Where a container tells errors of windows; None where it does not, or at a length that is not worth it."""
+    place = next((optional.range for optional in index.optional if optional.kind == KIND), None)
+    return place if place is not None and place.length <= index.size // _MOST_SHARE else None
+
+
 def read_window_errors(index: Index, read: Callable[[int, int], bytes]) -> WindowErrors | None:
-    """The errors of windows of a container; None: it does not tell them.
+    """The errors of windows of a container; None: it does not tell them, see `window_section`.
 
     Parameters
     ----------
@@ -199,9 +280,8 @@ def read_window_errors(index: Index, read: Callable[[int, int], bytes]) -> Windo
     ------
     CorruptStreamError
     """
-    for optional in index.optional:
-        if optional.kind == KIND:
-            place = optional.range
-            frame = whole_section(read(place.offset, place.length), place.offset, KIND)
-            return parse_window_errors(frame.payload, frame.payload_offset, index.header)
-    return None
+    place = window_section(index)
+    if place is None:
+        return None
+    frame = whole_section(read(place.offset, place.length), place.offset, KIND)
+    return parse_window_errors(frame.payload, frame.payload_offset, index.header)

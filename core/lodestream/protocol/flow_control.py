@@ -78,6 +78,11 @@ class FlowWindow:
         if self._fixed is not None:
             self.size = min(self._fixed, most)
 
+    def began(self, now: float) -> None:
+        """The first window was asked for at this time: it is measured from there on, and can grow when it has come."""
+        if not self._rounds:
+            self._rounds.append((self._arrived, now))
+
     def heard(self, seconds: float) -> None:
         """A round trip took at most this long."""
         if seconds > 0 and (self.round_trip is None or seconds < self.round_trip):

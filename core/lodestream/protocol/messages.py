@@ -128,6 +128,8 @@ class Open:
         SHA-256 of the container that these slices belong to.
     token : str or None
         For a client that cannot send a header with the handshake, such as a browser; not allowed in an address.
+    window_errors : bool or None
+        True: of a window, the client knows bounds of errors, and takes the section that has them.
     """
 
     type: ClassVar[str] = "open"
@@ -136,6 +138,7 @@ class Open:
     held: tuple[tuple[int, int], ...] = ()
     container: str | None = None
     token: str | None = field(default=None, repr=False)
+    window_errors: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -182,6 +185,9 @@ class Opened:
         comes first, then slices.
     credit : int or None
         The most credit that the server keeps for this stream; None: `BASE_CREDIT`.
+    window_errors : (offset, length) or None
+        Of a window: the section with bounds of its errors, which comes behind the index, or a length of 0 where the
+        container has none. None: the server tells no errors of windows before their end.
     """
 
     type: ClassVar[str] = "header"
@@ -193,6 +199,7 @@ class Opened:
     metadata: tuple[int, int]
     prefix: bool
     credit: int | None = None
+    window_errors: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,12 @@ def _place(value: Any) -> tuple[int, int]:
     return _integer(value[0]), _positive(value[1])
 
 
+def _section(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _MismatchError("[offset, length]")
+    return _integer(value[0]), _integer(value[1])
+
+
 def _flag(value: Any) -> bool:
     if not isinstance(value, bool):
         raise _MismatchError("true or false")
@@ -161,7 +167,14 @@ def _target(value: Any) -> Target:
 
 
 _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
-    Open: {"target": _target, "credit": _integer, "held": _held, "container": _digest, "token": _text},
+    Open: {
+        "target": _target,
+        "credit": _integer,
+        "held": _held,
+        "container": _digest,
+        "token": _text,
+        "window_errors": _flag,
+    },
     Credit: {"bytes": _positive},
     Stop: {},
     Bye: {},
@@ -174,6 +187,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
         "metadata": _place,
         "prefix": _flag,
         "credit": _credit,
+        "window_errors": _section,
     },
     Segments: {"offset": _integer, "data": _data},
     Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _error, "max": _error},
@@ -184,8 +198,16 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit, and
-#: servers of earlier releases do not say how much they keep of it.
-_OPTIONAL = {(Open, "target"), (Open, "held"), (Open, "container"), (Open, "token"), (Opened, "credit")}
+#: those of earlier releases say nothing of errors of windows, nor servers how much they keep of the credit.
+_OPTIONAL = {
+    (Open, "target"),
+    (Open, "held"),
+    (Open, "container"),
+    (Open, "token"),
+    (Open, "window_errors"),
+    (Opened, "credit"),
+    (Opened, "window_errors"),
+}
 #: What is left out where it is not known.
 _UNKNOWN = {(Layer, "rms"), (Layer, "max")}
 

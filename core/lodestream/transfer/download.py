@@ -61,6 +61,7 @@ class Download:
         self._connection = Connection(Side.CLIENT)
         self._opened: float | None = None
         self._turning = False  # this end has stopped in order to open again
+        self._reopened = False
         # Of a container that is not known by name, nothing can be said to be cached.
         known = self.reception.container is not None
         cached = _largest(self.reception) if known else ()
@@ -127,6 +128,7 @@ class Download:
                 self._turning = False
                 # The server knows what it has sent, and that nothing more of the last grants will come.
                 self.window.restart()
+                self._reopened = True
                 self._outbox.append(self._open())
                 return []
             self._outbox.append(self._connection.send(Bye()))
@@ -241,16 +243,21 @@ class Download:
 
     def _open(self, cached: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
         self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
-        return self._connection.send(Open(self.reception.target, self.window.size, cached, container))
+        target = self.reception.target
+        asks = None if target.region is None else True
+        return self._connection.send(Open(target, self.window.size, cached, container, window_errors=asks))
 
     def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:
         self.answer = event
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
+            if not self._reopened:
+                self.window.began(self._opened)
         self.window.allow(self._connection.most)
         self._grant(now)
         self.reception.identify(event.container, event.size)
-        return [*self.reception.expect(event.planned, event.index, event.metadata, event.prefix)]
+        places = event.index, event.metadata, event.window_errors
+        return [*self.reception.expect(event.planned, *places, prefix=event.prefix)]
 
     def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
         stopped = self._connection.state is State.STOPPING

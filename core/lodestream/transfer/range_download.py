@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..errors import RemoteError, RemoteProtocolError, TruncatedStreamError
+from ..planning.byte_ranges import RangeSet
 from ..protocol.messages import BASE_CREDIT, MIN_WINDOW
 from .receiver_state import ReceiverState
 
@@ -68,8 +69,9 @@ class RangeDownload:
     """Receiving a surface over HTTP Range: requests out, parts of the file in.
 
     The caller makes the request that `request` returns, passes the status and headers of the answer to `answer` and its
-    body, cut anywhere, to `receive`, then calls `finish`; until `request` returns None. If a connection
-    breaks, it continues with the next `request`.
+    body, cut anywhere, to `receive`, then calls `finish`; until `request` returns None. While an answer comes, `ahead`
+    may tell the request after it, which can be made beside it, so that the link is not idle in between; `request` then
+    returns that. If a connection breaks, the caller calls `leave`, and continues with the next `request`.
 
     Parameters
     ----------
@@ -82,16 +84,20 @@ class RangeDownload:
     ----------
     requests : int
         Number of requests so far.
+    was_ahead : bool
+        Whether the last request was made while another answer came.
     """
 
     def __init__(self, reception: ReceiverState, *, etag: str | None = None) -> None:
         self.reception = reception
         self.requests = 0
+        self.was_ahead = False
         self._etag = etag
         self._validator: str | None = None
         self._needed: tuple[int, int] | None = None
         self._gap = MIN_WINDOW
         self._asked: RangeRequest | None = None
+        self._ahead: RangeRequest | None = None
         self._asked_at: float | None = None
         self._answered_at: float | None = None
         self._position = 0
@@ -124,26 +130,52 @@ class RangeDownload:
             If the container cannot meet the target.
         """
         events: list[DownloadEvent] = []
+        ahead, self._ahead = self._ahead, None
+        self.was_ahead = ahead is not None
+        if ahead is not None:
+            # It was made while another answer came: how long it takes tells nothing of the link.
+            self._asked, self._position = ahead, ahead.offset
+            self._asked_at = self._answered_at = None
+            return ahead, events
         place = None
         if self.reception.plan is None:
-            place = self._first()
+            place = self._first(self.reception.cached)
             if place is None:
                 events += self._read_index()
                 place = self._needed
         if self.reception.plan is not None:
-            place = self._next_slices()
+            place = self._next_slices(self.reception.cached)
             if place is None:
                 events.append(self.reception.end(self.reception.plan.ended))
                 return None, events
         if place is None:
             raise AssertionError("either the index is known or something of it is missing")
+        self._asked, self._position = self._make(place), place[0]
+        self._asked_at, self._answered_at = now, None
+        return self._asked, events
+
+    def ahead(self) -> RangeRequest | None:
+        """A request to make beside the one whose answer is coming, if it is known what is needed after that.
+
+        Only when so little is left of the answer that the link would be idle soon: until then both would share it, and
+        what comes first would come late.
+        """
+        if self._asked is None or self._ahead is not None or self.ended is not None or self.reception.size is None:
+            return None
+        if self.left > self._gap:
+            return None
+        coming = self.reception.cached.copy()
+        coming.add(self._position, self.left)
+        place = self._first(coming) if self.reception.plan is None else self._next_slices(coming)
+        self._ahead = None if place is None else self._make(place)
+        return self._ahead
+
+    def _make(self, place: tuple[int, int]) -> RangeRequest:
         headers = {"Range": f"bytes={place[0]}-{place[0] + place[1] - 1}", "Accept-Encoding": "identity"}
         if self._etag is not None:
             headers["If-Range"] = self._etag
-        self._asked, self._position = RangeRequest(*place, headers), place[0]
-        self._asked_at, self._answered_at = now, None
         self.requests += 1
-        return self._asked, events
+        return RangeRequest(*place, headers)
 
     def answer(self, status: int, headers: Mapping[str, str], now: float | None = None) -> None:
         """Take the status and headers of an answer.
@@ -237,8 +269,8 @@ class RangeDownload:
         return self._asked.offset + self._asked.length - self._position if self._asked is not None else 0
 
     def leave(self) -> None:
-        """Declare that the rest of the current answer is not read, because something else is needed first."""
-        self._asked = None
+        """Declare that nothing more of what was asked for is read: the rest of the answer, and what comes ahead."""
+        self._asked = self._ahead = None
 
     def stop(self, why: str = "stopped") -> None:
         """Stop; the caller closes the connection.
@@ -272,9 +304,9 @@ class RangeDownload:
             raise RemoteError("other-container", "expected the file as it was before, got another: it has changed")
         self._etag, self._validator = strong or self._etag, validator or self._validator
 
-    def _first(self) -> tuple[int, int] | None:
-        """What to ask for before the index can be looked for."""
-        cached, size = self.reception.cached, self.reception.size
+    def _first(self, cached: RangeSet) -> tuple[int, int] | None:
+        """What to ask for before the index can be looked for, where these bytes are cached or coming."""
+        size = self.reception.size
         if size is None:
             return 0, self._beginning()
         tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
@@ -299,6 +331,7 @@ class RangeDownload:
     def _read_index(self) -> list[DownloadEvent]:
         from ..container import read_index
         from ..container.capacity import Capacity
+        from ..planning.window_errors import read_window_errors
 
         store, size = self.reception.keep(), self.reception.size or 0
 
@@ -307,21 +340,22 @@ class RangeDownload:
                 raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
 
-        self._needed = None
+        self._needed, windows = None, None
         try:
             index = read_index(read, size, Capacity(self.reception.decoder.capacity.max_vertices))
+            if self.reception.target.region is not None:
+                windows = read_window_errors(index, read)
         except _MissingError as missing:
             self._needed = missing.place
             return []
         except TruncatedStreamError as error:
             # All bytes that the host has were looked at: others would not follow.
             raise CutShortError(f"the file was cut short: {error}") from error
-        return [*self.reception.follow(index)]
+        return [*self.reception.follow(index, windows)]
 
-    def _next_slices(self) -> tuple[int, int] | None:
+    def _next_slices(self, cached: RangeSet) -> tuple[int, int] | None:
         """The next slice that is missing, with those after it that are near and nothing between that is cached."""
-        cached = self.reception.cached
-        missing = self.reception.missing()
+        missing = self.reception.missing(cached)
         first = next(missing, None)
         if first is None:
             return None

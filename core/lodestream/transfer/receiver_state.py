@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..container import Index
     from ..decoding.decoder import Decoder, View
     from ..planning.plan import Plan
+    from ..planning.window_errors import WindowErrors
 
 __all__ = ["DownloadEvent", "Ended", "MemoryStore", "ReceiverState", "Sink", "Store"]
 
@@ -178,7 +179,9 @@ class ReceiverState:
         self._learning = False  # the order has changed, and the index is needed to know it
         self._surface: RangeSet | None = None
         self._wanted: RangeSet | None = None
-        self._service: tuple[tuple[int, int], ...] = ()
+        self._service: tuple[tuple[int, int], ...] = ()  # index, metadata, and bounds of the errors of windows
+        self._windows: WindowErrors | None = None
+        self._bounded = True  # whether the other side tells errors of a window
         self._deadline: float | None = None
         if self.target.first is not None:
             self.decoder.focus(self.target.first)
@@ -201,8 +204,18 @@ class ReceiverState:
             )
         self.container, self.size = container or self.container, size
 
-    def expect(self, planned: int, index: tuple[int, int], metadata: tuple[int, int], prefix: bool) -> list[View]:
+    def expect(
+        self,
+        planned: int,
+        index: tuple[int, int],
+        metadata: tuple[int, int],
+        windows: tuple[int, int] | None = None,
+        *,
+        prefix: bool,
+    ) -> list[View]:
         """Declare what the other side is about to send; returns the views that stored bytes complete.
+
+        ``windows`` is as `Opened.window_errors`.
 
         Raises
         ------
@@ -211,28 +224,38 @@ class ReceiverState:
         """
         check_length(metadata[1], metadata[0], section=True)
         self.planned, self._service = planned, (index, metadata)
+        if windows is not None and windows[1]:
+            self._service = index, metadata, windows
+        if self._bounded != (windows is not None):
+            self._bounded = windows is not None
+            if self.index is not None:
+                self._plan(self.index)  # a server of another release stops elsewhere
         # Where the file comes from its first byte on, its order is known before its index is.
         if prefix and self._order is None:
             self._follow([(0, planned)], [], [metadata])
         return self._advance()
 
-    def follow(self, index: Index) -> list[View]:
-        """Set the container's index; returns the views that stored bytes complete.
+    def follow(self, index: Index, windows: WindowErrors | None = None) -> list[View]:
+        """Set the container's index, and its bounds of the errors of windows where the target is one.
+
+        Returns the views that stored bytes complete.
 
         Raises
         ------
         OptionError
             If the container cannot meet the target.
         """
+        self._windows = windows
         self._plan(index)
         return self._advance()
 
     def _plan(self, index: Index) -> None:
         from ..planning.planner import plan
 
-        chosen = plan(index, self.target)
+        chosen = plan(index, self.target, windows=self._windows, bounded=self._bounded)
         self.index, self._learning = index, False
-        self._service = tuple((place.offset, place.length) for place in (index.index, index.metadata))
+        places = index.index, index.metadata, *(place for place in chosen.before if place != index.index)
+        self._service = tuple((place.offset, place.length) for place in places)
         self.planned, self.plan = chosen.bytes, chosen
         parts = (chosen.ranges, chosen.before, chosen.after)
         self._follow(*([(place.offset, place.length) for place in part] for part in parts))
@@ -287,10 +310,13 @@ class ReceiverState:
                 views += self.decoder.feed_at(start, new)
         return views + self._advance()
 
-    def missing(self) -> Iterator[tuple[int, int]]:
-        """The bytes that are still to come, as (offset, length) in order; once the index is known."""
+    def missing(self, cached: RangeSet | None = None) -> Iterator[tuple[int, int]]:
+        """The bytes that are still to come, as (offset, length) in order; once the index is known.
+
+        ``cached`` is what is not asked for again, by default what is cached.
+        """
         for place in self._order or ():
-            yield from self.cached.missing(*place)
+            yield from (self.cached if cached is None else cached).missing(*place)
 
     def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
         """The parts of a range that the target needs, cached or not; before that is known, the whole range."""
@@ -425,5 +451,17 @@ class ReceiverState:
             header = scratch.header
         if header is None or (header.masked and not header.holes):
             return None  # the section of masks, without which the index cannot be counted through, is not there yet
+        if len(self._service) > 2 and not store.ranges.covers(*self._service[2]):
+            return None
         self.decoder.capacity.take(INDEX_GROWTH * place[1])
-        return self.follow(index_from(store.read(*place), ByteRange(*place), header))
+        index = index_from(store.read(*place), ByteRange(*place), header)
+        return self.follow(index, self._errors_of_windows(store, index))
+
+    def _errors_of_windows(self, store: Store, index: Index) -> WindowErrors | None:
+        """The bounds that the other side has sent, if it has."""
+        from ..planning.window_errors import read_window_errors, window_section
+
+        place = window_section(index)
+        if len(self._service) < 3 or place is None or not store.ranges.covers(place.offset, place.length):
+            return None
+        return read_window_errors(index, store.read)

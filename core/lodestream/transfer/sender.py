@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ..container import ByteRange, Index
@@ -11,6 +11,7 @@ from ..errors import CorruptStreamError, OptionError
 from ..planning.byte_ranges import RangeSet
 from ..planning.plan import Mark, Plan
 from ..planning.planner import plan
+from ..planning.window_errors import WindowErrors, window_section
 from ..protocol.connection import Connection, Side, State
 from ..protocol.flow_control import SMALL_MESSAGE
 from ..protocol.messages import (
@@ -50,6 +51,8 @@ class Sender:
         SHA-256 of the container, in hexadecimal digits.
     credit : int
         The most credit that is kept of what the client grants, `BASE_CREDIT` to `MAX_CREDIT`.
+    windows : callable () -> WindowErrors or None
+        Reads the container's bounds of the errors of windows; called when a client asks for a window and knows them.
 
     Attributes
     ----------
@@ -63,13 +66,20 @@ class Sender:
         Why the stream ended, once it has.
     """
 
-    def __init__(self, index: Index, container: str, credit: int = BASE_CREDIT) -> None:
+    def __init__(
+        self,
+        index: Index,
+        container: str,
+        credit: int = BASE_CREDIT,
+        windows: Callable[[], WindowErrors | None] = lambda: None,
+    ) -> None:
         self.sent = 0
         self.layers = 0
         self.cached = RangeSet()
         self.why: str | None = None
         self._index = index
         self._container = container
+        self._windows = windows
         self._connection = Connection(Side.SERVER, credit)
         self._outbox: deque[Event] = deque()
         self._slices: deque[ByteRange] = deque()
@@ -172,8 +182,10 @@ class Sender:
 
     def _plan(self, event: Open) -> None:
         index = self._index
+        bounded = bool(event.window_errors) and event.target.region is not None
         try:
-            chosen = plan(index, event.target, self._said(event))
+            windows = self._windows() if bounded else None
+            chosen = plan(index, event.target, self._said(event), windows=windows, bounded=bounded)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
         self.why = None
@@ -190,6 +202,7 @@ class Sender:
                 (index.metadata.offset, index.metadata.length),
                 chosen.prefix,
                 None if self._connection.most == BASE_CREDIT else self._connection.most,
+                _place(None if windows is None else window_section(index)) if bounded else None,
             )
         )
         self._end_if_done()
@@ -221,6 +234,10 @@ class Sender:
     def _end_if_done(self) -> None:
         if not self._slices:
             self._outbox.append(End(self._ended))
+
+
+def _place(section: ByteRange | None) -> tuple[int, int]:
+    return (0, 0) if section is None else (section.offset, section.length)
 
 
 def _as_cached(chosen: Plan) -> list[Mark]:

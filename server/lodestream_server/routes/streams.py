@@ -19,6 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 from lodestream.container import ByteRange
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
 from lodestream.planning.planner import plan
+from lodestream.planning.window_errors import window_section
 from lodestream.protocol.connection import State
 from lodestream.protocol.handshake import PARAMETER, from_address
 from lodestream.protocol.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
@@ -58,6 +59,8 @@ _LONGEST_REASON = 123
 # least so many bytes of a message.
 _PLANNED_AT_ONCE = 2048
 _BYTES_OF_A_RANGE = 3
+# In every message that asks for a window with its errors.
+_WINDOW = b"window_errors"
 
 _Result = TypeVar("_Result")
 
@@ -98,7 +101,7 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
             record = ready(parts, surface)
             with still_there(parts, surface):
                 container = await asyncio.to_thread(parts.containers.open, record.container or "")
-            sender = Sender(container.index, container.sha256, credit)
+            sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
         return
@@ -272,8 +275,11 @@ class _Session:
         if self._sender.state is State.ENDED:
             # Somebody who opens again and again does it in turn with others.
             return isinstance(parse(data), Open)
-        size = self._sender.plan_size + len(data) // _BYTES_OF_A_RANGE
-        return self._sender.state is State.IDLE and size > _PLANNED_AT_ONCE
+        if self._sender.state is not State.IDLE:
+            return False
+        if _WINDOW in data and window_section(self._container.index) is not None:
+            return True  # it is read from the disk
+        return self._sender.plan_size + len(data) // _BYTES_OF_A_RANGE > _PLANNED_AT_ONCE
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Do what takes long beside the event loop, which serves the others meanwhile."""

@@ -21,6 +21,7 @@ from .storage import Storage
 
 if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
+    from lodestream.planning.window_errors import WindowErrors
 
 __all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes"]
 
@@ -56,6 +57,18 @@ class OpenContainer:
             return None
         # Fewer bytes: the rest is not in memory, or the file has been cut.
         return bytes(buffer) if count == place.length else None
+
+    def window_errors(self) -> WindowErrors | None:
+        """Read the bounds of the errors of windows; None if the container has none. May be called from any thread.
+
+        Raises
+        ------
+        CorruptStreamError
+            If they are damaged.
+        """
+        from lodestream.planning.window_errors import read_window_errors
+
+        return read_window_errors(self.index, partial(_read_from, self.file.fileno()))
 
     def close(self) -> None:
         """Close the file."""

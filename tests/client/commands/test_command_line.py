@@ -17,7 +17,7 @@ from lodestream_client.commands import surfaces
 from ..conftest import Run
 
 Terrain = NDArray[np.float32]
-KEYS = {"bytes", "wire_bytes", "level", "rms", "max", "seconds", "ended"}
+KEYS = {"bytes", "wire_bytes", "level", "rms", "max", "bound", "seconds", "ended"}
 
 # Both ways to the same surface: from a file, and from a server.
 Fetch = Callable[..., tuple[int, dict[str, Any], str]]

@@ -24,6 +24,7 @@ from lodestream_client.errors import SilenceError, UnreachableError
 from lodestream_client.requests.answers import Head
 from lodestream_client.stream.core import Core
 from lodestream_client.stream.effects import (
+    Ahead,
     Dial,
     DialError,
     Dialled,
@@ -87,6 +88,44 @@ def test_the_plain_file_of_any_web_server() -> None:
     world = World(url=FILE).run()
     complete(world)
     assert {type(effect) for effect in world.effects} == {Get, Read, HangUp}
+
+
+@pytest.mark.parametrize("target", [None, ls.Target(region=NEAR), ls.Target(order="level")], ids=repr)
+def test_the_next_range_is_asked_for_before_the_last_one_has_come_and_before_a_view_is_looked_at(target: Any) -> None:
+    world = World(transport="http", target=target)
+    waiting = 0
+    while (effect := next_effect(world.core)) is not None:
+        if isinstance(effect, Get) and world.session.ranges is not None and world.session.ranges.requests > 1:
+            waiting += world.ahead is None
+        world.step(effect)
+        if world.session.shows and isinstance(next_effect(world.core), Ahead):
+            assert world.core.next_view() is None
+        elif (view := world.core.next_view()) is not None:
+            assert not isinstance(next_effect(world.core), Get) or world.ahead is not None
+            world.views.append(view)
+    assert world.session.ended == "complete"
+    assert world.in_vain == 0
+    assert world.session.ranges is not None
+    # What only an index tells can be asked for no sooner.
+    assert waiting <= 1
+
+
+def test_a_server_that_refuses_a_second_request_is_asked_one_by_one() -> None:
+    world = World(url=FILE, target=ls.Target(order="level"))
+    while not isinstance(effect := next_effect(world.core), Ahead):
+        assert effect is not None
+        world.step(effect)
+    world.step(effect)
+    while not isinstance(effect := next_effect(world.core), Get):
+        assert effect is not None
+        world.step(effect)
+    refused = len(world.effects)
+    world.acts = {refused: "break"}
+    world.run()
+    complete(world)
+    after = world.effects[refused + 1 :]
+    assert not any(isinstance(one, Ahead) and isinstance(two, Read) for one, two in pairwise(after))
+    assert any(isinstance(each, Get) for each in after)
 
 
 @given(
@@ -356,7 +395,7 @@ def test_the_keywords_of_connect_are_its_options() -> None:
 
 def test_every_effect_is_a_frozen_value() -> None:
     kinds = get_args(Effect)
-    assert len(kinds) == 7
+    assert len(kinds) == 8
     for kind in kinds:
         assert kind.__dataclass_params__.frozen
 

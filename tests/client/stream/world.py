@@ -24,6 +24,7 @@ from lodestream.transfer.sender import Sender
 from lodestream_client.requests.answers import Head
 from lodestream_client.stream.core import Core
 from lodestream_client.stream.effects import (
+    Ahead,
     Dial,
     DialError,
     Dialled,
@@ -87,6 +88,8 @@ class World:
         self.session = Session(url, ConnectOptions(**options), lambda: self.now)
         self.core = Core(self.session)
         self.acts = acts or {}
+        self.ahead: Get | None = None
+        self.in_vain = 0  # requests made ahead whose answers nobody wanted
         self._server: Sender | None = None
         self._body: Iterator[bytes] | None = None
         self._seconds = 0.0  # of the last request, also for each step of its answer
@@ -173,7 +176,12 @@ class World:
                 return None
             case Get(_, headers, seconds):
                 self._seconds = seconds
+                self.in_vain += self.ahead is not None and not self.ahead.asks_as(effect)
+                self.ahead = None
                 return self._answer(headers)
+            case Ahead(get):
+                self.ahead = get
+                return None
             case Read():
                 assert self._body is not None, "only an answer is read"
                 return next(self._body, b"")
@@ -181,7 +189,7 @@ class World:
                 self.now = self.now if self.session.stopped else max(self.now, until)
                 return None
             case HangUp():
-                self._server = self._body = None
+                self._server = self._body = self.ahead = None
                 return None
 
     def _message(self, until: float) -> bytes | None:

@@ -583,7 +583,7 @@ def test_metadata_that_are_longer_are_refused_before_they_are_read() -> None:
     with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
         loose.feed_at(index.metadata.offset, long[index.metadata.offset : index.metadata.offset + 6])
     with pytest.raises(CorruptStreamError, match="at most 65,536 bytes"):
-        ReceiverState(ls.Target()).expect(100, (200, 50), (100, 70_000), True)
+        ReceiverState(ls.Target()).expect(100, (200, 50), (100, 70_000), prefix=True)
 
 
 @pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**31, 2**62, LARGEST])

@@ -96,7 +96,7 @@ def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> Non
     whole = ls.Decoder(selection_of(ls.Target(region=region)))
     whole.feed(container)
     assert np.array_equal(whole.surface().points, window.points, equal_nan=True)
-    assert all(math.isnan(view.rms) for view in decoder.layers[:-1])
+    assert not any(math.isnan(view.rms) for view in decoder.layers)
     for view in decoder.layers[:-1:8]:  # to decode every layer proves no more
         assert view.points.shape == window.points.shape
     if region == REGIONS[0] and kind in ("integers", "floats", "holes"):

@@ -36,6 +36,7 @@ def transfer(
     outstanding = credit = window.size
     window.grant(window.size, 0.0)
     window.heard(round_trip)
+    window.began(0.0)
     events: list[tuple[float, int, str, int]] = []
     free = now = sent = most = settled = 0.0
     count = largest = 0

@@ -22,6 +22,10 @@ def record(random: Random) -> dict[str, object]:
     rate = 10 ** random.uniform(3, 8)
     window.allow(most)
     window.heard(heard)
+    begun = random.random() < 0.5
+    if begun:
+        window.began(0.0)
+        now = heard
     steps, sizes = [], []
     for _ in range(300):
         size = random.choice((random.randint(1, 4096), MAX_DATA))
@@ -32,7 +36,7 @@ def record(random: Random) -> dict[str, object]:
         window.arrive(size, now)
         steps.append((granted, size, now))
         sizes.append((window.size, window.due(window.size - size)))
-    return {"most": most, "heard": heard, "steps": steps, "sizes": sizes}
+    return {"most": most, "heard": heard, "begun": begun, "steps": steps, "sizes": sizes}
 
 
 def main() -> None:

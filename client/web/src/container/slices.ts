@@ -8,7 +8,7 @@ import { type Frame, wholeSection } from "./frames";
 import type { Index } from "./model";
 import { KIND } from "./sections";
 
-/** What a view is made of. */
+/** What a view is made of; its errors are those that the whole surface has in this state. */
 export interface State {
   readonly number: number;
   readonly level: number;
@@ -51,7 +51,6 @@ class Run {
 /** Collects bytes at their places and hands each segment and chunk of the residual on once, when it is whole. */
 export class Slices {
   readonly #index: Index;
-  readonly #partial: boolean;
   readonly #whole: boolean;
   readonly #items: Item[];
   readonly #starts: Float64Array;
@@ -75,10 +74,8 @@ export class Slices {
   #near: readonly Groups[] = [];
   #reached: number[] | null = null; // null while all comes in order
 
-  /** `partial`: what is wanted is not the whole surface, so errors of states on the way are not known (NaN). */
-  constructor(index: Index, wanted: SelectedSlices, partial: boolean) {
+  constructor(index: Index, wanted: SelectedSlices) {
     this.#index = index;
-    this.#partial = partial;
     this.#whole = wanted.whole;
     this.#wanted = wanted.segments;
     const chunks = [...wanted.chunks].map(([number, chunk]): Item => ({ number, chunk }));
@@ -212,7 +209,8 @@ export class Slices {
         number: layer,
         level,
         bytes: this.#inFile ? record.end : this.#bytes,
-        ...this.#figures(record.errors),
+        rms: record.errors.rms,
+        maxError: record.errors.maximum,
         complete: false,
         allPlanes: last && level === header.levels,
         wholeLevel: -1,
@@ -225,7 +223,8 @@ export class Slices {
         number: level,
         level,
         bytes: this.#bytes,
-        ...this.#figures(levels[level]!.errors),
+        rms: levels[level]!.errors.rms,
+        maxError: levels[level]!.errors.maximum,
         complete: false,
         allPlanes: false,
         wholeLevel: level,
@@ -274,11 +273,6 @@ export class Slices {
     return [[this.#byLayer, this.#byLevel], this.#near].flatMap((pair) =>
       pair.slice(0, kinds).map((groups) => groups.reached),
     );
-  }
-
-  #figures(errors: { rms: number; maximum: number }): { rms: number; maxError: number } {
-    if (this.#partial) return { rms: Number.NaN, maxError: Number.NaN };
-    return { rms: errors.rms, maxError: errors.maximum };
   }
 
   #end(number: number): State {

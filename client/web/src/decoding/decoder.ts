@@ -17,6 +17,7 @@ import type { Region, Surface } from "../types";
 import { Progress } from "./progress";
 import { type Coded, Reconstruction } from "./reconstruction";
 import { type Shared, View } from "./view";
+import { WindowState } from "./window-state";
 
 // What an entry of a layer's table becomes until its segment has been decoded.
 const ENTRY = 256;
@@ -32,7 +33,7 @@ export interface DecoderOptions extends Selection {
 /** What exists from the header, and the masks, on. */
 interface Begun {
   readonly header: Header;
-  readonly wanted: Uint8Array;
+  readonly window: WindowState | null;
   readonly progress: Progress;
   readonly shared: Shared;
 }
@@ -117,13 +118,13 @@ export class Decoder {
     const before = this.layers.length;
     this.capacity.take(data.length);
     if (this.#slices !== null) {
-      this.#takeSlice(this.#slices, offset, data);
+      this.#takePart(offset, data);
     } else if (offset === this.#frames.position + this.#frames.pending) {
       this.#feed(data);
       if (this.#begun !== null) {
         const early = this.#early;
         this.#early = [];
-        for (const { offset: place, data } of early) this.#takeLoose(place, data);
+        for (const { offset: place, data } of early) this.#takePart(place, data);
       }
     } else if (this.#begun === null) {
       this.#early.push({ offset, data: data.slice() });
@@ -235,7 +236,7 @@ export class Decoder {
     this.#header = header;
     this.#begun = {
       header,
-      wanted: selectedTiles(this.#selection, header),
+      window: this.#selection.region ? new WindowState(header, this.#selection.region) : null,
       progress: new Progress(header),
       shared: {
         reconstruction: new Reconstruction(this.#module, header),
@@ -304,9 +305,9 @@ export class Decoder {
   }
 
   #show(begun: Begun, made: State): void {
-    const { header, progress, shared, wanted } = begun;
+    const { header, progress, shared, window } = begun;
     const { channels, layout } = header;
-    const state = progress.snapshot(made.allPlanes);
+    const state = progress.snapshot(made.allPlanes || (window?.isLastLayer(made) ?? false));
     this.capacity.take(state.length);
     if (made.wholeLevel >= 0) {
       // The index says that there is nothing more of these levels.
@@ -314,12 +315,18 @@ export class Decoder {
       for (let unit = 0; unit < stop; unit++) if (state[unit] === UNANNOUNCED) state[unit] = 0;
     }
     const near = made.wholeNear ? this.#near : null;
-    for (let unit = 0; unit < state.length; unit++) {
-      const tile = Math.floor(unit / channels);
-      if (near?.[tile] && state[unit] === UNANNOUNCED) state[unit] = 0;
-      if (!wanted[tile]) state[unit] = 0; // what lies outside has no part in the window
+    for (let unit = 0; near && unit < state.length; unit++) {
+      if (near[Math.floor(unit / channels)] && state[unit] === UNANNOUNCED) state[unit] = 0;
     }
-    this.layers.push(new View(made, shared, { length: shared.reconstruction.length, state }, this.#selection));
+    window?.putOutside(made, state);
+    const info = { ...made, bound: false, ...window?.figures(made) };
+    this.layers.push(new View(info, shared, { length: shared.reconstruction.length, state }, this.#selection));
+  }
+
+  /** Bytes of a plan, once the header is known. */
+  #takePart(offset: number, data: Uint8Array): void {
+    if (this.#slices === null) this.#takeLoose(offset, data);
+    else if (!this.#begun?.window?.take(offset, data)) this.#takeSlice(this.#slices, offset, data);
   }
 
   /** Bytes that do not continue the file and belong to a service section: the index or the metadata. */
@@ -348,7 +355,8 @@ export class Decoder {
     this.capacity.take(INDEX_GROWTH * data.length);
     const index = indexFrom(data, start, begun.header).withMetadata(this.#metadata ?? {}, this.#digest.value);
     this.#index = index;
-    const slices = new Slices(index, select(index, this.#selection), this.#selection.region !== undefined);
+    begun.window?.follow(index);
+    const slices = new Slices(index, select(index, this.#selection));
     this.#slices = slices;
     if (this.layers.length || this.#frames.pending) {
       // The file was read in its own order so far, and is not any more.

@@ -69,7 +69,7 @@ export class Progress {
 }
 
 /** The state before the first layer: what has no coefficient, or none other than 0 in its whole level, is known. */
-function initialState(header: Header): Int8Array {
+export function initialState(header: Header): Int8Array {
   const { channels, geometric, layout } = header;
   const state = new Int8Array(layout.tiles.length * channels).fill(UNANNOUNCED);
   for (const [number, tile] of layout.tiles.entries()) {

@@ -32,6 +32,7 @@ export class View implements ViewInfo {
   readonly bytes: number;
   readonly rms: number;
   readonly maxError: number;
+  readonly bound: boolean;
   readonly complete: boolean;
   readonly #shared: Shared;
   readonly #known: Known;
@@ -43,6 +44,7 @@ export class View implements ViewInfo {
     this.bytes = state.bytes;
     this.rms = state.rms;
     this.maxError = state.maxError;
+    this.bound = state.bound;
     this.complete = state.complete;
     this.#shared = shared;
     this.#known = known;
@@ -51,8 +53,8 @@ export class View implements ViewInfo {
 
   /** What is known of the state without decoding it, in plain values. */
   get info(): ViewInfo {
-    const { number, level, bytes, rms, maxError, complete } = this;
-    return { number, level, bytes, rms, maxError, complete };
+    const { number, level, bytes, rms, maxError, bound, complete } = this;
+    return { number, level, bytes, rms, maxError, bound, complete };
   }
 
   /**

@@ -6,26 +6,37 @@
 
 import type { Index } from "../container/model";
 import { OptionError } from "../errors";
-import type { ByteRange, LevelRecord, Target } from "../types";
+import type { ByteRange, LevelRecord, Region, Target } from "../types";
 import type { RangeSet } from "./byte-ranges";
 import { type Ended, endOf, type Mark, type Plan } from "./plan";
 import { regionFirst } from "./region-first";
 import { select } from "./selection";
 import { absolute } from "./target";
+import { type Figures, type WindowErrors, WindowFigures, windowSection } from "./window-errors";
+
+/** What a plan of a window takes from beside the index. */
+export interface WindowOptions {
+  /** The container's own bounds of the errors of windows; their section then comes behind the index. */
+  readonly windows?: WindowErrors | null;
+  /** Whether errors of windows are told; false: NaN before the end, as servers of earlier releases plan. */
+  readonly bounded?: boolean;
+}
 
 /**
  * The slices that a receiver with this target gets, if it holds these bytes of the container.
  *
+ * Of a window, errors before its end are bounds, see `WindowFigures`; limits are met where these are.
+ *
  * @throws OptionError if there is no such level or region, or not even the first layer fits into the allowed bytes.
  */
-export function plan(index: Index, target: Target = {}, cached?: RangeSet): Plan {
-  let chosen = whole(index, target);
+export function plan(index: Index, target: Target = {}, cached?: RangeSet, options: WindowOptions = {}): Plan {
+  let chosen = whole(index, target, options);
   if (target.first !== undefined) chosen = regionFirst(index, chosen, target.first);
   return cached === undefined || cached.size === 0 ? chosen : less(chosen, cached);
 }
 
-function whole(index: Index, target: Target): Plan {
-  if (target.region !== undefined || target.attributes !== undefined) return selected(index, target);
+function whole(index: Index, target: Target, options: WindowOptions): Plan {
+  if (target.region !== undefined || target.attributes !== undefined) return selected(index, target, options);
   const finest = index.header.layout.levels;
   if (target.level !== undefined) {
     checkLevel(target.level, finest);
@@ -141,10 +152,11 @@ function byLevel(index: Index, target: Target, level: number): Plan {
 }
 
 /** A window, or some attributes only: segments in file order or level by level, then chunks of the residual. */
-function selected(index: Index, target: Target): Plan {
+function selected(index: Index, target: Target, options: WindowOptions): Plan {
   const chosen = select(index, target);
   const { tiles, levels } = index.header.layout;
-  const partial = target.region !== undefined;
+  const { windows = null, bounded = true } = options;
+  const within = figuresOf(index, target.region, windows, bounded);
   const finest = target.level ?? levels;
   checkLevel(finest, levels);
   const levelOf = (tile: number): number => tiles[tile]!.level;
@@ -160,42 +172,55 @@ function selected(index: Index, target: Target): Plan {
     const after = segments[number + 1];
     if (target.order === "level") {
       if (after === undefined || levelOf(after.tile) > own) {
-        marks.push(known(markOfLevel(index.levels[own]!, slices.total), partial));
+        const mark = markOfLevel(index.levels[own]!, slices.total);
+        marks.push({ ...mark, ...within(mark) });
       }
     } else if (after === undefined || after.layer > segment.layer) {
       // Layers of which nothing is wanted are there as well.
       const record = after === undefined ? index.layers[index.layers.length - 1]! : index.layers[after.layer - 1]!;
       const { rms, maximum: maxError } = record.errors;
       if (target.level === undefined || level <= target.level) {
-        const mark = { sent: slices.total, number: record.number, level, bytes: slices.total, rms, maxError };
-        marks.push(known(mark, partial));
+        const figures = within({ rms, maxError }, record.number);
+        marks.push({ sent: slices.total, number: record.number, level, bytes: slices.total, ...figures });
       }
     }
   }
   let last: Mark;
   let ended: Ended;
   if (finest < levels) {
-    last = known(markOfLevel(index.levels[finest]!, slices.total), partial);
+    last = markOfLevel(index.levels[finest]!, slices.total);
     ended = "level";
   } else {
     for (const chunk of chosen.chunks.values()) slices.append(chunk.range);
     const number = chosen.chunks.size > 0 ? index.layers.length : index.layers.length - 1;
     last = { ...markOfLevel(index.levels[index.levels.length - 1]!, slices.total, number), level: finest };
+    if (bounded) last = { ...last, ...within(last, chosen.chunks.size > 0 ? undefined : number) };
     ended = "complete";
   }
   marks = [...marks.filter((mark) => mark.sent < slices.total), last];
   if (target.level === undefined) [marks, ended] = until(marks, target, index.header.extent);
   const ranges = cut(slices.ranges, marks[marks.length - 1]!.sent);
-  return { before: [index.index], ranges, after: [index.metadata], marks, ended, prefix: false };
+  const section = target.region !== undefined && windows !== null && bounded ? windowSection(index) : null;
+  const before = section === null ? [index.index] : [index.index, section];
+  return { before, ranges, after: [index.metadata], marks, ended, prefix: false };
+}
+
+/** What a receiver knows of the errors of its selection, from those of the whole surface, and the layer. */
+function figuresOf(
+  index: Index,
+  region: Region | undefined,
+  windows: WindowErrors | null,
+  bounded: boolean,
+): (of: Figures, layer?: number) => Figures {
+  if (region === undefined) return ({ rms, maxError }) => ({ rms, maxError });
+  if (!bounded) return () => ({ rms: Number.NaN, maxError: Number.NaN });
+  const figures = new WindowFigures(index.header, region, windows);
+  return (of, layer) => figures.within(of, layer);
 }
 
 function markOfLevel(state: LevelRecord, bytes: number, number: number = state.level): Mark {
   const { rms, maximum: maxError } = state.errors;
   return { sent: bytes, number, level: state.level, bytes, rms, maxError };
-}
-
-function known(mark: Mark, partial: boolean): Mark {
-  return partial ? { ...mark, rms: Number.NaN, maxError: Number.NaN } : mark;
 }
 
 /** Slices of the surface after its header, joined where they touch; `total` is their length. */

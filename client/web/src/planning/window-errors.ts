@@ -11,13 +11,23 @@ import type { Index } from "../container/model";
 import type { Read } from "../container/reader";
 import { CorruptStreamError, OptionError } from "../errors";
 import { checkRegion } from "../grid/support";
-import type { Region } from "../types";
+import type { ByteRange, Region } from "../types";
 
 /** Kind of the section. */
 const WINDOW_ERRORS = 128;
 // A code is a step of an eighth of an octave: 2^(-k / 8) over 2^16, rounded up; the last one says that there is no error.
 const STEPS = [65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734];
 const NOTHING = 255;
+// A section that is more of the container than this part of it costs a window more than it can save.
+const MOST_SHARE = 8;
+// Rounding of sums, quotients and roots is far below the steps of the codes; a bound stays one all the same.
+const UPWARDS = 1 + 2 ** -40;
+
+/** Bounds of RMS and maximum error. */
+export interface Figures {
+  readonly rms: number;
+  readonly maxError: number;
+}
 
 /** Bounds of the errors of each cell of a surface after each layer. */
 export class WindowErrors {
@@ -48,6 +58,18 @@ export class WindowErrors {
     const [rows, columns] = region;
     const inside = countValid(mask, shape[1], rows[0], rows[1], columns[0], columns[1]);
     if (!inside) return { rms: 0, maximum: 0 };
+    const { squares, worst } = this.sums(region, layer, mask);
+    const rms = Math.sqrt(squares / inside) * UPWARDS;
+    return { rms: Math.min(rms, worst) * extent, maximum: worst * extent };
+  }
+
+  /**
+   * Of the cells that a window of the only block touches, after a layer: what the squared errors add up to at most, and
+   * the largest error, over the surface's extent. `mask` as for `bounds`.
+   */
+  sums(region: Region, layer: number, mask: Uint8Array | null): { squares: number; worst: number } {
+    const { shape, layerCount } = this.#header;
+    const [rows, columns] = region;
     const [height, width] = [2 ** this.cell[0], 2 ** this.cell[1]];
     const across = Math.ceil(shape[1] / width);
     let [squares, worst] = [0, 0];
@@ -61,9 +83,54 @@ export class WindowErrors {
         worst = Math.max(worst, fractionOf(this.#codes[place + 1]!));
       }
     }
-    // Rounding of these sums is far below the steps of the codes; a bound stays one all the same.
-    const rms = Math.sqrt(squares / inside) * (1 + 2 ** -40);
-    return { rms: Math.min(rms, worst) * extent, maximum: worst * extent };
+    return { squares, worst };
+  }
+}
+
+/**
+ * What the errors of a window do not exceed, wherever those of the whole surface are known.
+ *
+ * A maximum of the whole holds in each part. The squares of all errors are at least those of a part, so the RMS of n of N
+ * vertices is at most sqrt(N / n) times that of all. Bounds of the cells of the window, where the container has them, are
+ * nearer. Masks are not looked at, so that whoever plans need not decode them: all holes may lie in the window. Servers
+ * make the same plans, so every sum is added up in the order of the cells.
+ */
+export class WindowFigures {
+  /** Whether the window is all of the surface. */
+  readonly whole: boolean;
+  readonly #region: Region;
+  readonly #windows: WindowErrors | null;
+  readonly #extent: number;
+  readonly #least: number; // valid points that the window has at least
+  readonly #root: number;
+
+  /** `header` is of one block, with the number of its holes. Throws `OptionError` where there is no such region. */
+  constructor(header: Header, region: Region, windows: WindowErrors | null = null) {
+    checkRegion(region, header.shape);
+    this.#region = region;
+    this.#windows = windows;
+    this.#extent = header.extent;
+    let holes = 0;
+    for (const count of header.masks.holes) holes += count;
+    const points = header.shape[0] * header.shape[1];
+    const inside = (region[0][1] - region[0][0]) * (region[1][1] - region[1][0]);
+    this.whole = inside === points;
+    // Points of a surface that touches itself are not all vertices: how many a window has is not counted.
+    this.#least = header.arrangement ? 0 : Math.max(inside - holes, 0);
+    this.#root = this.#least ? Math.sqrt((points - holes) / this.#least) * UPWARDS : Number.POSITIVE_INFINITY;
+  }
+
+  /** From errors of the whole surface, and the layer whose they are, if it is one; NaN where they are not known. */
+  within(of: Figures, layer?: number): Figures {
+    let { rms, maxError } = of;
+    if (Number.isNaN(rms) || this.whole) return { rms, maxError };
+    rms = rms ? rms * this.#root : 0;
+    if (layer !== undefined && this.#windows !== null) {
+      const { squares, worst } = this.#windows.sums(this.#region, layer, null);
+      maxError = Math.min(maxError, worst * this.#extent);
+      if (this.#least) rms = Math.min(rms, Math.sqrt(squares / this.#least) * UPWARDS * this.#extent);
+    }
+    return { rms: Math.min(rms, maxError), maxError };
   }
 }
 
@@ -88,13 +155,22 @@ function countValid(
   return count;
 }
 
+/** Where a container tells errors of windows; null where it does not, or at a length that is not worth it. */
+export function windowSection(index: Index): ByteRange | null {
+  const range = index.optional.find(({ kind }) => kind === WINDOW_ERRORS)?.range;
+  return range !== undefined && range.length <= Math.floor(index.size / MOST_SHARE) ? range : null;
+}
+
 /** The errors of windows of a container; null: it does not tell them. Throws `CorruptStreamError`. */
 export async function readWindowErrors(index: Index, read: Read): Promise<WindowErrors | null> {
-  const section = index.optional.find(({ kind }) => kind === WINDOW_ERRORS);
-  if (!section) return null;
-  const { offset, length } = section.range;
-  const frame = wholeSection(await read(offset, length), offset, WINDOW_ERRORS);
-  return parseWindowErrors(frame.payload, frame.payloadOffset, index.header);
+  const range = windowSection(index);
+  return range && windowErrorsFrom(await read(range.offset, range.length), range.offset, index.header);
+}
+
+/** The errors of windows from their section, which stands at `offset`. Throws `CorruptStreamError`. */
+export function windowErrorsFrom(section: Uint8Array, offset: number, header: Header): WindowErrors {
+  const frame = wholeSection(section, offset, WINDOW_ERRORS);
+  return parseWindowErrors(frame.payload, frame.payloadOffset, header);
 }
 
 function parseWindowErrors(payload: Uint8Array, offset: number, header: Header): WindowErrors {

@@ -68,6 +68,11 @@ export class Window {
     if (this.fixed !== undefined) this.size = Math.min(this.fixed, most);
   }
 
+  /** The first window was asked for at this time: it is measured from there on, and can grow when it has come. */
+  began(now: number): void {
+    if (this.rounds.length === 0) this.rounds.push([this.arrived, now]);
+  }
+
   /** A round trip took at most this long. */
   heard(seconds: number): void {
     if (seconds > 0 && (this.roundTrip === undefined || seconds < this.roundTrip)) this.roundTrip = seconds;

@@ -83,6 +83,8 @@ export interface Open {
   readonly container?: string | undefined;
   /** For a client that cannot send a header with the handshake, such as a browser; not allowed in an address. */
   readonly token?: string | undefined;
+  /** True: of a window, the client knows bounds of errors, and takes the section that has them. */
+  readonly window_errors?: boolean | undefined;
 }
 
 /** From the client: this many more bytes of `segments.data` may be sent. */
@@ -118,6 +120,11 @@ export interface Header {
   readonly prefix: boolean;
   /** The most credit that the server keeps for this stream; left out: `BASE_CREDIT`. */
   readonly credit?: number | undefined;
+  /**
+   * Of a window: the section with bounds of its errors, which comes behind the index, or a length of 0 where the container
+   * has none. Left out: the server tells no errors of windows before their end.
+   */
+  readonly window_errors?: Place | undefined;
 }
 
 /** From the server: a slice of the container that starts at `offset`. */
@@ -130,8 +137,7 @@ export interface Segments {
 /**
  * From the server: a layer (quality order) or a level (level order) is complete with what was sent so far.
  *
- * `rms` and `max` are NaN while the client has been sent more than belongs to the layer, and in a window that is not
- * complete.
+ * `rms` and `max` are NaN while the client has been sent more than belongs to the layer. Of a window they are bounds.
  */
 export interface Layer {
   readonly type: "layer";

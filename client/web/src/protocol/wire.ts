@@ -81,6 +81,11 @@ const place: Read = (value) => {
   return [integer(value[0]), integer(value[1], 1)];
 };
 
+const section: Read = (value) => {
+  if (!pair(value)) throw new Mismatch("[offset, length]");
+  return [integer(value[0]), integer(value[1])];
+};
+
 const flag: Read = (value) => {
   if (typeof value !== "boolean") throw new Mismatch("true or false");
   return value;
@@ -136,6 +141,7 @@ const FIELDS: Readonly<Record<EventType, readonly (readonly [name: string, read:
     ["held", heldPlaces],
     ["container", digest],
     ["token", text],
+    ["window_errors", flag],
   ],
   credit: [["bytes", positive]],
   stop: [],
@@ -149,6 +155,7 @@ const FIELDS: Readonly<Record<EventType, readonly (readonly [name: string, read:
     ["metadata", place],
     ["prefix", flag],
     ["credit", credit],
+    ["window_errors", section],
   ],
   segments: [
     ["offset", count],
@@ -175,7 +182,9 @@ const DEFAULTS: Readonly<Record<string, unknown>> = {
   "open.held": [],
   "open.container": undefined,
   "open.token": undefined,
+  "open.window_errors": undefined,
   "header.credit": undefined,
+  "header.window_errors": undefined,
   "layer.rms": Number.NaN,
   "layer.max": Number.NaN,
 };

@@ -42,6 +42,7 @@ export class Download<View extends ViewInfo> {
   private readonly connection = new Connection("client");
   private openedAt: number | undefined;
   private turning = false; // this end has stopped in order to open again
+  private reopened = false;
   private aiming = false; // with another target, even if the last one is met
   private outbox: Uint8Array[];
 
@@ -200,18 +201,23 @@ export class Download<View extends ViewInfo> {
   private openWith(held: readonly Place[] = [], container?: string, token?: string): Uint8Array {
     const credit = this.window.size;
     this.window.grant(credit);
-    return this.connection.send({ type: "open", target: this.reception.target, credit, held, container, token });
+    const { target } = this.reception;
+    const window_errors = target.region === undefined ? undefined : true;
+    return this.connection.send({ type: "open", target, credit, held, container, token, window_errors });
   }
 
   private begin(event: Header, now: number | undefined): View[] {
     this.header = event;
-    if (now !== undefined && this.openedAt !== undefined) this.window.heard(now - this.openedAt);
+    if (now !== undefined && this.openedAt !== undefined) {
+      this.window.heard(now - this.openedAt);
+      if (!this.reopened) this.window.began(this.openedAt);
+    }
     this.window.allow(this.connection.most);
     this.grant(now);
     this.reception.identify(event.container, event.size);
     // What answers the last target says nothing of the one that is asked for next.
     if (this.aiming) return [];
-    return this.reception.expect(event.planned, event.index, event.metadata, event.prefix);
+    return this.reception.expect(event);
   }
 
   private take(event: Segments, now: number | undefined): View[] {
@@ -234,6 +240,7 @@ export class Download<View extends ViewInfo> {
       this.turning = this.aiming = false;
       // The server knows what it has sent, and that nothing more of the last grants will come.
       this.window.restart();
+      this.reopened = true;
       this.outbox.push(this.openWith());
       return;
     }

@@ -15,7 +15,8 @@ import { type Place, RangeSet } from "../planning/byte-ranges";
 import { type Ended, endOf, type Plan } from "../planning/plan";
 import { plan } from "../planning/planner";
 import { sameRegion } from "../planning/target";
-import { MAX_DATA } from "../protocol/messages";
+import { type WindowErrors, windowErrorsFrom, windowSection } from "../planning/window-errors";
+import { MAX_DATA, type Header as ServerHeader } from "../protocol/messages";
 import type { ByteRange, Region, Target, ViewInfo } from "../types";
 import type { StreamDecoder } from "./decoding";
 import { inFileOrder, sure } from "./safe-prefix";
@@ -33,6 +34,9 @@ export interface ReceiverStateOptions {
   readonly size?: number | undefined;
   readonly sink?: Sink | undefined;
 }
+
+/** What a server is about to send, see the header of the protocol. */
+export type Announced = Pick<ServerHeader, "planned" | "index" | "metadata" | "prefix" | "window_errors">;
 
 // What is kept for a slice beside its bytes.
 const SLICE = 256;
@@ -77,7 +81,9 @@ export class ReceiverState<View extends ViewInfo> {
   private learning = false; // the order has changed, and the index is needed to know it
   private surface: RangeSet | undefined;
   private wantedSet: RangeSet | undefined;
-  private service: readonly [index: Place, metadata: Place] | undefined;
+  private service: readonly [index: Place, metadata: Place, windows?: Place] | undefined;
+  private windows: WindowErrors | null = null;
+  private bounded = true; // whether the other side tells errors of a window
   private deadline: number | undefined;
   private kept = 0;
 
@@ -115,20 +121,26 @@ export class ReceiverState<View extends ViewInfo> {
    *
    * @throws CorruptStreamError if the metadata are longer than allowed in a container.
    */
-  expect(planned: number, index: Place, metadata: Place, prefix: boolean): View[] {
+  expect({ planned, index, metadata, prefix, window_errors }: Announced): View[] {
     checkMetadataLength(metadata[1], metadata[0], true);
     this.planned = planned;
-    this.service = [index, metadata];
+    this.service = window_errors?.[1] ? [index, metadata, window_errors] : [index, metadata];
+    if (this.bounded !== (window_errors !== undefined)) {
+      this.bounded = window_errors !== undefined;
+      if (this.index !== undefined) this.makePlan(this.index); // a server of another release stops elsewhere
+    }
     if (prefix && this.order === undefined) this.follow([[0, planned]], [], [metadata]);
     return this.advance();
   }
 
   /**
-   * Set the container's index; returns the views that stored bytes complete.
+   * Set the container's index, and its bounds of the errors of windows where the target is one; returns the views that
+   * stored bytes complete.
    *
    * @throws OptionError if the container cannot meet the target.
    */
-  learn(index: Index): View[] {
+  learn(index: Index, windows: WindowErrors | null = null): View[] {
+    this.windows = windows;
     this.makePlan(index);
     return this.advance();
   }
@@ -145,7 +157,12 @@ export class ReceiverState<View extends ViewInfo> {
     const store = this.keep();
     const capacity = new Capacity(this.decoder.capacity.maxVertices);
     const found = stepped(indexSteps(size, capacity), store, size);
-    return isPlace(found) ? { missing: found } : { views: this.learn(found) };
+    if (isPlace(found)) return { missing: found };
+    const section = this.target.region === undefined ? null : windowSection(found);
+    if (section === null) return { views: this.learn(found) };
+    for (const missing of store.ranges.missing(section.offset, section.length)) return { missing };
+    const data = store.read(section.offset, section.length);
+    return { views: this.learn(found, windowErrorsFrom(data, section.offset, found.header)) };
   }
 
   /**
@@ -172,7 +189,8 @@ export class ReceiverState<View extends ViewInfo> {
     if (!sameRegion(target.region, this.target.region) || names(target) !== names(this.target)) {
       throw new OptionError("expected a target with the same region and attributes, got others: open another stream");
     }
-    if (this.index !== undefined) plan(this.index, target);
+    const { windows, bounded } = this;
+    if (this.index !== undefined) plan(this.index, target, undefined, { windows, bounded });
     this.decoder.focus(target.first ?? null);
     this.target = target;
     this.ended = this.stoppedFor = this.deadline = undefined;
@@ -210,11 +228,27 @@ export class ReceiverState<View extends ViewInfo> {
         this.copy(start, slice);
         this.fed.add(start, length);
         views.push(...this.decoder.feedAt(start, slice));
-        if (this.index === undefined && this.decoder.index !== null) this.makePlan(this.decoder.index);
+        this.learnFromDecoder();
       }
     }
     views.push(...this.advance());
     return views;
+  }
+
+  /** What the decoder has read of the index is known here too, once the bounds that come behind it are. */
+  private learnFromDecoder(): void {
+    const { index } = this.decoder;
+    if (this.index !== undefined || index === null) return;
+    const windows = this.windowsIn(this.aside, index);
+    if (windows !== undefined) this.learn(index, windows);
+  }
+
+  /** The bounds of errors of windows that the other side sends; null: none; undefined: not all has come. */
+  private windowsIn(store: Store, index: Index): WindowErrors | null | undefined {
+    const place = windowSection(index);
+    if (this.service?.[2] === undefined || place === null) return null;
+    if (!store.ranges.covers(place.offset, place.length)) return undefined;
+    return windowErrorsFrom(store.read(place.offset, place.length), place.offset, index.header);
   }
 
   /** The bytes that are still to come, in order; once the index is known. */
@@ -263,10 +297,13 @@ export class ReceiverState<View extends ViewInfo> {
   }
 
   private makePlan(index: Index): void {
-    const chosen = plan(index, this.target);
+    const { windows, bounded } = this;
+    const chosen = plan(index, this.target, undefined, { windows, bounded });
     this.index = index;
     this.learning = false;
-    this.service = [placeOf(index.index), placeOf(index.metadata)];
+    const section = chosen.before.find((place) => place !== index.index);
+    const places = [placeOf(index.index), placeOf(index.metadata)] as const;
+    this.service = section === undefined ? places : [...places, placeOf(section)];
     this.planned = endOf(chosen).bytes;
     this.plan = chosen;
     this.follow(chosen.ranges.map(placeOf), chosen.before.map(placeOf), chosen.after.map(placeOf));
@@ -281,19 +318,25 @@ export class ReceiverState<View extends ViewInfo> {
     if (this.store !== undefined) this.order = all.flatMap((place) => [...this.fed.missing(...place)]);
   }
 
+  private get servicePlaces(): Place[] {
+    if (this.service === undefined) return [];
+    const [index, metadata, windows] = this.service;
+    return windows === undefined ? [index, metadata] : [index, metadata, windows];
+  }
+
   /** Add to `received` what of a range belongs to the surface, once that is known. */
   private count(offset: number, length: number): void {
     if (this.planned === undefined) return;
     const belongs =
       this.surface !== undefined
         ? this.surface.overlap(offset, length)
-        : new RangeSet(this.service ?? []).missing(offset, length);
+        : new RangeSet(this.servicePlaces).missing(offset, length);
     for (const [, size] of belongs) this.received += size;
   }
 
   /** Keep of what the decoder is given at once the parts that tell where things stand. */
   private copy(offset: number, data: Uint8Array): void {
-    for (const [start, length] of [[0, HEAD] as Place, ...(this.service ?? [])]) {
+    for (const [start, length] of [[0, HEAD] as Place, ...this.servicePlaces]) {
       const first = Math.max(start, offset);
       const last = Math.min(start + length, offset + data.length);
       if (first < last) this.aside.write(first, data.slice(first - offset, last - offset));
@@ -353,7 +396,9 @@ export class ReceiverState<View extends ViewInfo> {
     const { capacity } = this.decoder;
     capacity.promise(0, [], { masked: 0, tables: header.tables });
     capacity.take(INDEX_GROWTH * length);
-    return this.learn(indexFrom(store.read(offset, length), offset, header));
+    const index = indexFrom(store.read(offset, length), offset, header);
+    const windows = this.windowsIn(store, index);
+    return windows === undefined ? undefined : this.learn(index, windows);
   }
 }
 

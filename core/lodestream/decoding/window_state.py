@@ -1,0 +1,118 @@
+"""A window on its way: what its errors do not exceed, and what is taken for known outside of it.
+
+Errors are those of the whole surface's layers, in cells or altogether. So a window must be reconstructed as it would be
+within the whole: a level counts as known only from the layer on with which all of it is, wherever its tiles lie.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.frames import whole_section
+from ..container.model import Header, Index
+from ..container.slices import State
+from ..entropy.bitplanes import pass_count
+from ..entropy.dequantize import UNANNOUNCED
+from ..planning.selection import Selection
+from ..planning.window_errors import KIND, WindowFigures, parse_window_errors, window_section
+from ..target import Region
+from .reconstruction import initial_state
+
+__all__ = ["WindowState"]
+
+
+class WindowState:
+    """The window of a decoder.
+
+    Parameters
+    ----------
+    header : Header
+        With its masks.
+    region : ((int, int), (int, int))
+        Rows and columns, half-open.
+    """
+
+    def __init__(self, header: Header, region: Region) -> None:
+        self._header, self._region = header, region
+        self._figures = WindowFigures(header, region)
+        self._outside = ~Selection(region).tiles(header)
+        self._section = bytearray()
+        self._index: Index | None = None
+        self._known_from: NDArray[np.int64] | None = None
+
+    def follow(self, index: Index) -> None:
+        """Learn from the index with which layer each level is known."""
+        self._index, self._known_from = index, _known_from(index)
+
+    def take(self, offset: int, data: bytes) -> bool:
+        """Take bytes of the section with the errors of windows; returns whether they belong to it.
+
+        Raises
+        ------
+        CorruptStreamError
+            When the section is damaged.
+        """
+        place = None if self._index is None else window_section(self._index)
+        if place is None or not place.offset <= offset < place.end:
+            return False
+        if offset == place.offset + len(self._section):
+            self._section += data
+            if len(self._section) == place.length:
+                frame = whole_section(bytes(self._section), place.offset, KIND)
+                windows = parse_window_errors(frame.payload, frame.payload_offset, self._header)
+                self._figures = WindowFigures(self._header, self._region, windows)
+        return True
+
+    def figures(self, made: State) -> tuple[float, float, bool]:
+        """RMS and maximum error of a state in the window, and whether they are bounds."""
+        last = self._header.layer_count - 1
+        layer = made.number if made.whole_level < 0 and made.number <= last else None
+        rms, max_error = self._figures.within(made.rms, made.max_error, layer)
+        return rms, max_error, not self._figures.whole and max_error != 0 and not math.isnan(rms)
+
+    def is_last_layer(self, made: State) -> bool:
+        """Whether nothing but residual is missing of the whole surface in this state."""
+        in_turn = made.whole_level < 0 and not math.isnan(made.rms)
+        return in_turn and made.number >= self._header.layer_count - 1
+
+    def put_outside(self, made: State, state: NDArray[np.int8]) -> None:
+        """Set what tiles outside the window tell of their levels; int8, shape (tile, channel); changed."""
+        outside = self._outside
+        if made.complete or math.isnan(made.rms):
+            state[outside] = 0
+        elif made.whole_level >= 0:
+            told = initial_state(self._header)
+            told[: self._header.layout.tiles_of(made.whole_level).stop] = 0
+            state[outside] = told[outside]
+        elif self._known_from is not None:
+            levels = np.array([tile.level for tile in self._header.layout.tiles])
+            told = initial_state(self._header)
+            told[self._known_from[levels] <= made.number] = 0
+            state[outside] = told[outside]
+        # Else the file comes in its own order, and all of the state is known as it is.
+
+
+def _known_from(index: Index) -> NDArray[np.int64]:
+    """The first layer with which every tile of a level is known, int64, shape (level, channel)."""
+    header = index.header
+    levels = [tile.level for tile in header.layout.tiles]
+    unknown = initial_state(header) == UNANNOUNCED
+    left = np.zeros(unknown.shape, np.int64)
+    first = np.zeros((header.levels + 1, header.channels), np.int64)
+    unannounced, missing, known = unknown.data, left.data, first.data
+    for segment in index.segments:
+        place = segment.tile, segment.channel
+        if unannounced[place]:
+            unannounced[place], missing[place] = False, pass_count(segment.top)
+        missing[place] -= segment.passes
+        known[levels[segment.tile], segment.channel] = segment.layer
+    for level in range(header.levels + 1):
+        tiles = header.layout.tiles_of(level)
+        own = slice(tiles.start, tiles.stop)
+        # What no layer has named is known with the last one; what has passes left is never known.
+        first[level, unknown[own].any(axis=0)] = header.layer_count - 1
+        first[level, left[own].any(axis=0)] = header.layer_count
+    return first
