@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import InputError
 from ..surface import Closed
 from .axis import AxisStep, axis_lengths, axis_step
@@ -285,6 +288,11 @@ class Layout:
     def tiles_of(self, level: int) -> range:
         """Numbers of the tiles of a level."""
         return self._tile_ranges[level]
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """The first tile of each level, int64, shape (level,)."""
+        return np.array([own.start for own in self._tile_ranges])
 
     def points(self, level: int) -> int:
         """Of all grids at a level."""
