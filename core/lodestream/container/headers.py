@@ -234,8 +234,9 @@ def _parse_predictors(
         start, count = fields.at, fields.varint()
         if count != len(own):
             raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
-        for level, axis in own:
-            predictors[channel, level, axis] = fields.unpack("bb")
+        if own:
+            levels, axes = zip(*own, strict=True)
+            predictors[channel, levels, axes] = np.frombuffer(fields.take(2 * count), np.int8).reshape(-1, 2)
     if (predictors == -128).any():
         raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
     return predictors

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
+from ..container.sections import Entry
 from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
 from ..entropy.tiles import Reading, Tiles, TileTable
@@ -59,10 +60,10 @@ class Reconstruction:
         """Segments added so far."""
         return self._added
 
-    def add(self, segment: Coded) -> None:
-        """Take a segment; nothing is decoded yet."""
-        self._queue[self._added] = segment
-        self._added += 1
+    def add(self, segments: Sequence[Coded]) -> None:
+        """Take segments; nothing is decoded yet."""
+        self._queue.update(enumerate(segments, self._added))
+        self._added += len(segments)
 
     def correct(self, number: int, data: bytes, offset: int) -> None:
         """Take a chunk of the residual section, which stands at ``offset``."""
@@ -267,6 +268,24 @@ class Progress:
             raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
         self.state[tile, channel] = below - passes
         return below - 1
+
+    def advance_all(self, entries: Sequence[Entry], payload: memoryview, start: int, offset: int) -> list[Coded]:
+        """Note the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
+
+        The payload stands at ``offset``. See `advance`.
+        """
+        state, segments = self.state, []
+        for tile, channel, top, passes, length in entries:
+            below = state[tile, channel]
+            if top or below == UNANNOUNCED or passes > below:
+                first = self.advance(tile, channel, top, passes, offset + start)
+            else:  # goes on with a tile that is known, which is all that `advance` looks at: there are many segments
+                state[tile, channel] = below - passes
+                first = below - 1
+            end = start + length
+            segments.append(Coded(tile, channel, first, passes, bytes(payload[start:end]), offset + start))
+            start = end
+        return segments
 
     def snapshot(self, whole: bool) -> NDArray[np.int8]:
         """The present state, int8, shape (tile, channel).

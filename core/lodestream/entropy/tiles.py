@@ -15,7 +15,7 @@ from ..kernels import PASSES_STATE
 from ..quantization.band_steps import Quantiser, band_step
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
-from .dequantize import UNANNOUNCED, spread_bands
+from .dequantize import spread_bands
 
 __all__ = ["Reading", "Run", "TileTable", "Tiles", "gather"]
 
@@ -178,16 +178,18 @@ class Tiles:
 
     def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
         """What decodes the runs up to each of ``ends``, from the end before it."""
-        bands = np.array(self.table.first)
-        lengths = [len(run.data) for run in runs]
-        described = [(run.tile, run.first, run.last, length) for run, length in zip(runs, lengths, strict=True)]
-        tile, first, last, length = np.array(described, np.int64).reshape(-1, 4).T
-        count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
-        table = np.stack([bands[tile], count, tile, first, last, start, length, tile >= self.large], 1)
+        described, start, bands = [], 0, self.table.first
+        for tile, first, last, data in runs:
+            length = len(data)
+            count = bands[tile + 1] - bands[tile]
+            described.append((bands[tile], count, tile, first, last, start, length, tile >= self.large))
+            start += length
+        table = np.array(described, np.int64).reshape(-1, 8)
         made, begin = [], 0
         for end in ends:
             own = table[begin:end]
-            own[:, RUN_START] -= own[:1, RUN_START].copy()
+            if begin:
+                own[:, RUN_START] -= own[:1, RUN_START].copy()
             made.append(Reading(self, own, [run.data for run in runs[begin:end]]))
             begin = end
         return made

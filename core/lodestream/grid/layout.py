@@ -290,6 +290,11 @@ class Layout:
         return self._tile_ranges[level]
 
     @cached_property
+    def parents(self) -> list[int]:
+        """The number of each tile's parent, -1 where it has none."""
+        return [tile.parent for tile in self.tiles]
+
+    @cached_property
     def starts(self) -> NDArray[np.int64]:
         """The first tile of each level, int64, shape (level,)."""
         return np.array([own.start for own in self._tile_ranges])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.axis import AxisStep
-from ..grid.layout import Grid, Layout
+from ..grid.layout import REMEMBERED, Grid, Layout
 
 __all__ = [
     "COEFFICIENT_BITS",
@@ -29,7 +31,8 @@ FIT_NODES = 24
 INTERFACES = 2
 
 
-def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
+@lru_cache(maxsize=REMEMBERED)
+def fitted_steps(layout: Layout) -> tuple[tuple[int, int], ...]:
     """(coarser level, axis) of every step with an (a, b) of its own: along an axis 0 or 1 that is long enough.
 
     All patches have it in common; all interfaces have another in common, whose axis is `INTERFACES`.
@@ -42,7 +45,7 @@ def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
                 if is_fitted(step):
                     fitted.add(INTERFACES if grid.interface else axis)
         found += [(level, axis) for axis in sorted(fitted)]
-    return found
+    return tuple(found)
 
 
 def default_predictors(layout: Layout) -> NDArray[np.int8]:
