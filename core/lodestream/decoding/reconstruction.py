@@ -38,6 +38,10 @@ __all__ = [
 ]
 
 
+#: Bytes of segments that are worth decoding before anybody asks for points.
+_WORTH = 1 << 13
+
+
 class Reconstruction:
     """Decodes segments when a reconstruction asks for them, in the order in which they were added.
 
@@ -69,6 +73,16 @@ class Reconstruction:
         """Take a chunk of the residual section, which stands at ``offset``."""
         if data:
             self._chunks[number] = data, offset
+
+    def prepare(self, length: int) -> None:
+        """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
+        with self._lock:
+            waiting = 0
+            for number in range(self._taken, length):
+                waiting += len(self._queue[number].data)
+                if waiting >= _WORTH:
+                    self._decode(length)
+                    return
 
     def blocks(
         self,
