@@ -36,8 +36,8 @@ Band = tuple[int, int]
 
 #: Most rows of a band; of wide ones the fewest, and values where it has more rows than these.
 _ROWS, _FEW_ROWS, _VALUES = 512, 128, 1 << 20
-#: Values of a level that stay in the cache as a whole, so that bands would only be more calls.
-_SMALL = 1 << 16
+#: Values of a level that one thread makes as a whole: bands would only be more calls.
+_SMALL = 1 << 20
 #: Least values of a level that threads share.
 _SHARED = 1 << 17
 #: Values that a thread keeps room for.
@@ -72,8 +72,9 @@ def reconstruct_channel(
 def has_bands(header: Header, level: int) -> bool:
     """Whether a level is made by bands: a large one of one grid whose rows, if they change in its step, do not wrap."""
     layout = header.layout
-    stepped = len(layout.grids) == 1 and level > 0
-    return stepped and layout.points(level) > _SMALL and not layout.steps(0, level)[0].wraps
+    if len(layout.grids) > 1 or level == 0 or layout.steps(0, level)[0].wraps:
+        return False
+    return layout.points(level) > (_SMALL if threads() == 1 else min(_SMALL, _SHARED))
 
 
 def values_by_bands(

@@ -166,6 +166,12 @@ class Layout:
         """The layout of one block that shares no side."""
         return Layout([Grid(shape, closed)], tile)
 
+    @staticmethod
+    @lru_cache(maxsize=REMEMBERED)
+    def of(grids: tuple[Grid, ...], tile: tuple[int, int]) -> Layout:
+        """The layout of some grids."""
+        return Layout(grids, tile)
+
     def shape(self, grid: int, level: int) -> tuple[int, int]:
         """Rows and columns of a grid at a level."""
         return self._shapes[grid][level]

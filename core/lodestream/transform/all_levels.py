@@ -1,4 +1,4 @@
-"""All levels of the only grid of a surface undone in one call of a kernel, for the price of one.
+"""All levels of the only grid of a surface undone in one call of a kernel.
 
 Small surfaces have many levels of few values, and so have prefixes of large ones, whose finest levels hold no details.
 """

@@ -80,8 +80,9 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
     lines = values.shape[1 - axis]
     work = np.empty(work_room(step, axis, lines), np.int32)
     table = step.extension(REACH)
-    for part in _parts(axis, lines, step.length):
-        plane = values[:, part] if axis == 0 else values[part]
+    whole = lines * step.length <= _AT_ONCE
+    planes = (values[:, part] if axis == 0 else values[part] for part in _parts(axis, lines, step.length))
+    for plane in [values] if whole else planes:
         done = 0
         while done < step.run:  # very long axes take several calls, between which an interruption is heard
             done = kernels.lift(inverse, axis, plane, step.midpoints, step.run, table, *predictor, done, work)
