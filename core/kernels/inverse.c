@@ -1,5 +1,5 @@
-/* All levels of one plane undone, one step after another (docs/format.md, section 8): small surfaces have many levels of
- * few values, of which a call each would take longer than what it does. */
+/* All levels of one plane undone, one step after another (docs/format.md, section 8): small surfaces have many levels
+ * of few values, of which a call each would take longer than what it does. */
 #include "lodestream.h"
 
 enum {
