@@ -27,7 +27,7 @@ from ..transform.pyramid import PADDING, empty, inverse, refine
 from .crop import AxisCrop, crop_axis
 from .levels import known_levels
 
-__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "values_by_bands"]
+__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "values_of_grid"]
 
 #: Lattice coordinates of each grid, over two to the power of the second.
 Coordinates = tuple[list[NDArray[np.int32]], int]
@@ -77,10 +77,10 @@ def has_bands(header: Header, level: int) -> bool:
     return layout.points(level) > (_SMALL if threads() == 1 else min(_SMALL, _SHARED))
 
 
-def values_by_bands(
+def values_of_grid(
     header: Header, tiles: Sequence[Tiles], state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
 ) -> list[NDArray[Any]]:
-    """Values of a level that `has_bands`: of the points and of each attribute, shape (row, column, component).
+    """Values of a level of the only grid: of the points and of each attribute, shape (row, column, component).
 
     ``tiles`` are of each channel, ``state`` is int8, shape (tile, channel), ``chosen`` bool, shape (channel,): channels
     that are not chosen are 0.
@@ -94,6 +94,16 @@ def values_by_bands(
         made((*shape, count), header.dtypes[channel])
         for count, channel in zip(counts, accumulate(counts, initial=0), strict=False)
     ]
+
+    def show_whole(channel: int) -> None:
+        number, component = places[channel]
+        own = tiles[channel], state[:, channel]
+        (made,), fraction = reconstruct_channel(header, channel, *own, level)
+        store_values(header.lattices[channel], (made, fraction), arrays[number], component)
+
+    if not has_bands(header, level):
+        spread(show_whole, wanted)
+        return arrays
 
     def level_of(channel: int) -> _Level:
         own = tiles[channel], state[:, channel]

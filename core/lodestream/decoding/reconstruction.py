@@ -24,7 +24,7 @@ from ..residual import chunk_coder
 from ..target import Region
 from ..transform.predictors import COEFFICIENT_BITS
 from .batches import Coded, batch_length, rounds_of
-from .channels import Coordinates, has_bands, reconstruct_channel, values_by_bands
+from .channels import Coordinates, reconstruct_channel, values_of_grid
 from .crop import reconstruct_window
 
 __all__ = [
@@ -116,11 +116,11 @@ class Reconstruction:
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
     ) -> list[Values]:
         """The values of all blocks before residual and holes."""
-        if not has_bands(self.header, level):
+        if len(self.header.layout.grids) > 1:
             return to_values(self.header, self.reconstructions(length, state, level, chosen), level)
         with self._lock:
             self._decode(length)
-            arrays = values_by_bands(self.header, self._tiles, state, level, chosen)
+            arrays = values_of_grid(self.header, self._tiles, state, level, chosen)
         return [Values(_arranged(self.header, level, [[array] for array in arrays], 0))]
 
     def reconstructions(

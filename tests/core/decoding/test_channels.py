@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.decoding import channels
-from lodestream.decoding.channels import has_bands, values_by_bands
+from lodestream.decoding.channels import has_bands, values_of_grid
 from lodestream.decoding.reconstruction import Reconstruction, to_values
 from lodestream.parallel import VARIABLE
 
@@ -78,7 +78,7 @@ def test_channels_that_are_not_chosen_are_zero() -> None:
     decoder._reconstruction._decode(decoder._reconstruction.length)
     state = np.zeros((len(header.layout.tiles), header.channels), np.int8)
     chosen = np.array([True, False, True])
-    arrays = values_by_bands(header, tiles, state, header.levels, chosen)
+    arrays = values_of_grid(header, tiles, state, header.levels, chosen)
     assert [bool(array.any()) for array in arrays] == chosen.tolist()
     np.testing.assert_array_equal(arrays[0][..., 0], heights)
 
