@@ -102,8 +102,8 @@ def _streamed(url: str, error: float | None) -> NDArray[Any]:
     target = ls.Target(until_rms=ls.Tolerance(error, relative=True)) if error else None
     view = None
     with sync.connect(url, target=target) as stream:
-        for view in stream:  # noqa: B007 - the last one is what was waited for
-            pass
+        for view in stream:
+            view.prepare()  # while the rest is on its way; the last one is what was waited for
     assert view is not None
     return view.points
 

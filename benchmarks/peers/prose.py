@@ -30,8 +30,9 @@ How long a receiver waits for points with an RMS error, or for every value: the 
 on one core. The link is one in figures: no handshake, no round trip, nothing lost.
 
 - *Ours* is the one exact stream, made without naming an error, decoded layer by layer as it arrives: a layer when it
-  has come and the ones before are decoded. At the first layer with the error the points are made, once. So what is
-  counted after the last byte is that layer, the points, and whatever the decoder had left until points are asked for.
+  has come and the ones before are decoded, its segments when 8 KiB of them wait (`View.prepare`). At the first layer
+  with the error the points are made, once. So what is counted after the last byte is that layer, the segments that
+  wait, and the points.
 - *A peer* sends the stream that meets the error, and it is decoded when it is there. Each coder has all its settings
   and what lies between two of them; the best of all coders is taken in each cell. What turns whole numbers back into
   values is not counted, where a coder has whole numbers; ours gives values.

@@ -42,7 +42,7 @@ _X86_64_V2 = ["-msse4.2", "-mpopcnt", "-mcx16", "-msahf"]
 #: And what x86-64-v3 has beyond it, for the second library.
 _X86_64_V3 = ["-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovbe"]
 #: All that the second library holds: what takes 1.3 times as long without it, or longer.
-WIDE = ("library.c", "lifting.c", "predictor_fit.c", "values.c")
+WIDE = ("library.c", "inverse.c", "lifting.c", "predictor_fit.c", "values.c")
 
 #: The machines for which one wheel serves every Linux.
 PORTABLE = ("x86_64", "aarch64")

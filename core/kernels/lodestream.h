@@ -58,6 +58,23 @@ LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t ro
                            int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a,
                            int64_t b, int64_t from, int32_t *work, int64_t work_count);
 
+/* inverse.c ------------------------------------------------------------------------------------------------------ */
+
+#define LODE_INVERSE_STEP 48
+#define LODE_INVERSE_NOTHING 0
+#define LODE_INVERSE_REFINE 3
+
+/* Inverse steps of the lifting one after another, in place, in the first rows and columns of a plane.
+ *
+ * steps: rows of LODE_INVERSE_STEP: what is done, the axis, rows and columns of the plane that take part, and
+ *        `midpoints`, `run`, `a`, `b` and `table` as lode_lift takes them. What is done is one of
+ *        LODE_INVERSE_NOTHING; 1 and LODE_LIFT_BARE, as for lode_lift; LODE_INVERSE_REFINE: values are kept within
+ *        +-2^24 and multiplied by 8, and only rows and columns matter.
+ * work:  as much as the step takes that needs most.
+ * Together the steps should have no more than some million values. Returns 0. */
+LODE_API int64_t lode_inverse(const int64_t *steps, int64_t steps_count, int32_t *x, int64_t rows, int64_t columns,
+                              int64_t pitch, int32_t *work, int64_t work_count);
+
 /* mask.c --------------------------------------------------------------------------------------------------------- */
 
 /* Code groups `first` to `last` - 1 of a mask of `rows` x `columns` points: LODE_MASK_GROUP points of a row, fewer at

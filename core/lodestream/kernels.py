@@ -22,6 +22,9 @@ __all__ = [
     "DIFFERENCES_MEMORY",
     "DIFFERENCES_MODEL",
     "INDICES",
+    "INVERSE_NOTHING",
+    "INVERSE_REFINE",
+    "INVERSE_STEP",
     "LIFT_STRIP",
     "MASK_GROUP",
     "MASK_MODEL",
@@ -37,6 +40,7 @@ __all__ = [
     "choose",
     "classify",
     "differences",
+    "inverse",
     "lift",
     "lzf",
     "mask",
@@ -273,6 +277,11 @@ _F32, _F64 = np.float32, np.float64
 LIFT_STRIP = 64
 LIFT_BARE = 2
 lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
+
+# inverse.c
+INVERSE_STEP = 48
+INVERSE_NOTHING, INVERSE_REFINE = 0, 3
+inverse = Kernel("inverse", reads(_I64), writes_plane(_I32), writes(_I32))
 
 # mask.c
 MASK_GROUP = 16

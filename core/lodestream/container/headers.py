@@ -168,7 +168,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
         raise CorruptStreamError(f"expected an extent of 0 or more, got {extent}", offset)
     lattices = tuple(_parse_lattice(fields) for _ in range(channels))
     # What follows is counted in levels, so that the levels must be known to read on.
-    layout = Layout.single(*blocks[0], tile) if arrangement is None else Layout(grids_of(arrangement), tile)
+    layout = Layout.single(*blocks[0], tile) if arrangement is None else Layout.of(tuple(grids_of(arrangement)), tile)
     empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
     predictors = _parse_predictors(fields, layout, channels, min(point_channels, 3), offset)
     fields.end()
@@ -234,8 +234,9 @@ def _parse_predictors(
         start, count = fields.at, fields.varint()
         if count != len(own):
             raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
-        for level, axis in own:
-            predictors[channel, level, axis] = fields.unpack("bb")
+        if own:
+            levels, axes = zip(*own, strict=True)
+            predictors[channel, levels, axes] = np.frombuffer(fields.take(2 * count), np.int8).reshape(-1, 2)
     if (predictors == -128).any():
         raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
     return predictors

@@ -208,7 +208,7 @@ class Header:
     def layout(self) -> Layout:
         """Levels, bands and tiles."""
         if self.arrangement is not None:
-            return Layout(grids_of(self.arrangement), self.tile)
+            return Layout.of(tuple(grids_of(self.arrangement)), self.tile)
         return Layout.single(*self.blocks[0], self.tile)
 
     @cached_property

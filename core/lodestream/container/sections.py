@@ -11,7 +11,7 @@ import msgpack
 from ..errors import CorruptStreamError, UnsupportedVersionError
 from ..transform.predictors import COEFFICIENT_BITS
 from .chunks import chunk_places
-from .fields import FieldReader, FieldWriter
+from .fields import LARGEST, FieldReader, FieldWriter
 from .metadata import check_length, packed
 from .model import ByteRange, Errors, Header
 
@@ -137,27 +137,47 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Error
     """
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
-    channels = header.channels
+    channels, data = header.channels, bytes(payload)
     units = len(header.layout.tiles) * channels
-    entries, unit = [], 0
-    for _ in range(fields.varint(units)):
-        start, first = fields.at, fields.byte()
-        passes = (first & 7) + 1
-        if passes > _PASSES:
-            passes += fields.varint(2 * COEFFICIENT_BITS)
-        skip = first >> 4
-        if skip == _SKIP:
-            skip += fields.varint(units)
-        length = fields.varint()
-        top = fields.byte() if first & 8 else 0
-        unit += skip
-        if unit >= units or top > COEFFICIENT_BITS or length < 1 or (first & 8 and not top):
-            raise CorruptStreamError(f"expected one of {units} units and at most 28 planes, got {unit}, {top}", start)
-        entries.append(Entry(*divmod(unit, channels), top, passes, length))
-        unit += 1
-    if sum(entry.length for entry in entries) != len(payload) - fields.place:
+    count = fields.varint(units)
+    entries, unit, place, total = [], 0, fields.place, 0
+    # There are many entries: what a field nearly always is, one byte, is read without a call.
+    try:
+        for _ in range(count):
+            start, first = place, data[place]
+            place += 1
+            passes, skip, top = (first & 7) + 1, first >> 4, 0
+            if passes > _PASSES:
+                more, place = _varint(fields, place, 2 * COEFFICIENT_BITS)
+                passes += more
+            if skip == _SKIP:
+                more, place = _varint(fields, place, units)
+                skip += more
+            length = data[place]
+            place += 1
+            if length > 127:
+                length, place = _varint(fields, place - 1, LARGEST)
+            if first & 8:
+                top = data[place]
+                place += 1
+            unit += skip
+            if unit >= units or top > COEFFICIENT_BITS or length < 1 or (first & 8 and not top):
+                problem = f"expected one of {units} units and at most 28 planes, got {unit}, {top}"
+                raise CorruptStreamError(problem, offset + start)
+            entries.append(Entry(unit // channels, unit % channels, top, passes, length))
+            total += length
+            unit += 1
+    except IndexError:
+        raise CorruptStreamError("expected 1 more bytes, got 0", offset + place) from None
+    if total != len(data) - place:
         raise CorruptStreamError("expected segments as long as the layer's table says, got another length", offset)
-    return errors, entries, fields.place
+    return errors, entries, place
+
+
+def _varint(fields: FieldReader, place: int, limit: int) -> tuple[int, int]:
+    """A whole number that stands at ``place``, and where the next field does."""
+    fields.place = place
+    return fields.varint(limit), fields.place
 
 
 def serialize_metadata(values: dict[str, Any]) -> bytes:

@@ -9,15 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
+from operator import itemgetter
 from typing import NamedTuple
 
 from ..entropy.tiles import Reading, Run, Tiles
 from ..grid.layout import Layout
+from ..parallel import threads
 
 __all__ = ["Coded", "batch_length", "rounds_of"]
 
 #: Bytes of segments that are worth a thread's while.
 _WORTH = 1 << 12
+#: Bytes of segments that one thread takes at once: more would stand in memory a second time.
+_LITTLE = 1 << 16
+
+_tile = itemgetter(0)
 
 
 class Coded(NamedTuple):
@@ -37,30 +43,35 @@ def batch_length(layout: Layout, segments: Sequence[Coded]) -> int:
     A segment that comes after a child has looked for its planes in vain, as no writer of ours puts it, begins the next
     batch: what it tells must not be known before.
     """
-    lowest: dict[tuple[int, int], int] = {}  # the lowest plane that was looked at of a tile of a channel
-    for number, segment in enumerate(segments):
-        if segment.first >> 1 >= lowest.get((segment.tile, segment.channel), segment.first + 1):
+    parents, channels = layout.parents, 1 + max((segment.channel for segment in segments), default=0)
+    lowest: dict[int, int] = {}  # the lowest plane that was looked at, by the number of a unit
+    for number, (tile, channel, first, passes, _, _) in enumerate(segments):
+        seen = lowest.get(tile * channels + channel)
+        if seen is not None and first >> 1 >= seen:
             return number
-        parent = layout.tiles[segment.tile].parent, segment.channel
-        plane = (segment.first - segment.passes + 1) >> 1
-        if parent[0] >= 0 and plane < lowest.get(parent, plane + 1):
-            lowest[parent] = plane
+        parent, plane = parents[tile], (first - passes + 1) >> 1
+        if parent >= 0:
+            above = parent * channels + channel
+            if plane < lowest.get(above, plane + 1):
+                lowest[above] = plane
     return len(segments)
 
 
 def rounds_of(channels: Sequence[Tiles], segments: Sequence[Coded]) -> list[list[Reading]]:
     """What decodes a batch: rounds one after another, in each of them readings that may run at the same time."""
     runs: list[list[Run]] = [[] for _ in channels]
-    for segment in segments:
-        last = segment.first - segment.passes + 1
-        runs[segment.channel].append(Run(segment.tile, segment.first, last, segment.data))
+    for tile, channel, first, passes, data, _ in segments:
+        runs[channel].append(Run(tile, first, first - passes + 1, data))
     every = [list(_rounds(tiles, own)) for tiles, own in zip(channels, runs, strict=True) if own]
     return [[reading for some in of for reading in some] for of in zip_longest(*every, fillvalue=())]
 
 
 def _rounds(tiles: Tiles, runs: list[Run]) -> Iterator[list[Reading]]:
     """The rounds of one channel: one reading for all levels that have little, several for a level that has more."""
-    runs.sort(key=lambda run: run.tile)
+    runs.sort(key=_tile)
+    if sum([len(run.data) for run in runs]) <= (_LITTLE if threads() == 1 else _WORTH):
+        yield tiles.readings(runs, [len(runs)])
+        return
     levels = tiles.table.layout.tiles
     ends: list[list[int]] = [[]]
     begin = 0

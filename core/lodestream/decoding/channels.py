@@ -23,10 +23,11 @@ from ..parallel import spread, threads
 from ..quantization.distortion import store_values
 from ..transform.lifting import FRACTION_BITS, inverse_step
 from ..transform.predictors import predictor
-from ..transform.pyramid import PADDING, allocate, inverse, refine
+from ..transform.pyramid import PADDING, empty, inverse, refine
 from .crop import AxisCrop, crop_axis
+from .levels import known_levels
 
-__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "values_by_bands"]
+__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "values_of_grid"]
 
 #: Lattice coordinates of each grid, over two to the power of the second.
 Coordinates = tuple[list[NDArray[np.int32]], int]
@@ -35,6 +36,8 @@ Band = tuple[int, int]
 
 #: Most rows of a band; of wide ones the fewest, and values where it has more rows than these.
 _ROWS, _FEW_ROWS, _VALUES = 512, 128, 1 << 20
+#: Values of a level that one thread makes as a whole: bands would only be more calls.
+_SMALL = 1 << 20
 #: Least values of a level that threads share.
 _SHARED = 1 << 17
 #: Values that a thread keeps room for.
@@ -49,14 +52,8 @@ def reconstruct_channel(
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
-    canvases: list[NDArray[np.int32]] | None = None,
 ) -> Coordinates:
     """One channel of the grids of ``level`` in a state.
-
-    Parameters
-    ----------
-    canvases : list of int32 arrays, optional
-        Of the shapes of the level, one for each grid, where the reconstruction is made; new ones otherwise.
 
     Returns
     -------
@@ -64,26 +61,26 @@ def reconstruct_channel(
         Lattice coordinates of each grid, interfaces first, over two to the power of the second.
     """
     layout = header.layout
-    whole = 0
-    while whole < level and not state[layout.tiles_of(whole + 1)].any():
-        whole += 1
-    for canvas in canvases or ():
-        canvas.fill(0)
-    coefficients = canvases or [allocate(layout.shape(number, level)) for number in range(len(layout.grids))]
-    tiles.spread_levels(level, state, coefficients, whole)
-    inverse(coefficients, layout, header.predictors[channel], level, whole, channel < header.geometric)
+    whole, bare = known_levels(layout, state, level)
+    coefficients = [empty(layout.shape(number, level)) for number in range(len(layout.grids))]
+    tiles.spread_levels(level, state, coefficients, whole, bare=bare)
+    coordinate = channel < header.geometric
+    inverse(coefficients, layout, header.predictors[channel], level, whole, coordinate, bare=bare)
     return coefficients, FRACTION_BITS if whole < level else 0
 
 
 def has_bands(header: Header, level: int) -> bool:
-    """Whether a level can be made by bands: of one grid whose rows, if they change in its step, do not wrap."""
-    return len(header.layout.grids) == 1 and level > 0 and not header.layout.steps(0, level)[0].wraps
+    """Whether a level is made by bands: a large one of one grid whose rows, if they change in its step, do not wrap."""
+    layout = header.layout
+    if len(layout.grids) > 1 or level == 0 or layout.steps(0, level)[0].wraps:
+        return False
+    return layout.points(level) > (_SMALL if threads() == 1 else min(_SMALL, _SHARED))
 
 
-def values_by_bands(
+def values_of_grid(
     header: Header, tiles: Sequence[Tiles], state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None = None
 ) -> list[NDArray[Any]]:
-    """Values of a level that `has_bands`: of the points and of each attribute, shape (row, column, component).
+    """Values of a level of the only grid: of the points and of each attribute, shape (row, column, component).
 
     ``tiles`` are of each channel, ``state`` is int8, shape (tile, channel), ``chosen`` bool, shape (channel,): channels
     that are not chosen are 0.
@@ -97,6 +94,16 @@ def values_by_bands(
         made((*shape, count), header.dtypes[channel])
         for count, channel in zip(counts, accumulate(counts, initial=0), strict=False)
     ]
+
+    def show_whole(channel: int) -> None:
+        number, component = places[channel]
+        own = tiles[channel], state[:, channel]
+        (made,), fraction = reconstruct_channel(header, channel, *own, level)
+        store_values(header.lattices[channel], (made, fraction), arrays[number], component)
+
+    if not has_bands(header, level):
+        spread(show_whole, wanted)
+        return arrays
 
     def level_of(channel: int) -> _Level:
         own = tiles[channel], state[:, channel]
@@ -189,18 +196,16 @@ class _Level:
         corner[...] = self._nodes[crop.first : crop.first + crop.step.coarse]
         if self.fraction != self._nodes_fraction:
             refine(corner)
-        self._put_details(canvas, crop)
-        for axis, step in ((1, self._steps[1]), (0, crop.step)):
+        if self._announced:
+            self._put_details(canvas, crop)
+        known = canvas if self._announced else canvas[: crop.step.coarse]
+        for axis, step, part in ((1, self._steps[1], known), (0, crop.step, canvas)):
             if step.midpoints:
-                inverse_step(canvas, axis, step, self._rules[axis])
+                inverse_step(part, axis, step, self._rules[axis], not self._announced)
         return canvas[crop.start : crop.start + band[1] - band[0]], self.fraction
 
     def _put_details(self, canvas: NDArray[np.int32], crop: AxisCrop) -> None:
         nodes = crop.step.coarse
-        if not self._announced:
-            canvas[:nodes, self._steps[1].coarse :] = 0
-            canvas[nodes:] = 0
-            return
         for part, first in ((canvas[:nodes], crop.first), (canvas[nodes:], self._steps[0].coarse + crop.first)):
             if len(part):
                 numbers = self._numbers[(self._first < first + len(part)) & (self._last > first)]

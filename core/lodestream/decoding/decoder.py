@@ -267,16 +267,10 @@ class Decoder:
             raise CorruptStreamError(f"expected {header.layer_count} layers, got more", frame.offset)
         errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
         self.capacity.take(_ENTRY * len(entries))
-        segments = []
-        for tile, channel, top, passes, length in entries:
-            place = frame.payload_offset + start
-            first = self._progress.advance(tile, channel, top, passes, place)
-            segments.append(Coded(tile, channel, first, passes, bytes(frame.payload[start : start + length]), place))
-            start += length
-        finest = max((entry.tile for entry in entries), default=0)  # tiles stand by level
+        segments = self._progress.advance_all(entries, frame.payload, start, frame.payload_offset)
+        finest = entries[-1].tile if entries else 0  # tiles stand by level
         self._level = max(self._level, header.layout.tiles[finest].level)
-        for segment in segments:
-            self._reconstruction.add(segment)
+        self._reconstruction.add(segments)
         last = number + 1 == header.layer_count
         complete = last and not header.corrected
         whole = complete or (last and self._level == header.levels)
@@ -393,7 +387,7 @@ class Decoder:
                 known = bool(self._progress.top[item.tile, item.channel])
                 top = 0 if known else item.top
                 first = self._progress.advance(item.tile, item.channel, top, item.passes, place)
-                self._reconstruction.add(Coded(item.tile, item.channel, first, item.passes, payload, place))
+                self._reconstruction.add([Coded(item.tile, item.channel, first, item.passes, payload, place)])
                 state = self._slices.hold(item)
             if state is not None:
                 self._show(state)

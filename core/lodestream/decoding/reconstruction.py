@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
+from ..container.sections import Entry
 from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
 from ..entropy.tiles import Reading, Tiles, TileTable
@@ -23,7 +24,7 @@ from ..residual import chunk_coder
 from ..target import Region
 from ..transform.predictors import COEFFICIENT_BITS
 from .batches import Coded, batch_length, rounds_of
-from .channels import Coordinates, has_bands, reconstruct_channel, values_by_bands
+from .channels import Coordinates, reconstruct_channel, values_of_grid
 from .crop import reconstruct_window
 
 __all__ = [
@@ -35,6 +36,10 @@ __all__ = [
     "reconstruct_channel",
     "to_values",
 ]
+
+
+#: Bytes of segments that are worth decoding before anybody asks for points.
+_WORTH = 1 << 13
 
 
 class Reconstruction:
@@ -59,15 +64,25 @@ class Reconstruction:
         """Segments added so far."""
         return self._added
 
-    def add(self, segment: Coded) -> None:
-        """Take a segment; nothing is decoded yet."""
-        self._queue[self._added] = segment
-        self._added += 1
+    def add(self, segments: Sequence[Coded]) -> None:
+        """Take segments; nothing is decoded yet."""
+        self._queue.update(enumerate(segments, self._added))
+        self._added += len(segments)
 
     def correct(self, number: int, data: bytes, offset: int) -> None:
         """Take a chunk of the residual section, which stands at ``offset``."""
         if data:
             self._chunks[number] = data, offset
+
+    def prepare(self, length: int) -> None:
+        """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
+        with self._lock:
+            waiting = 0
+            for number in range(self._taken, length):
+                waiting += len(self._queue[number].data)
+                if waiting >= _WORTH:
+                    self._decode(length)
+                    return
 
     def blocks(
         self,
@@ -101,11 +116,11 @@ class Reconstruction:
         self, length: int, state: NDArray[np.int8], level: int, chosen: NDArray[np.bool_] | None
     ) -> list[Values]:
         """The values of all blocks before residual and holes."""
-        if not has_bands(self.header, level):
+        if len(self.header.layout.grids) > 1:
             return to_values(self.header, self.reconstructions(length, state, level, chosen), level)
         with self._lock:
             self._decode(length)
-            arrays = values_by_bands(self.header, self._tiles, state, level, chosen)
+            arrays = values_of_grid(self.header, self._tiles, state, level, chosen)
         return [Values(_arranged(self.header, level, [[array] for array in arrays], 0))]
 
     def reconstructions(
@@ -267,6 +282,24 @@ class Progress:
             raise CorruptStreamError(f"expected at most {below} more passes of tile {tile}, got {passes}", offset)
         self.state[tile, channel] = below - passes
         return below - 1
+
+    def advance_all(self, entries: Sequence[Entry], payload: memoryview, start: int, offset: int) -> list[Coded]:
+        """Note the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
+
+        The payload stands at ``offset``. See `advance`.
+        """
+        state, segments = self.state, []
+        for tile, channel, top, passes, length in entries:
+            below = state[tile, channel]
+            if top or below == UNANNOUNCED or passes > below:
+                first = self.advance(tile, channel, top, passes, offset + start)
+            else:  # goes on with a tile that is known, which is all that `advance` looks at: there are many segments
+                state[tile, channel] = below - passes
+                first = below - 1
+            end = start + length
+            segments.append(Coded(tile, channel, first, passes, bytes(payload[start:end]), offset + start))
+            start = end
+        return segments
 
     def snapshot(self, whole: bool) -> NDArray[np.int8]:
         """The present state, int8, shape (tile, channel).

@@ -71,6 +71,15 @@ class View:
         """
         return self.surface().points
 
+    def prepare(self) -> None:
+        """Decode what has come until here, so that the points of this view or a later one are made sooner.
+
+        It changes no result, and does nothing where little waits. A program that shows the last view only, and receives
+        more slowly than it decodes, calls it for each view that it does not show: at the end the last layers alone are
+        left. All is decoded once, whenever that is.
+        """
+        self._reconstruction.prepare(self._length)
+
     def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
         """The grid of a coarser level, an array with that level's shape.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.model import Header
-from ..entropy.dequantize import UNANNOUNCED
+from ..decoding.levels import known_levels
 from ..entropy.tiles import Tiles
 from ..grid.layout import Layout
 from ..transform.lifting import FRACTION_BITS
@@ -80,7 +80,7 @@ class StateReconstructor:
         """
         header, layout = self._header, self._header.layout
         arrays = [canvas[place, :, :-PADDING] for canvas in self.canvases]
-        whole = _whole_levels(layout, state)
+        whole, bare = known_levels(layout, state, layout.levels)
         kept = self._kept.get(channel)
         levels = 0 if kept is None else min(_first_changed(layout, kept.state, state), len(kept.grids))
         self._kept[channel] = kept = _Kept(state.copy(), [] if kept is None else kept.grids[:levels])
@@ -88,8 +88,7 @@ class StateReconstructor:
         if start is not None:
             for array, grid in zip(arrays, kept.grids[start], strict=True):
                 array[: grid.shape[0], : grid.shape[1]] = grid
-        bare = _bare_levels(layout, state)
-        self._tiles[channel].spread_above(start, state, arrays, whole, bare)
+        self._tiles[channel].spread_levels(layout.levels, state, arrays, whole, start, bare)
         rules, coordinate = header.predictors[channel], channel < header.geometric
         for level in self._levels[levels:]:
             inverse(arrays, layout, rules, level, whole, coordinate, start, bare)
@@ -100,21 +99,6 @@ class StateReconstructor:
         return FRACTION_BITS if whole < layout.levels else 0
 
 
-def _whole_levels(layout: Layout, state: NDArray[np.int8]) -> int:
-    """The finest level up to which all details are known."""
-    whole = 0
-    while whole < layout.levels and not state[_tiles(layout, whole + 1)].any():
-        whole += 1
-    return whole
-
-
-def _bare_levels(layout: Layout, state: NDArray[np.int8]) -> list[int]:
-    """Levels without details; none where sides come from interfaces, which tell the details along them."""
-    if layout.shared:
-        return []
-    return [level for level in range(1, layout.levels + 1) if (state[_tiles(layout, level)] >= UNANNOUNCED).all()]
-
-
 def _first_changed(layout: Layout, before: NDArray[np.int8], after: NDArray[np.int8]) -> int:
     """The coarsest level of which anything else is known; one more than there are where nothing is.
 
@@ -123,8 +107,3 @@ def _first_changed(layout: Layout, before: NDArray[np.int8], after: NDArray[np.i
     """
     changed = np.flatnonzero(before != after)
     return layout.tiles[changed[0]].level if changed.size else layout.levels + 1
-
-
-def _tiles(layout: Layout, level: int) -> slice:
-    tiles = layout.tiles_of(level)
-    return slice(tiles.start, tiles.stop)

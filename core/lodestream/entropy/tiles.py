@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from ..kernels import PASSES_STATE
 from ..quantization.band_steps import Quantiser, band_step
 from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
-from .dequantize import UNANNOUNCED, spread_bands
+from .dequantize import spread_bands
 
 __all__ = ["Reading", "Run", "TileTable", "Tiles", "gather"]
 
@@ -178,16 +178,18 @@ class Tiles:
 
     def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
         """What decodes the runs up to each of ``ends``, from the end before it."""
-        bands = np.array(self.table.first)
-        lengths = [len(run.data) for run in runs]
-        described = [(run.tile, run.first, run.last, length) for run, length in zip(runs, lengths, strict=True)]
-        tile, first, last, length = np.array(described, np.int64).reshape(-1, 4).T
-        count, start = bands[tile + 1] - bands[tile], np.cumsum(length) - length
-        table = np.stack([bands[tile], count, tile, first, last, start, length, tile >= self.large], 1)
+        described, start, bands = [], 0, self.table.first
+        for tile, first, last, data in runs:
+            length = len(data)
+            count = bands[tile + 1] - bands[tile]
+            described.append((bands[tile], count, tile, first, last, start, length, tile >= self.large))
+            start += length
+        table = np.array(described, np.int64).reshape(-1, 8)
         made, begin = [], 0
         for end in ends:
             own = table[begin:end]
-            own[:, RUN_START] -= own[:1, RUN_START].copy()
+            if begin:
+                own[:, RUN_START] -= own[:1, RUN_START].copy()
             made.append(Reading(self, own, [run.data for run in runs[begin:end]]))
             begin = end
         return made
@@ -218,41 +220,37 @@ class Tiles:
             self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, len(state))
 
     def spread_levels(
-        self, level: int, state: NDArray[np.int8], coefficients: Sequence[NDArray[np.int32]], whole: int
-    ) -> None:
-        """`spread` all tiles of the levels up to one; ``state`` has the passes that remain of each.
-
-        ``state`` has the shape (tile,); ``coefficients`` are the grids' arrays, shape (row, column), zeros so far:
-        tiles that were not announced are passed over. Those of levels above ``whole`` are multiplied by
-        2**`FRACTION_BITS`.
-        """
-        tiles_of = self.table.layout.tiles_of
-        last = self.table.first[tiles_of(level).stop]
-        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
-            chosen = numbers[numbers < last]
-            chosen = chosen[state[self.table.origins[chosen, 0]] < UNANNOUNCED]
-            self._spread(chosen, state, array, tiles_of(whole).stop)
-
-    def spread_above(
         self,
-        start: int | None,
+        level: int,
         state: NDArray[np.int8],
         coefficients: Sequence[NDArray[np.int32]],
         whole: int,
+        start: int | None = None,
         bare: Collection[int] = (),
     ) -> None:
-        """`spread` all tiles of the levels above ``start``, or of every level: zeros where they were not announced.
+        """`spread` all tiles of the levels up to one: zeros where they were not announced.
 
-        Otherwise as `spread_levels`; what ``coefficients`` (int32 arrays, shape (row, column), one for each grid) hold
-        there does not matter. ``state`` has the shape (tile,). Levels in ``bare`` are passed over.
+        Parameters
+        ----------
+        level : int
+        state : int8, shape (tile,)
+            Passes that remain of each tile.
+        coefficients : int32 arrays, shape (row, column), one for each grid
+            What they hold at the places of these tiles does not matter.
+        whole : int
+            Coefficients of levels above this one are multiplied by 2**`FRACTION_BITS`.
+        start : int, optional
+            The levels up to this one are passed over.
+        bare : collection of int
+            So are these.
         """
-        tiles_of = self.table.layout.tiles_of
-        wanted = np.ones(len(self.table.layout.tiles), np.bool_)
-        wanted[: 0 if start is None else tiles_of(start).stop] = False
-        for level in bare:
-            wanted[slice(tiles_of(level).start, tiles_of(level).stop)] = False
-        for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
-            self._spread(numbers[wanted[self.table.origins[numbers, 0]]], state, array, tiles_of(whole).stop)
+        table, tiles_of = self.table, self.table.layout.tiles_of
+        finer, state = tiles_of(whole).stop, np.ascontiguousarray(state)
+        for lowest, highest in _runs(0 if start is None else start + 1, level, bare):
+            span = table.first[tiles_of(lowest).start], table.first[tiles_of(highest).stop]
+            for array, numbers in zip(coefficients, table.of_grid, strict=True):
+                own = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
+                self._spread(own, state, array, finer)
 
     def spread_rows(
         self, numbers: NDArray[np.int64], state: NDArray[np.int8], rows: NDArray[np.int32], first: int, finer: bool
@@ -292,6 +290,14 @@ class Tiles:
     ) -> None:
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.origins, self.steps
         spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
+
+
+def _runs(first: int, last: int, without: Collection[int]) -> Iterator[tuple[int, int]]:
+    """The numbers from ``first`` to ``last`` as runs, by their first and last, without some of them."""
+    for number in (*sorted(n for n in without if first <= n <= last), last + 1):
+        if first < number:
+            yield first, number - 1
+        first = number + 1
 
 
 def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:

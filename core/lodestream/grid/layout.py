@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import InputError
 from ..surface import Closed
 from .axis import AxisStep, axis_lengths, axis_step
@@ -163,6 +166,12 @@ class Layout:
         """The layout of one block that shares no side."""
         return Layout([Grid(shape, closed)], tile)
 
+    @staticmethod
+    @lru_cache(maxsize=REMEMBERED)
+    def of(grids: tuple[Grid, ...], tile: tuple[int, int]) -> Layout:
+        """The layout of some grids."""
+        return Layout(grids, tile)
+
     def shape(self, grid: int, level: int) -> tuple[int, int]:
         """Rows and columns of a grid at a level."""
         return self._shapes[grid][level]
@@ -285,6 +294,16 @@ class Layout:
     def tiles_of(self, level: int) -> range:
         """Numbers of the tiles of a level."""
         return self._tile_ranges[level]
+
+    @cached_property
+    def parents(self) -> list[int]:
+        """The number of each tile's parent, -1 where it has none."""
+        return [tile.parent for tile in self.tiles]
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """The first tile of each level, int64, shape (level,)."""
+        return np.array([own.start for own in self._tile_ranges])
 
     def points(self, level: int) -> int:
         """Of all grids at a level."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .. import kernels
 from ..grid.axis import AxisStep
 
-__all__ = ["CLAMP", "FRACTION_BITS", "REACH", "TAPS", "forward_step", "inverse_step"]
+__all__ = ["CLAMP", "FRACTION_BITS", "REACH", "TAPS", "forward_step", "inverse_step", "work_room"]
 
 #: The update's taps over 2^24: (1 - 1/sqrt 2)(2 sqrt 2 - 3)^j rounded so that they sum to 2^22.
 TAPS = np.array([4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1], np.float64)
@@ -78,14 +78,19 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
         values[...] = packed
         return
     lines = values.shape[1 - axis]
-    places = step.midpoints + step.run + 2 * REACH + 5
-    work = np.empty(places * _bundle(axis, lines) + 16, np.int32)
+    work = np.empty(work_room(step, axis, lines), np.int32)
     table = step.extension(REACH)
-    for part in _parts(axis, lines, step.length):
-        plane = values[:, part] if axis == 0 else values[part]
+    whole = lines * step.length <= _AT_ONCE
+    planes = (values[:, part] if axis == 0 else values[part] for part in _parts(axis, lines, step.length))
+    for plane in [values] if whole else planes:
         done = 0
         while done < step.run:  # very long axes take several calls, between which an interruption is heard
             done = kernels.lift(inverse, axis, plane, step.midpoints, step.run, table, *predictor, done, work)
+
+
+def work_room(step: AxisStep, axis: int, lines: int) -> int:
+    """Numbers of int32 that the kernel works in, to step so many lines along an axis."""
+    return (step.midpoints + step.run + 2 * REACH + 5) * _bundle(axis, lines) + 16
 
 
 def _bundle(axis: int, lines: int) -> int:

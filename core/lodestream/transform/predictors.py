@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.axis import AxisStep
-from ..grid.layout import Grid, Layout
+from ..grid.layout import REMEMBERED, Grid, Layout
 
 __all__ = [
     "COEFFICIENT_BITS",
@@ -15,6 +17,7 @@ __all__ = [
     "INTERFACES",
     "default_predictors",
     "fitted_steps",
+    "is_fitted",
     "predictor",
 ]
 
@@ -28,7 +31,8 @@ FIT_NODES = 24
 INTERFACES = 2
 
 
-def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
+@lru_cache(maxsize=REMEMBERED)
+def fitted_steps(layout: Layout) -> tuple[tuple[int, int], ...]:
     """(coarser level, axis) of every step with an (a, b) of its own: along an axis 0 or 1 that is long enough.
 
     All patches have it in common; all interfaces have another in common, whose axis is `INTERFACES`.
@@ -38,10 +42,10 @@ def fitted_steps(layout: Layout) -> list[tuple[int, int]]:
         fitted = set()
         for number, grid in enumerate(layout.grids):
             for axis, step in enumerate(layout.steps(number, level + 1)):
-                if _is_fitted(step):
+                if is_fitted(step):
                     fitted.add(INTERFACES if grid.interface else axis)
         found += [(level, axis) for axis in sorted(fitted)]
-    return found
+    return tuple(found)
 
 
 def default_predictors(layout: Layout) -> NDArray[np.int8]:
@@ -51,11 +55,12 @@ def default_predictors(layout: Layout) -> NDArray[np.int8]:
 
 def predictor(predictors: NDArray[np.int8], grid: Grid, step: AxisStep, level: int, axis: int) -> tuple[int, int]:
     """The (a, b) of a grid's step along an axis from ``level`` to the level below."""
-    if not _is_fitted(step):
+    if not is_fitted(step):
         return FOUR_POINT
     a, b = (int(x) for x in predictors[level - 1, INTERFACES if grid.interface else axis])
     return a, b
 
 
-def _is_fitted(step: AxisStep) -> bool:
+def is_fitted(step: AxisStep) -> bool:
+    """Whether a step has an (a, b) of its own: along an axis that is long enough."""
     return step.midpoints > 0 and step.run >= FIT_NODES

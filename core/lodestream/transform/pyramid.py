@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .. import kernels
 from ..grid.axis import AxisStep
 from ..grid.layout import Layout, Source
+from .all_levels import fits, inverse_levels
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
 from .predictors import FIT_NODES, FOUR_POINT, INTERFACES, default_predictors, fitted_steps, predictor
 
@@ -25,6 +26,7 @@ __all__ = [
     "allocate",
     "bare_level",
     "copied",
+    "empty",
     "forward",
     "inverse",
     "inverse_level",
@@ -53,6 +55,12 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
     """
     rows, columns = shape
     return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
+
+
+def empty(shape: tuple[int, int]) -> NDArray[np.int32]:
+    """As `allocate`, whatever it holds."""
+    rows, columns = shape
+    return np.empty((rows, columns + PADDING), np.int32)[:, :columns]
 
 
 def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -127,6 +135,9 @@ def inverse(
     With ``start``, the arrays hold the grids of that level already, as this leaves them there with the same ``whole``.
     Details of the levels in ``bare`` are 0, whatever stands in their places; none where sides come from interfaces.
     """
+    if fits(layout, level) and not layout.shared:
+        inverse_levels(arrays[0], layout, predictors, level, whole, start or 0, bare)
+        return
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
     if coordinate and start is None:
         take_nodes(arrays, layout)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container.model import Header
+from lodestream.decoding import batches
 from lodestream.decoding.batches import Coded, batch_length, rounds_of
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.parallel import VARIABLE, spread
@@ -50,8 +53,16 @@ def test_a_file_of_ours_is_one_batch(count: str, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv(VARIABLE, count)
     header, segments = segments_of(ls.encode(ls.Surface(rough((330, 420), 3))))
     assert batch_length(header.layout, segments) == len(segments)
-    assert any(len(readings) > 3 for readings in rounds_of(decoded(header, [], True), segments))
+    with patch.object(batches, "_LITTLE", 0):
+        assert any(len(readings) > 3 for readings in rounds_of(decoded(header, [], True), segments))
+        assert_same(decoded(header, segments, True), decoded(header, segments, False))
     assert_same(decoded(header, segments, True), decoded(header, segments, False))
+
+
+def test_one_thread_takes_little_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "1")
+    header, segments = segments_of(ls.encode(ls.Surface(rough((99, 120), 3))))
+    assert [len(readings) for readings in rounds_of(decoded(header, [], True), segments)] == [1]
 
 
 @settings(max_examples=12, deadline=None)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.decoding import channels
-from lodestream.decoding.channels import has_bands, values_by_bands
+from lodestream.decoding.channels import has_bands, values_of_grid
 from lodestream.decoding.reconstruction import Reconstruction, to_values
 from lodestream.parallel import VARIABLE
 
@@ -60,7 +60,7 @@ def test_any_bands_of_any_state(
     expected = to_values(header, reconstruction.reconstructions(length, state, level), level)
     with pytest.MonkeyPatch.context() as context:
         context.setenv(VARIABLE, count)
-        with patch.multiple(channels, _ROWS=most, _SHARED=1 + most, _KEPT=64 * most):
+        with patch.multiple(channels, _SMALL=0, _ROWS=most, _SHARED=1 + most, _KEPT=64 * most):
             found = reconstruction._whole(length, state, level, None)
             assert len(found) == len(expected)
     for ours, whole in zip(found, expected, strict=True):
@@ -75,15 +75,15 @@ def test_channels_that_are_not_chosen_are_zero() -> None:
     decoder.feed(ls.encode(ls.Surface(heights, attributes={"one": heights + 1, "other": heights + 2})))
     header, tiles = decoder.header, decoder._reconstruction._prepare()
     assert header is not None
-    assert has_bands(header, header.levels)
     decoder._reconstruction._decode(decoder._reconstruction.length)
     state = np.zeros((len(header.layout.tiles), header.channels), np.int8)
     chosen = np.array([True, False, True])
-    arrays = values_by_bands(header, tiles, state, header.levels, chosen)
+    arrays = values_of_grid(header, tiles, state, header.levels, chosen)
     assert [bool(array.any()) for array in arrays] == chosen.tolist()
     np.testing.assert_array_equal(arrays[0][..., 0], heights)
 
 
+@patch.object(channels, "_SMALL", 0)
 def test_rows_that_wrap_have_no_bands() -> None:
     rng = np.random.default_rng(3)
     header, _ = arrived(rng.integers(0, 9, (24, 30)), (True, False))
@@ -91,3 +91,10 @@ def test_rows_that_wrap_have_no_bands() -> None:
     header, _ = arrived(rng.integers(0, 9, (24, 30)), (False, True))
     assert has_bands(header, header.levels)
     assert not has_bands(header, 0)
+
+
+def test_what_stays_in_the_cache_has_no_bands() -> None:
+    header, _ = arrived(np.arange(60).reshape(6, 10), (False, False))
+    assert not has_bands(header, header.levels)
+    with patch.object(channels, "_SMALL", 59):
+        assert has_bands(header, header.levels)

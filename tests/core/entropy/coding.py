@@ -100,8 +100,7 @@ def decode_runs(
 ) -> list[Ints]:
     """Coefficients after the runs, as they are known when ``state[tile][channel]`` passes remain."""
     reader = Reconstruction(header_for(layout, channels, large))
-    for segment in coded:
-        reader.add(segment)
+    reader.add(list(coded))
     reader._decode(reader.length)
     decoded = []
     for channel, tiles in enumerate(reader._tiles):

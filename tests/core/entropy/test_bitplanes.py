@@ -155,8 +155,7 @@ def test_gains_are_the_squared_errors_of_what_is_known(large: int) -> None:
     table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
     counts = passes_of(layout, values)
     reader = Reconstruction(header_for(layout, 1, large))
-    for segment in encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n], large):
-        reader.add(segment)
+    reader.add(encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n], large))
     reader._decode(reader.length)
     for tile, count in enumerate(counts):
         if not count:
