@@ -71,10 +71,10 @@ def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
     """See `lodestream.Surface.to_pyvista`."""
     pv = require_library("pyvista", "pyvista")
     surface = restore(surface)
-    grids = [_structured(pv, surface, number) for number in range(len(surface.blocks))]
+    grids: list[pyvista.StructuredGrid] = [_structured(pv, surface, n) for n in range(len(surface.blocks))]
     if len(grids) == 1:
         return grids[0]
-    blocks = pv.MultiBlock()
+    blocks: pyvista.MultiBlock = pv.MultiBlock()
     for number, grid in enumerate(grids):
         blocks.append(grid, f"block_{number}")
     return blocks
@@ -124,7 +124,10 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
         grids = [data]
     if not grids:
         raise FormatError("expected structured grids, got a MultiBlock without any")
-    blocks, faces, words, left_out = [], [], {}, []
+    blocks: list[Block] = []
+    faces: list[dict[str, Any]] = []
+    words: dict[str, str] = {}
+    left_out: list[str] = []
     for grid in grids:
         if not isinstance(grid, pv.StructuredGrid | pv.RectilinearGrid | pv.ImageData):
             if isinstance(grid, pv.DataObject):

@@ -65,7 +65,8 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
     xr = require_library("xarray", "xarray")
     parts = parts_of(grid)
     mapping = {"grid_mapping": "spatial_ref"} if _has_place(grid) else {}
-    variables, places = {}, {}
+    variables: dict[str, Any] = {}
+    places: dict[str, Any] = {}
     for part in parts:
         values, encoding = given(part)
         attrs = part.attrs | (_letters(grid)[part.name] if part.coordinate else {})
