@@ -24,7 +24,7 @@ from lodestream.container import read_index
 from lodestream.container.capacity import Capacity
 from lodestream.container.model import ByteRange, Header
 from lodestream.coordinates.height_fields import level_metadata
-from lodestream.decoding.decoder import Decoder
+from lodestream.decoding.decoder import Decoder, View
 from lodestream.errors import InputError, OptionError
 from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
@@ -257,7 +257,7 @@ class Container:
                 self._windows.popitem(last=False)
         return found.blocks[0]
 
-    def _decoded(self, target: Target) -> Any:
+    def _decoded(self, target: Target) -> View:
         decoder = Decoder(target, max_vertices=self._given[2])
         chosen = plan(self._index, target)
         places = [*chosen.before, *chosen.ranges]

@@ -133,7 +133,8 @@ def test_points_in_space_are_lazy_too(tmp_path: Path) -> None:
     surface = ls.Surface(torus(90, 120), (True, True), metadata={"unit": "mm"})
     (tmp_path / "a.lode").write_bytes(ls.encode(surface))
     found = opened(tmp_path / "a.lode")
-    xr.testing.assert_equal(found[["z"]].isel(row=slice(3, 9)), surface.to_xarray()[["z"]].isel(row=slice(3, 9)))
+    wanted: Any = surface.to_xarray()
+    xr.testing.assert_equal(found[["z"]].isel(row=slice(3, 9)), wanted[["z"]].isel(row=slice(3, 9)))
     back = ls.Surface.from_xarray(found)
     assert back.closed == (True, True)
     assert np.array_equal(back.points, surface.points)
@@ -162,7 +163,7 @@ def test_several_blocks_are_opened_one_by_one_or_as_a_tree(tmp_path: Path) -> No
     with pytest.raises(ls.OptionError, match="block= of 0 to 1"):
         opened(tmp_path / "a.lode")
     assert np.array_equal(opened(tmp_path / "a.lode", block=1).z.values, blocks[1].points[..., 2])
-    tree = xr.open_datatree(tmp_path / "a.lode", engine=LodeBackend)
+    tree: Any = xr.open_datatree(tmp_path / "a.lode", engine=LodeBackend)
     assert np.array_equal(tree["block_0"]["x"].values, blocks[0].points[..., 0])
     assert xr.open_datatree(tmp_path / "a.lode", engine=LodeBackend, level=1)["block_0"].sizes["row"] < 40
     with pytest.raises(ls.OptionError, match="got 2"):

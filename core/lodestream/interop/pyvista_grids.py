@@ -166,7 +166,10 @@ def _block(grid: Any) -> tuple[Block, dict[str, Any]]:
     face: dict[str, Any] = {}
     if _GHOSTS in grid.cell_data and min(shape) > 1:
         hidden = np.asarray(grid.cell_data[_GHOSTS]) & HIDDEN_CELL != 0
-        mask, face = without_hidden(hidden.reshape(shape[0] - 1, shape[1] - 1), mask)
+        hidden = hidden.reshape(shape[0] - 1, shape[1] - 1)
+        if mask is not None:  # cells of holes are hidden anyway, and say nothing of their other corners
+            hidden &= mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
+        mask, face = without_hidden(hidden, mask)
     return Block(_rows(grid.points, shape), mask=mask, attributes=attributes), face
 
 

@@ -52,6 +52,17 @@ def test_closed_axes_repeat_their_first_points_and_are_closed_again() -> None:
     assert np.array_equal(back.points, surface.points)
 
 
+def test_a_valid_point_among_holes_and_a_closed_axis_with_holes_come_back() -> None:
+    points = torus(12, 16)
+    mask = np.ones((12, 16), np.bool_)
+    mask[:, 15] = mask[3:8, :4] = False
+    mask[5, 1] = True
+    back = ls.Surface.from_pyvista(ls.Surface(points, (True, True), mask=mask).to_pyvista())
+    assert back.closed == (True, True)
+    assert back.mask is not None
+    assert np.array_equal(back.mask, mask)
+
+
 def test_several_blocks_are_a_multiblock() -> None:
     surface = ls.Surface(blocks=[ls.Block(torus(8, 9)), ls.Block(torus(5, 6))])
     blocks = surface.to_pyvista()

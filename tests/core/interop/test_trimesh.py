@@ -50,7 +50,7 @@ def test_colours_normals_textures_and_other_attributes_go_where_trimesh_has_them
     surface = ls.Surface(
         terrain(shape), attributes={"color": color, "normal": normal, "n": np.arange(42.0).reshape(shape)}
     )
-    mesh = surface.to_trimesh()
+    mesh: Any = surface.to_trimesh()
     assert np.array_equal(mesh.visual.vertex_colors, color.reshape(-1, 4))
     assert np.allclose(mesh.vertex_normals, normal.reshape(-1, 3))
     assert mesh.vertex_attributes["n"].tolist() == list(range(42))
@@ -59,7 +59,7 @@ def test_colours_normals_textures_and_other_attributes_go_where_trimesh_has_them
     assert np.array_equal(back.attributes["color"], color.reshape(-1, 4)[order])
     assert np.allclose(back.attributes["normal"], normal.reshape(-1, 3)[order])
     uv = rng.random((*shape, 2))
-    textured = ls.Surface(terrain(shape), attributes={"uv": uv}).to_trimesh()
+    textured: Any = ls.Surface(terrain(shape), attributes={"uv": uv}).to_trimesh()
     assert np.array_equal(textured.visual.uv, uv.reshape(-1, 2))
     assert set(ls.Surface.from_trimesh(textured).attributes) == {"uv"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,17 @@ def made(path: Path, values: Any, chunks: tuple[int, ...], **options: Any) -> An
     return array
 
 
+def stored(path: Path) -> Any:
+    """All values of an array that is opened anew."""
+    return zarr.open_array(path)[:]
+
+
 @pytest.mark.parametrize("dtype", ls.surface.DTYPES)
 def test_every_type_comes_back_bit_for_bit(dtype: str, tmp_path: Path) -> None:
     values = np.abs(terrain((100, 90)) / 8).astype(dtype)
     array = made(tmp_path / "a.zarr", values, (64, 48))
     assert array.metadata.to_dict()["codecs"] == ({"name": NAME, "configuration": {}},)
-    again = zarr.open_array(tmp_path / "a.zarr")[:]
+    again = stored(tmp_path / "a.zarr")
     assert again.dtype == values.dtype
     assert again.tobytes() == values.tobytes()
     if dtype == "int16":
@@ -51,16 +57,16 @@ def test_nan_of_any_bits_infinities_and_chunks_of_holes_come_back(tmp_path: Path
     values[:32, 32:64] = np.nan
     values.view("u4")[40, 70] = 0xFFC01234  # a NaN with bits of its own
     made(tmp_path / "a.zarr", values, (32, 32))
-    assert zarr.open_array(tmp_path / "a.zarr")[:].tobytes() == values.tobytes()
+    assert stored(tmp_path / "a.zarr").tobytes() == values.tobytes()
 
 
 def test_leading_axes_of_length_one_big_endian_values_and_small_chunks(tmp_path: Path) -> None:
     values = np.stack([terrain((20, 30), seed) for seed in range(3)]).astype(">f8")
     made(tmp_path / "a.zarr", values, (1, 16, 16))
-    assert np.array_equal(zarr.open_array(tmp_path / "a.zarr")[:], values)
+    assert np.array_equal(stored(tmp_path / "a.zarr"), values)
     one = np.arange(6.0).reshape(2, 3)
     made(tmp_path / "b.zarr", one, (1, 1))
-    assert np.array_equal(zarr.open_array(tmp_path / "b.zarr")[:], one)
+    assert np.array_equal(stored(tmp_path / "b.zarr"), one)
 
 
 def test_a_precision_is_kept_in_the_metadata_and_holds(tmp_path: Path) -> None:
@@ -68,7 +74,7 @@ def test_a_precision_is_kept_in_the_metadata_and_holds(tmp_path: Path) -> None:
     exact = made(tmp_path / "a.zarr", values, (64, 64))
     rough = made(tmp_path / "b.zarr", values, (64, 64), precision=0.5)
     assert rough.metadata.to_dict()["codecs"][0]["configuration"] == {"precision": "0.5"}
-    again = zarr.open_array(tmp_path / "b.zarr")[:]
+    again = stored(tmp_path / "b.zarr")
     assert 0 < np.abs(again - values).max() <= 0.5
     assert rough.nbytes_stored() < exact.nbytes_stored() / 2
 
@@ -96,8 +102,8 @@ def test_configurations_that_are_not_known_are_refused(data: Any) -> None:
 
 def damaged() -> list[tuple[bytes, str]]:
     other = ls.encode(np.zeros((3, 3), "f4"))
-    small = zarr_codec._PLAIN + __import__("zlib").compress(b"\0" * 3)
-    large = zarr_codec._PLAIN + __import__("zlib").compress(b"\0" * (1 << 20))
+    small = zarr_codec._PLAIN + zlib.compress(b"\0" * 3)
+    large = zarr_codec._PLAIN + zlib.compress(b"\0" * (1 << 20))
     return [
         (b"", "expected a chunk of kind"),
         (b"Xabc", "expected a chunk of kind"),
