@@ -22,6 +22,7 @@ DPI = 100
 SMALL = 320
 
 _LIGHT = 315, 45  # azimuth and altitude in degrees: north-west, as maps have it
+_FLAT = 1e-300  # heights that differ by no more have no relief, and no factor would give them one
 _RELIEF = 0.15  # height of the relief for its shading, in widths of the surface
 
 
@@ -76,7 +77,7 @@ def _heights(figure: Figure, block: Block, pixels: int) -> None:
     figure.set_size_inches(max(columns * scale, 300) / DPI + 1.5, max(rows * scale, 200) / DPI + 0.7)
     axes = figure.add_subplot()
     low, high = (float(edge) for edge in (np.nanmin(heights), np.nanmax(heights))) if heights.size else (0.0, 1.0)
-    height = max(high - low, np.finfo(np.float64).tiny)
+    height = high - low
     image = axes.imshow(heights, cmap="terrain", vmin=low, vmax=high)
     if min(rows, columns) > 1:
         shaded = LightSource(*_LIGHT).shade(
@@ -85,7 +86,7 @@ def _heights(figure: Figure, block: Block, pixels: int) -> None:
             blend_mode="soft",
             vmin=low,
             vmax=high,
-            vert_exag=_RELIEF * max(rows, columns) / height,
+            vert_exag=_RELIEF * max(rows, columns) / height if height > _FLAT else 0.0,
         )
         shaded[..., 3] = np.isfinite(heights)
         axes.imshow(shaded)

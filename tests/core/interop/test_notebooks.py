@@ -46,6 +46,10 @@ def test_a_surface_shows_a_picture_and_sizes(surface: ls.Surface) -> None:
         assert "n (int32, 2 components)" in html
 
 
+def test_constant_heights_are_drawn_without_a_warning() -> None:
+    assert "<img" in ls.Surface(np.full((30, 40), 7.0))._repr_html_()
+
+
 def test_a_view_shows_bytes_and_errors_and_a_window_too() -> None:
     mask = np.ones((500, 600), np.bool_)
     mask[:9] = False
