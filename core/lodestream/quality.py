@@ -30,7 +30,8 @@ class Quality:
     rms : Tolerance or None
         The stream is made for one root mean square error instead: the complete surface has at most this error.
     attributes : mapping of str to Tolerance
-        Maximum errors of attributes, by name; the others come back bit for bit.
+        Maximum errors of attributes, by name, or of single channels: a coordinate (x, y, z), a component of an
+        attribute (``wind_0``). The others come back bit for bit, but for coordinates that `precision` is for.
 
     Raises
     ------
@@ -76,7 +77,8 @@ class Quality:
         Parameters
         ----------
         precisions : iterable of str
-            ``P`` for the points, ``NAME=P`` for an attribute. A name may hold an equals sign, a tolerance does not.
+            ``P`` for the points, ``NAME=P`` for an attribute or a channel. A name may hold an equals sign, a tolerance
+            does not.
         rms : str or None
 
         Raises

@@ -272,7 +272,8 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         type=parse_precision,
         metavar="[NAME=]P",
         help="maximum error of the complete surface: a number in the surface's unit, or 1e-3d for 1e-3 times its "
-        "extent; NAME=P sets it for the attribute NAME; may be repeated (default: lossless)",
+        "extent; NAME=P sets it for an attribute, a coordinate (z) or a component (wind_0); may be repeated "
+        "(default: lossless)",
     )
     group.add_argument(
         "--rms",

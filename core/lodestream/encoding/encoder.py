@@ -19,6 +19,7 @@ from .corrected import correct
 from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
 from .losses import at_holes
 from .measured import measure
+from .named_precisions import check_names
 from .prepared import Prepared, prepare
 from .quantized import NoQuantiserError, quantize
 from .transformed import transform
@@ -63,7 +64,9 @@ def encode(
         Encode for one root mean square error instead: a container as short as possible whose complete surface has at
         most this error. Quantization steps are chosen for this error alone, and there are few layers before the last.
     attribute_precision : mapping of str to float, str or Tolerance, optional
-        Maximum error of attributes, by name.
+        Maximum error of attributes, by name; or of single channels: of a coordinate ("x", "y" or "z"), of a component
+        of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named keeps to its own
+        precision, whatever `precision` is; if that is None, the other coordinates come back bit for bit.
     quality : Quality, optional
         In place of the three before, which are a shorthand for ``Quality.of(precision, rms, attribute_precision)``.
     progress : callable, optional
@@ -83,8 +86,8 @@ def encode(
     TooLargeError
         If a block has more rows or columns than kernels can count.
     OptionError
-        If there is no attribute of a given name, an error is no number of 0 or more, both a precision and an error are
-        given, or a quality and one of these.
+        If there is no attribute or channel of a given name, an error is no number of 0 or more, both a precision and an
+        error are given, or a quality and one of these.
     UnavailableError
         If the compiled kernels are missing; it says how to get them.
     """
@@ -120,10 +123,7 @@ def _check(surface: Surface, quality: Quality) -> None:
     most = max(length for block in surface.blocks for length in block.shape)
     if most > LONGEST_AXIS:
         raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {most:,}")
-    unknown = [name for name in quality.attributes if name not in surface.blocks[0].attributes]
-    if unknown:
-        known = ", ".join(surface.blocks[0].attributes) or "none"
-        raise OptionError(f"expected a precision for one of the attributes ({known}), got one for {unknown[0]!r}")
+    check_names(surface, quality)
 
 
 def _stages(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:

@@ -51,15 +51,21 @@ def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
     InputError
         If a precision is too small for the values.
     """
-    found = choose_lattices(prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions)
-    whole = prepared.precision is None and bits is None
+    named, first = prepared.named, prepared.point_channels
+    own = {channel: error for channel, error in named.items() if channel < first}
+    found = choose_lattices(
+        prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions, named=own
+    )
+    whole = prepared.precision is None and bits is None and not own
     if whole and prepared.point_channels == 1 and prepared.arrangement is None:
         offset = offset_lattice(prepared.arrays[0][0][..., 0])
         if offset is not None and find_lattice(prepared.valid) is None:
             found[0] = offset
     for number, kind in enumerate(prepared.kinds, 1):
         values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays])
-        found += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits)
+        own = {part: named[first + part] for part in range(kind.channels) if first + part in named}
+        found += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits, own)
+        first += kind.channels
     return Lattices(tuple(found))
 
 

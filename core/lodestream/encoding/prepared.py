@@ -28,6 +28,7 @@ from ..target import Tolerance
 from ..transform.pyramid import PADDING
 from .arranging import arranged, may_share, unshared
 from .holes import Arrays, filled, valid_points
+from .named_precisions import named_errors
 from .tiling import SMALL, SMALL_TILE, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE, chunk_exponents, square, tile_exponents
 
 __all__ = ["Prepared", "prepare"]
@@ -62,6 +63,8 @@ class Prepared:
     rms : float or None
         Largest root mean square error of a stream that is made for it, in the surface's unit.
     attribute_precisions : mapping of str to Tolerance
+    named : mapping of int to float
+        Largest error allowed of single channels, by number, in their unit.
     divisions : float
         Into how many lattice steps the widest extent is divided where the points lie on no lattice.
     arrangement : Arrangement or None
@@ -87,6 +90,7 @@ class Prepared:
     precision: float | None
     rms: float | None
     attribute_precisions: Mapping[str, Tolerance]
+    named: Mapping[int, float]
     divisions: float
     arrangement: Arrangement | None
     patches: tuple[Patch, ...]
@@ -99,6 +103,15 @@ class Prepared:
     def kept(self) -> list[NDArray[np.bool_] | None]:
         """Of each block the holes whose values come back, bool, shape (row, column)."""
         return [block.kept for block in self.given.blocks]
+
+    @property
+    def rough(self) -> list[bool]:
+        """Of each channel whether it need not come back bit for bit."""
+        found = [self.precision is not None or self.rms is not None] * self.geometric
+        found += [False] * (self.point_channels - self.geometric)
+        for kind in self.kinds:
+            found += [kind.name in self.attribute_precisions] * kind.channels
+        return [any_ or channel in self.named for channel, any_ in enumerate(found)]
 
     @property
     def interfaces(self) -> int:
@@ -149,12 +162,14 @@ def prepare(surface: Surface, quality: Quality) -> Prepared:
     absolute = None if precision is None else precision.absolute(extent)
     if quality.rms is not None and extent:
         rms = quality.rms.absolute(extent) or None  # 0: every value is exact, as of a surface that is one point
+    kinds, named = _kinds(first), named_errors(surface, arrays, quality)
     divisions = _divisions(points, geometric) if absolute is None and rms is None else DEFAULT_DIVISIONS
     arrangement = None
     if len(blocks) > 1 or (geometric > 1 and may_share(first, points[0])):
         arrangement = unshared(blocks)
         if geometric > 1:  # sides are shared by points, not by heights
-            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions)
+            own = {channel: error for channel, error in named.items() if channel < point_channels}
+            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=own)
             arrangement = arranged(blocks, points, lattices[:geometric])
     if arrangement is None:
         small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
@@ -170,11 +185,14 @@ def prepare(surface: Surface, quality: Quality) -> Prepared:
         valid=valid,
         point_channels=point_channels,
         geometric=geometric,
-        kinds=_kinds(first),
+        kinds=kinds,
         extent=extent,
         precision=absolute,
         rms=rms,
-        attribute_precisions=quality.attributes,
+        attribute_precisions={
+            kind.name: quality.attributes[kind.name] for kind in kinds if kind.name in quality.attributes
+        },
+        named=named,
         divisions=divisions,
         arrangement=arrangement,
         patches=(whole_patch(0, first.shape, first.closed),) if arrangement is None else arrangement.patches,

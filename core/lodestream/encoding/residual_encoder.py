@@ -26,8 +26,8 @@ _TABLES, _WORTH = 8, 0.01
 def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
     """The section's chunks; and of each channel whether it is exact then.
 
-    A precision is for the coordinates, or for the attribute that it names: the others come back bit for bit, and so do
-    NaN and infinities, and all values of holes that are kept.
+    A precision is for the coordinates, or for the channel or attribute that it names: the others come back bit for
+    bit, and so do NaN and infinities, and all values of holes that are kept.
 
     Parameters
     ----------
@@ -83,11 +83,7 @@ class _ChunkCoder:
 
     def __init__(self, prepared: Prepared, header: Header, restored: list[Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
-        rough = [prepared.precision is not None or prepared.rms is not None] * prepared.geometric
-        rough += [False] * (prepared.point_channels - prepared.geometric)
-        for kind in prepared.kinds:
-            rough += [kind.name in prepared.attribute_precisions] * kind.channels
-        self._rough = rough
+        self._rough = prepared.rough
 
     def code(self, window: ChunkPlace) -> tuple[bytes, bool]:
         """One chunk, and whether its values are exact then."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ def choose_lattices(
     bits: int | None = None,
     *,
     divisions: float = DEFAULT_DIVISIONS,
+    named: Mapping[int, float] | None = None,
 ) -> list[Lattice]:
     """A lattice for each channel.
 
@@ -44,9 +46,11 @@ def choose_lattices(
         Largest distance allowed between a point and what comes back; None: whatever costs least, for what the lattice
         leaves out is stored.
     bits : int, optional
-        Keep no more of any channel than so many bits of its range.
+        Keep no more of any channel than so many bits of its range, unless it is named.
     divisions : float
         Into how many lattice steps the widest extent is divided where there is neither a lattice nor a precision.
+    named : mapping of int to float, optional
+        Largest errors allowed of single channels, whatever is allowed of a point.
 
     Returns
     -------
@@ -57,16 +61,18 @@ def choose_lattices(
     Raises
     ------
     InputError
-        If a value is above `LARGEST_VALUE` in magnitude.
+        If a value is above `LARGEST_VALUE` in magnitude, or a precision is too small for the values.
     """
     count = 1 if points.ndim == 2 else points.shape[2]
     spans = []
     for channel in range(count):
         values = channel_of(points, channel)
         spans.append((float(values.min()), float(values.max())))
+    steps = {channel: _step_for(points.dtype, error, 1, [spans[channel]]) for channel, error in (named or {}).items()}
     if bits is not None:
         # With no bit at all every value is nearest to the same lattice point.
-        return [precision_lattice(low, high, max(high - low, 1e-300) * 2.0 ** -(bits or -2)) for low, high in spans]
+        shares = [max(high - low, 1e-300) * 2.0 ** -(bits or -2) for low, high in spans]
+        return [precision_lattice(*span, steps.get(k, shares[k])) for k, span in enumerate(spans)]
     widest = max((high - low for low, high in spans[:geometric]), default=0.0)
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:
@@ -76,7 +82,10 @@ def choose_lattices(
     for channel in range(count):
         low, high = spans[channel]
         own = find_lattice(channel_of(points, channel))
-        if channel >= geometric:
+        if channel in steps:
+            coarse = own is not None and own.spacing >= steps[channel]
+            lattices.append(own if own is not None and coarse else precision_lattice(low, high, steps[channel]))
+        elif channel >= geometric:
             lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_DIVISIONS))
         elif own is not None and (precision is None or own.spacing >= wanted):
             lattices.append(own)
@@ -86,7 +95,10 @@ def choose_lattices(
 
 
 def attribute_lattices(
-    values: NDArray[Any], precision: Tolerance | None = None, bits: int | None = None
+    values: NDArray[Any],
+    precision: Tolerance | None = None,
+    bits: int | None = None,
+    named: Mapping[int, float] | None = None,
 ) -> list[Lattice]:
     """A lattice for each component of an attribute.
 
@@ -97,19 +109,21 @@ def attribute_lattices(
         Largest distance allowed between the values of a point and what comes back. None: the components' own lattices
         where found, or fine ones, for what they leave out is stored.
     bits : int, optional
-        Keep no more of any component than so many bits of its range.
+        Keep no more of any component than so many bits of its range, where no precision is given.
+    named : mapping of int to float, optional
+        Largest errors of single components.
     """
     grid = values[:, np.newaxis]
     count = values.shape[1]
     if precision is not None:
         lows, highs = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
         extent = float(np.sqrt(((highs - lows) ** 2).sum()))
-        if extent or not precision.relative:
-            return choose_lattices(grid, count, precision.absolute(extent), bits)
-    if bits is not None:
-        return choose_lattices(grid, count, None, bits)
+        if extent or not precision.relative:  # nothing corrects what fewer bits would leave out
+            return choose_lattices(grid, count, precision.absolute(extent), named=named)
+    if bits is not None and precision is None:
+        return choose_lattices(grid, count, None, bits, named=named)
     # As attributes of nothing: each component gets its own lattice, or a fine one.
-    return choose_lattices(grid, 0, None)
+    return choose_lattices(grid, 0, None, named=named)
 
 
 def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: list[tuple[float, float]]) -> float:

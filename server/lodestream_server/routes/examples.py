@@ -72,7 +72,7 @@ UPLOAD: dict[str, Any] = {
             (
                 "precision",
                 "maximum error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P sets it "
-                "for the attribute NAME; may be repeated",
+                "for an attribute, a coordinate (z) or a component (wind_0); may be repeated",
                 None,
                 "1e-4d",
             ),

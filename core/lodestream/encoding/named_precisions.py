@@ -1,0 +1,82 @@
+"""Precisions of single channels: coordinates by their letter, components of attributes by their number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..errors import OptionError
+from ..quality import Quality
+from ..surface import Block, Surface
+from .holes import Arrays
+
+__all__ = ["check_names", "named_errors"]
+
+
+def check_names(surface: Surface, quality: Quality) -> None:
+    """Refuse a precision for what the surface does not have.
+
+    Raises
+    ------
+    OptionError
+        If there is no attribute, coordinate or component of a name; or if there are an error of the whole and one of a
+        coordinate.
+    """
+    block = surface.blocks[0]
+    channels = _channels(block)
+    for name in quality.attributes:
+        if name in block.attributes:
+            continue
+        if name not in channels:
+            known = ", ".join([*block.attributes, *channels])
+            raise OptionError(f"expected a precision for one of {known}, got one for {name!r}")
+        if quality.rms is not None and channels[name] < _width(block):
+            raise OptionError(f"expected either a root mean square error or a precision of {name}, got both")
+
+
+def named_errors(surface: Surface, arrays: Sequence[Arrays], quality: Quality) -> dict[int, float]:
+    """The largest error allowed of each channel that is named, in its unit.
+
+    Parameters
+    ----------
+    surface : Surface
+        As it is coded: heights alone where x and y follow a rule, which is exact.
+    arrays : sequence, one for each block, of lists of arrays, shape (row, column, channel)
+        Its points, then each attribute; finite.
+    quality : Quality
+        Relative errors are shares of the channel's range; of a channel without one they say nothing.
+    """
+    found: dict[int, float] = {}
+    block = surface.blocks[0]
+    for name, channel in _channels(block).items():
+        tolerance = quality.attributes.get(name)
+        if tolerance is None:
+            continue
+        spans = [_span(own, channel) for own in arrays]
+        span = max(high for _, high in spans) - min(low for low, _ in spans)
+        if span or not tolerance.relative:
+            found[channel] = tolerance.absolute(span)
+    return found
+
+
+def _width(block: Block) -> int:
+    return block.points.shape[2] if block.points.ndim == 3 else 1
+
+
+def _channels(block: Block) -> dict[str, int]:
+    """The number of each channel that has a name of its own; whole attributes have theirs beside these."""
+    width = _width(block)
+    names = ["z"] if width == 1 else list("xyz")[:width]
+    names += [f"attribute_{number}" for number in range(width - len(names))]
+    for name, values in block.attributes.items():
+        names += [f"{name}_{part}" for part in range(values.shape[2])] if values.ndim == 3 else [name]
+    return {name: channel for channel, name in enumerate(names) if name not in block.attributes}
+
+
+def _span(own: Arrays, channel: int) -> tuple[float, float]:
+    """Lowest and highest value of a channel of a block."""
+    for array in own:
+        if channel < array.shape[2]:
+            values = array[..., channel]
+            return float(values.min()), float(values.max())
+        channel -= array.shape[2]
+    raise IndexError(channel)
