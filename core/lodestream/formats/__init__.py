@@ -11,7 +11,7 @@ format, write a module with ``sniff`` and ``read`` or ``write``, and give it a r
 from .reading import read, sniff
 from .source import DEFAULT_MAX_VERTICES, check_allowed
 from .table import Format, formats
-from .writing import check_blocks, for_writing, write, write_stream
+from .writing import check_blocks, for_writing, write, write_stream, written
 
 __all__ = [
     "DEFAULT_MAX_VERTICES",
@@ -24,4 +24,5 @@ __all__ = [
     "sniff",
     "write",
     "write_stream",
+    "written",
 ]

@@ -15,6 +15,7 @@ from ..source import Source
 __all__ = ["Choice", "Found", "choose", "others"]
 
 _REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
+_ANCILLARY = "ancillary_variables"
 _EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
 _NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n", "degreesn", "degreen")
 _MOST_NAMES = 12
@@ -137,7 +138,7 @@ def _only(dataset: Any, coordinates: set[str]) -> str:
     variables = dataset.variables
     beside = {str(name) for name in dataset.sizes} | coordinates
     for variable in variables.values():
-        beside |= _referred(variable)
+        beside |= _referred(variable) | set(str(variable.attrs.get(_ANCILLARY, "")).split())
     wide = [
         str(name)
         for name, variable in variables.items()
