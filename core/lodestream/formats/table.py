@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import BinaryIO
 
 from ..surface import Surface
@@ -14,11 +15,12 @@ from .obj import reader as obj
 from .obj import writer as obj_writer
 from .pcd import reader as pcd
 from .plot3d import reader as plot3d
+from .plot3d import writer as plot3d_writer
 from .ply import reader as ply
 from .ply import writer as ply_writer
 from .raster import ascii_grid, ascii_writer, cog, geotiff, png, srtm_hgt, usgs_dem
 from .source import Source
-from .vtk import cgns
+from .vtk import cgns, multiblock
 from .vtk import legacy as vtk_legacy
 from .vtk import writer as vts_writer
 from .vtk import xml_files as vtk_xml
@@ -60,6 +62,9 @@ class Format:
         Whether reading starts a separate process, which must be allowed and needs its own memory.
     write_suffixes : tuple of str
         The suffixes under which it is written, if not under all of them.
+    write_beside : callable or None
+        Takes a `Surface` and the path of its file, for a format of several files: it puts them all in place, complete
+        or not at all. `write` makes a ZIP archive of them then.
     """
 
     name: str
@@ -75,6 +80,7 @@ class Format:
     media_type: str = "application/octet-stream"
     process: bool = False
     write_suffixes: tuple[str, ...] = ()
+    write_beside: Callable[[Surface, Path], None] | None = None
 
     @property
     def suffixes_out(self) -> tuple[str, ...]:
@@ -84,7 +90,7 @@ class Format:
     @property
     def stream_suffix(self) -> str:
         """Suffix of a file into which `write` writes; empty where it is only read."""
-        return self.suffixes_out[0] if self.write else ""
+        return self.suffixes_out[0] + (".zip" if self.write_beside else "") if self.write else ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,6 +188,15 @@ FORMATS = (
         more=vtk_xml.MORE,
         process=True,
     ),
+    Format(
+        name="vtm",
+        suffixes=multiblock.SUFFIXES,
+        sniff=multiblock.sniff,
+        write=multiblock.write,
+        write_beside=multiblock.write_beside,
+        blocks=True,
+        media_type=multiblock.MEDIA_TYPE,
+    ),
     Format(name="glb", suffixes=(".glb",), sniff=glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
     Format(name="cgns", suffixes=(".cgns",), sniff=cgns.sniff, read=cgns.read, options=cgns.OPTIONS, process=True),
     Format(name="bpt", suffixes=(bezier.SUFFIX,), sniff=bezier.sniff, read=bezier.read, options=bezier.OPTIONS),
@@ -197,6 +212,9 @@ FORMATS = (
         suffixes=plot3d.SUFFIXES,
         sniff=plot3d.sniff,
         read=plot3d.read,
+        write=plot3d_writer.write,
+        blocks=True,
+        write_suffixes=plot3d_writer.SUFFIXES,
         options=plot3d.READ_OPTIONS,
         more=plot3d.MORE,
     ),

@@ -66,8 +66,8 @@ def written(name: str) -> Format:
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file; the suffix decides the format.
 
-    The file is written under a temporary name and renamed at the end, so it is complete or absent. A `FormatWarning`
-    tells what the format cannot hold.
+    The file is written under a temporary name and renamed at the end, so it is complete or absent; so are both the
+    file and the folder of a .vtm. A `FormatWarning` tells what the format cannot hold.
 
     Raises
     ------
@@ -82,6 +82,12 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
             write_stream(surface, format_.name, file)
         return
     target = path.resolve()  # a link stays a link
+    if format_.write_beside is not None:
+        try:
+            format_.write_beside(_prepared(surface, format_), target)
+        except InputError as error:
+            raise with_name(error, str(path)) from None
+        return
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
@@ -115,8 +121,14 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
         If the format cannot hold this surface. Nothing has been written then.
     """
     format_ = written(format_name)
-    check_blocks(format_, len(surface.blocks))
+    surface = _prepared(surface, format_)
     assert format_.write is not None, "it is written"
+    format_.write(surface, file)
+
+
+def _prepared(surface: Surface, format_: Format) -> Surface:
+    """The surface as a writer takes it: with its repeated rows, columns and angles."""
+    check_blocks(format_, len(surface.blocks))
     surface = restore(surface)
     note_infinities(surface, format_.name)
-    format_.write(surface, file)
+    return surface

@@ -20,8 +20,8 @@ _HELD = ("geotransform", "grid", "axes")
 #: What stands for holes where the surface does not say so, or a height has that value.
 _NODATA = (-9999, -99999, -999999, -32768, -2147483648)
 
-#: The place of a grid that has none: cells of 1 by 1 from 0, as GDAL gives images.
-_NOWHERE = (0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
+#: The place of a grid that has none: x is the column, y is the row.
+_NOWHERE = (-0.5, 1.0, 0.0, -0.5, 0.0, 1.0)
 
 
 def write(surface: Surface, file: BinaryIO) -> None:

@@ -250,7 +250,12 @@ def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
 def _without_hidden(
     hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.bool_], dict[str, Any]]:
-    """Make holes of the points all of whose cells are hidden; name the other hidden cells."""
+    """Make holes of the points all of whose cells are hidden; name the other hidden cells.
+
+    A cell with a hidden point says nothing more by being hidden: its other points are valid.
+    """
+    if mask is not None:
+        hidden = hidden & mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
     around = np.pad(hidden, 1, constant_values=True)
     all_hidden = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
     valid = ~all_hidden if mask is None else mask & ~all_hidden
