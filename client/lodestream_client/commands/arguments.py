@@ -291,6 +291,13 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--name", metavar="N", help="name of the surface")
     group.add_argument(
+        "--format",
+        dest="format_name",
+        metavar="F",
+        help="format of the file, as its name would say it, such as hgt or geotiff; standard input needs it where the "
+        "content does not tell (default: the content decides)",
+    )
+    group.add_argument(
         "-o",
         dest="options",
         action="append",
@@ -313,12 +320,15 @@ class SurfaceOptions:
         Name of the surface.
     format_options : mapping of str to str
         The ``-o`` options.
+    format_name : str or None
+        The format that the file must have.
     """
 
     quality: Quality
     closed: Closure
     name: str | None
     format_options: Mapping[str, str]
+    format_name: str | None = None
 
 
 def surface_options(args: argparse.Namespace) -> SurfaceOptions:
@@ -326,7 +336,8 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
     Ends the program if they are wrong, for example if a key is given twice.
     """
-    return SurfaceOptions(quality_of(args), args.closed, args.name, _format_options(args))
+    options = _format_options(args)
+    return SurfaceOptions(quality_of(args), args.closed, args.name, options, args.format_name)
 
 
 def _format_options(args: argparse.Namespace) -> dict[str, str]:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["PushOptions", "register", "run"]
 
+_STANDARD_INPUT = "standard input"
+
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-command."""
@@ -85,6 +87,26 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _filename(options: PushOptions, path: Path) -> str | None:
+    """The name that tells the server the format of the first file; None where its own name and content do.
+
+    Raises
+    ------
+    OptionError
+        If there is no such format.
+    FormatError
+        If the file has another one.
+    """
+    wanted, name = options.surface.format_name, options.files[0]
+    if wanted is None:
+        return None
+    from lodestream.formats import sniff
+
+    format_ = sniff(path, filename=_STANDARD_INPUT if name == "-" else name, format_name=wanted)
+    stem, suffix = (_STANDARD_INPUT, "") if name == "-" else (Path(name).stem, Path(name).suffix.lower())
+    return stem + (suffix if suffix in format_.suffixes else format_.suffixes[0])
+
+
 def _uploaded(options: PushOptions) -> Description:
     from .. import sync
 
@@ -104,6 +126,7 @@ def _uploaded(options: PushOptions) -> Description:
         return sync.upload(
             options.url,
             *sources,
+            filename=_filename(options, files.paths[0]),
             precision=wanted.quality.precision,
             rms=wanted.quality.rms,
             attribute_precision=wanted.quality.attributes,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -242,6 +243,36 @@ def test_encode_takes_surface_options(run: Run, tmp_path: Path) -> None:
     assert described["closed"] == [True, False]
     assert described["metadata"]["name"] == "Ring"
     assert described["exact"] is True
+
+
+class _Input:
+    """Standard input that holds these bytes."""
+
+    def __init__(self, content: bytes) -> None:
+        self.buffer = io.BytesIO(content)
+
+
+def test_standard_input_has_the_format_that_is_said(
+    run: Run, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers, out = b"10.5 20\n30 40\n50 60\n", tmp_path / "a.lode"
+    for format_name in ("text", "csv"):
+        monkeypatch.setattr(sys, "stdin", _Input(numbers))
+        assert run("encode", "-", out, "--format", format_name)[0] == 0
+        np.testing.assert_array_equal(ls.decode(out.read_bytes()).points, [[10.5, 20], [30, 40], [50, 60]])
+    monkeypatch.setattr(sys, "stdin", _Input(numbers))
+    code, stdout, stderr = run("push", "-", server, "--format", "csv", "--json")
+    assert (code, stderr) == (0, "")
+    assert json.loads(stdout)["filenames"] == ["standard input.dat"]
+    assert json.loads(stdout)["shape"] == [3, 2]
+    (tmp_path / "heights.bin").write_bytes(numbers + b"70 80\n")
+    code, stdout, _ = run("push", tmp_path / "heights.bin", server, "--format", "text", "--json")
+    assert (code, json.loads(stdout)["filenames"]) == (0, ["heights.dat"])
+    for command in (("encode", "-", out), ("push", "-", server)):
+        monkeypatch.setattr(sys, "stdin", _Input(numbers))
+        code, stdout, stderr = run(*command, "--format", "pcd")
+        assert (code, stdout) == (1, "")
+        assert "standard input: expected a file of format pcd, got text" in stderr
 
 
 def test_encode_with_a_precision(run: Run, terrain_file: Path, terrain: Terrain, tmp_path: Path) -> None:
