@@ -379,7 +379,7 @@ def test_write_goes_through_what_is_no_file(tmp_path: Path) -> None:
 def test_formats_that_are_not_written_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"ends in one of \.npy, .*\.ply, \.obj, \.vts, .*\.glb"):
         formats.write(Surface(np.eye(3)), tmp_path / "a.docx")
-    with pytest.raises(OptionError, match=r"one of npy, .*ply, obj, vts, glb.*, got 'pcd'"):
+    with pytest.raises(OptionError, match=r"one of npy, .*ply, obj, vts, vtm, glb.*, got 'pcd'"):
         formats.write_stream(Surface(np.eye(3)), "pcd", io.BytesIO())
     assert list(tmp_path.iterdir()) == []
 

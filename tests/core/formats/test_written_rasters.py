@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, FormatWarning
+from lodestream.errors import FormatError, FormatWarning, InputError
 from lodestream.surface import Block, Surface
 
 rasterio = pytest.importorskip("rasterio")
@@ -70,7 +71,7 @@ def test_a_format_has_the_names_of_its_suffixes() -> None:
     assert formats.for_writing("cog.tif").name == "geotiff"
 
 
-def read_back(surface: Surface, path: Path, **options: str) -> Surface:
+def read_back(surface: Surface, path: Path, **options: Any) -> Surface:
     formats.write(surface, path)
     return formats.read(path, **options)
 
@@ -221,3 +222,30 @@ def test_what_is_in_the_way_leaves_no_file(tmp_path: Path, suffix: str) -> None:
         with pytest.raises(FormatError, match="expected heights on an even grid"):
             formats.write(Surface(np.random.default_rng(1).normal(size=(6, 9, 3))), tmp_path / f"a.{suffix}")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"grid": [["a", "b"], [1, 2]]},
+        {"grid": 1.5},
+        {"grid": [[0, 1], [0, 1]], "nodes": [None, ["x"] * 9]},
+        {"grid": [[0, 1], [0, 1]], "nodes": [None]},
+        {"grid": [[0, 1], [0, 1]], "angles": [{"channel": 0}]},
+        {"axes": {"x": [0, 1], "y": [0, 1], "dtype": "no type"}},
+    ],
+)
+@pytest.mark.parametrize("kind", ["npz", "cog", "netcdf", "esri-ascii", "plot3d", "vtm"])
+@pytest.mark.filterwarnings("ignore:.*assumes evenly spaced:lodestream.errors.FormatWarning")
+def test_metadata_that_are_no_rules_are_refused(kind: str, metadata: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"expected .* in the metadata, got"):
+        formats.write_stream(Surface(hills(), metadata=metadata), kind, io.BytesIO())
+
+
+@pytest.mark.parametrize("nodata", ["none", b"-9999", [1], True, float("inf")])
+@pytest.mark.parametrize("kind", ["cog", "netcdf", "esri-ascii"])
+def test_nodata_that_is_no_number_is_passed_over(tmp_path: Path, kind: str, nodata: Any) -> None:
+    surface = with_hole(np.int32, nodata=nodata)
+    with (tmp_path / "a").open("wb") as file:
+        formats.write_stream(surface, kind, file)
+    same(formats.read(tmp_path / "a"), surface)

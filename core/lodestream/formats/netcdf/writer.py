@@ -198,7 +198,7 @@ def _filled(
 def _fill(values: NDArray[Any], mask: NDArray[np.bool_], nodata: Any) -> Any:
     """The value of holes, in the type of the values: the given one, NaN, or an integer that none of them is."""
     dtype, valid = values.dtype, values[mask]
-    candidates: list[float] = [nodata] if isinstance(nodata, int | float) else []
+    candidates: list[float] = [nodata] if isinstance(nodata, int | float) and np.isfinite(nodata) else []
     if dtype.kind == "f":
         fits = [dtype.type(it) for it in candidates if abs(it) <= np.finfo(dtype).max]
         return next((it for it in fits if not (valid == it).any()), dtype.type(np.nan))

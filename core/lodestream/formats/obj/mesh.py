@@ -239,8 +239,8 @@ class ObjFile:
             if len(said - _NOTHING) >= least:
                 found.append(f"{what} ({', '.join(kind.decode() for kind in kinds if kind in self._others)}) left out")
         if self._foreign:
-            kinds = [f"{kind} ({number(count)})" for kind, count in self._foreign.items()]
-            found.append(f"statements that are no geometry left out: {', '.join(kinds)}")
+            foreign = ", ".join(f"{kind} ({number(count)})" for kind, count in self._foreign.items())
+            found.append(f"statements that are no geometry left out: {foreign}")
         if self.face_count and self.segments:
             found.append("lines (l) beside faces left out")
         for place, what in ((1, "places in a texture (vt)"), (2, "normals (vn)")):

@@ -142,8 +142,8 @@ def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
     """The value that stands for holes; None where there is none."""
     given = surface.metadata.get("nodata")
     valid = heights if surface.mask is None else heights[surface.mask]
-    if given is not None:
-        value = float(given)
+    value = _number(given)
+    if value is not None:
         if heights.dtype.kind == "f" and np.isnan(value):
             return value
         limits: Any = np.finfo(heights.dtype) if heights.dtype.kind == "f" else np.iinfo(heights.dtype)
@@ -151,6 +151,14 @@ def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
         if held and not (valid == heights.dtype.type(value)).any():
             return value
     return float("nan") if surface.mask is not None and heights.dtype.kind == "f" else None
+
+
+def _number(text: Any) -> float | None:
+    """The number that metadata give, which text may be; None where they give none."""
+    try:
+        return float(text) if isinstance(text, int | float | str) else None
+    except (ValueError, OverflowError):
+        return None
 
 
 def _locate(dataset: Any, surface: Surface) -> Any:
