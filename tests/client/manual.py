@@ -17,6 +17,7 @@ COMMANDS = (
     "token",
     "encode",
     "decode",
+    "convert",
     "info",
     "push",
     "retry",

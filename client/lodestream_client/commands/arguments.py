@@ -29,6 +29,7 @@ __all__ = [
     "add_command",
     "add_json_option",
     "add_rate_option",
+    "add_reading_options",
     "add_size_option",
     "add_surface_options",
     "add_target_options",
@@ -45,6 +46,7 @@ __all__ = [
     "parse_surface",
     "parse_tolerance",
     "quality_of",
+    "reading_options",
     "standard_input_once",
     "standard_output_once",
     "surface_options",
@@ -282,6 +284,11 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
         "with a --precision of the points",
     )
+    add_reading_options(group)
+
+
+def add_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that decide how a file is read, whatever becomes of it."""
     group.add_argument(
         "--closed",
         choices=("auto", "none", "rows", "cols", "both"),
@@ -336,8 +343,12 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
     Ends the program if they are wrong, for example if a key is given twice.
     """
-    options = _format_options(args)
-    return SurfaceOptions(quality_of(args), args.closed, args.name, options, args.format_name)
+    return reading_options(args, quality_of(args))
+
+
+def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
+    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice."""
+    return SurfaceOptions(quality, args.closed, args.name, _format_options(args), args.format_name)
 
 
 def _format_options(args: argparse.Namespace) -> dict[str, str]:

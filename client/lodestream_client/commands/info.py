@@ -108,7 +108,8 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     for kind in ("levels", "layers"):
         if details.get(kind):
             out.print()
-            out.print(_states(kind, details[kind], out.is_terminal))
+            exact = details.get("bytes") if kind == "layers" and details.get("exact") else None
+            out.print(_states(kind, details[kind], out.is_terminal, exact))
 
 
 def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -166,7 +167,8 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
+def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool, exact: int | None) -> Any:
+    """A table of levels or layers; `exact` are the bytes of all, which end with every value."""
     from rich import box
     from rich.table import Table
 
@@ -180,6 +182,8 @@ def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
         place = [_size(state["shape"])] if grids else [str(state["level"])] if kind == "layers" else []
         figures = (f"{state['bytes']:,}", _figure(state.get("rms")), _figure(state.get("max")))
         table.add_row(*map(cell, (number, *place, *figures)))
+    if exact is not None:
+        table.add_row(*map(cell, ("exact", states[-1]["level"], f"{exact:,}", "0", "0")))
     return table
 
 

@@ -118,6 +118,10 @@ def _level(layout: Layout) -> int | None:
     return None
 
 
+#: Heights that differ by no more have no relief, and no factor would give them one.
+_FLAT = 1e-300
+
+
 def _heights(figure: Figure, block: Block) -> None:
     from matplotlib.colors import LightSource
 
@@ -127,7 +131,7 @@ def _heights(figure: Figure, block: Block) -> None:
     figure.set_size_inches(max(columns * scale, 300) / _DPI + 1.5, max(rows * scale, 200) / _DPI + 0.7)
     axes = figure.add_subplot()
     low, high = (float(edge) for edge in (np.nanmin(heights), np.nanmax(heights))) if heights.size else (0.0, 1.0)
-    height = max(high - low, np.finfo(np.float64).tiny)
+    height = high - low
     image = axes.imshow(heights, cmap="terrain", vmin=low, vmax=high)
     if min(rows, columns) > 1:
         shaded = LightSource(*_LIGHT).shade(
@@ -136,7 +140,7 @@ def _heights(figure: Figure, block: Block) -> None:
             blend_mode="soft",
             vmin=low,
             vmax=high,
-            vert_exag=_RELIEF * max(rows, columns) / height,
+            vert_exag=_RELIEF * max(rows, columns) / height if height > _FLAT else 0.0,
         )
         shaded[..., 3] = np.isfinite(heights)
         axes.imshow(shaded)

@@ -275,6 +275,59 @@ def test_standard_input_has_the_format_that_is_said(
         assert "standard input: expected a file of format pcd, got text" in stderr
 
 
+def test_bytes_that_are_read_twice_count_once(run: Run, container_file: Path, tmp_path: Path) -> None:
+    size = container_file.stat().st_size
+    for options in ((), ("--level", "1"), ("--until-rms", "1e-2d")):
+        code, stdout, _ = run("decode", container_file, tmp_path / "a.npy", "--json", *options)
+        assert code == 0
+        assert 0 < json.loads(stdout)["wire_bytes"] <= size
+    assert run("decode", container_file, tmp_path / "a.npy")[2].count("read)") == 1
+
+
+def test_the_last_row_of_layers_is_the_exact_surface(run: Run, container_file: Path, tmp_path: Path) -> None:
+    last = run("info", container_file)[1].splitlines()[-1].split()
+    levels = len(json.loads(run("info", container_file, "--json")[1])["levels"])
+    assert last == ["exact", str(levels - 1), f"{container_file.stat().st_size:,}", "0", "0"]
+    rounded = ls.encode(ls.decode(container_file.read_bytes()), precision=0.5)
+    (tmp_path / "p.lode").write_bytes(rounded)
+    assert "exact" not in run("info", tmp_path / "p.lode")[1].splitlines()[-1]
+
+
+def test_convert_goes_from_one_format_to_another(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = np.arange(24, dtype=np.float32).reshape(4, 6)
+    np.save(tmp_path / "a.npy", heights)
+    code, stdout, stderr = run("convert", tmp_path / "a.npy", tmp_path / "b.npz")
+    assert (code, stdout) == (0, "")
+    assert stderr.startswith("lodestream: 4 x 6 points written in ")
+    with np.load(tmp_path / "b.npz") as arrays:
+        np.testing.assert_array_equal(arrays["heights"], heights)
+    code, stdout, _ = run("convert", tmp_path / "b.npz", tmp_path / "c.vts", "-o", "array=heights", "--json")
+    assert (code, json.loads(stdout)["shape"]) == (0, [4, 6])
+    assert (tmp_path / "c.vts").stat().st_size > heights.nbytes
+    monkeypatch.setattr(sys, "stdin", _Input(b"1,2\n3,4\n"))
+    assert run("convert", "-", tmp_path / "d.npy", "--format", "csv")[0] == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "d.npy"), [[1, 2], [3, 4]])
+
+
+def test_convert_says_what_it_does_not_do(run: Run, container_file: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.eye(3))
+    for files, words in (
+        ((tmp_path / "a.npy", tmp_path / "b.lode"), "lodestream encode makes containers"),
+        ((container_file, tmp_path / "b.npy"), "lodestream decode reads containers"),
+        ((tmp_path / "a.npy", tmp_path / "b.npy", "--precision", "1"), "--precision"),
+    ):
+        code, stdout, stderr = run("convert", *files)
+        assert (code, stdout) == (2, "")
+        assert words in stderr
+    assert run("convert", tmp_path / "a.npy", tmp_path / "b.docx")[0] == 1
+    points = np.random.default_rng(1).normal(size=(2, 3, 3))
+    blocks = ls.Surface(blocks=[ls.Block(points), ls.Block(points + 9)])
+    ls.write(blocks, tmp_path / "two.p3d")
+    code, _, stderr = run("convert", tmp_path / "two.p3d", tmp_path / "two.npy")
+    assert (code, "two.npy: expected one block for npy, got 2" in stderr) == (1, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npy", "two.p3d"]
+
+
 def test_encode_with_a_precision(run: Run, terrain_file: Path, terrain: Terrain, tmp_path: Path) -> None:
     assert run("encode", terrain_file, tmp_path / "p.lode", "--precision", "0.5")[0] == 0
     assert run("decode", tmp_path / "p.lode", tmp_path / "p.npy")[0] == 0

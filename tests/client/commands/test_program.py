@@ -100,6 +100,29 @@ def test_the_manual_is_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
     assert manual.PATH.read_text().split() == manual.render().split(), "run python -m tests.client.manual"
 
 
+def test_the_package_runs_as_a_module() -> None:
+    command = [sys.executable, "-m", "lodestream"]
+    for arguments in (["--version"], ["formats", "--json"], ["nonsense"]):
+        ours = subprocess.run([*command, *arguments], capture_output=True, env=environment(), timeout=120, check=False)
+        assert ours.returncode == call(*arguments).returncode
+        assert ours.stdout == call(*arguments).stdout
+        assert ours.stderr == call(*arguments).stderr
+
+
+def test_the_module_says_where_its_program_is_not_installed() -> None:
+    code = "import importlib.metadata as m; m.entry_points = lambda **_: (); import lodestream.__main__ as main; "
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}raise SystemExit(main.main())"],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "lodestream: the command is not installed: pip install lodestream\n"
+
+
 def test_pipes(terrain_file: Path) -> None:
     encoded = call("encode", "-", "-", data=terrain_file.read_bytes())
     assert encoded.returncode == 0
