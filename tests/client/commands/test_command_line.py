@@ -14,6 +14,7 @@ from rich.console import Console
 
 import lodestream as ls
 from lodestream_client.commands import surfaces
+from lodestream_server import running_server
 
 from ..conftest import Run
 
@@ -291,6 +292,35 @@ def test_the_last_row_of_layers_is_the_exact_surface(run: Run, container_file: P
     rounded = ls.encode(ls.decode(container_file.read_bytes()), precision=0.5)
     (tmp_path / "p.lode").write_bytes(rounded)
     assert "exact" not in run("info", tmp_path / "p.lode")[1].splitlines()[-1]
+
+
+def test_list_finds_and_sorts(run: Run, tmp_path: Path) -> None:
+    with running_server(tmp_path / "data", workers=1) as url:
+        for name, size in (("Wide valley", 60), ("alp", 40), ("Hill", 50)):
+            np.save(tmp_path / "a.npy", np.random.default_rng(size).normal(size=(size, size)))
+            assert run("push", tmp_path / "a.npy", url, "--name", name)[0] == 0
+        (tmp_path / "broken.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
+        assert run("push", tmp_path / "broken.off", url)[0] == 1
+
+        def names(*options: str) -> list[str]:
+            code, stdout, _ = run("list", url, "--json", *options)
+            assert code == 0
+            return [surface["name"] or surface["filenames"][0] for surface in json.loads(stdout)["surfaces"]]
+
+        assert sorted(names()) == ["Hill", "Wide valley", "alp", "broken.off"]
+        assert names("--reverse") == names()[::-1]
+        assert names("--sort", "name") == ["alp", "broken.off", "Hill", "Wide valley"]
+        assert names("--sort", "size") == ["broken.off", "alp", "Hill", "Wide valley"]
+        assert names("--sort", "size", "--reverse", "--state", "ready") == ["Wide valley", "Hill", "alp"]
+        assert names("--sort", "created") == ["Wide valley", "alp", "Hill", "broken.off"]
+        assert names("--sort", "state")[0] == "broken.off"
+        assert names("--search", "hill") == ["Hill"]
+        assert names("--search", "AL") == [name for name in names() if name in ("alp", "Wide valley")]
+        line = run("list", url, "--state", "failed")[1]
+        assert "failed" in line
+        assert "24 B" in line
+        assert "broken.off: expected" in line
+        assert run("list", url, "--search", "nothing")[1:] == ("", "lodestream: no such surfaces\n")
 
 
 def test_convert_goes_from_one_format_to_another(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
