@@ -294,6 +294,34 @@ def test_the_last_row_of_layers_is_the_exact_surface(run: Run, container_file: P
     assert "exact" not in run("info", tmp_path / "p.lode")[1].splitlines()[-1]
 
 
+def test_push_of_many_files(run: Run, server: str, tmp_path: Path) -> None:
+    names = []
+    for number in range(3):
+        names.append(tmp_path / f"slope-{number}.npy")
+        np.save(names[-1], np.add.outer(np.arange(20 + number), np.arange(30)))
+    code, stdout, stderr = run("push", "--each", *names, server)
+    assert (code, stderr) == (0, "")
+    urls = stdout.splitlines()
+    shapes = [json.loads(run("info", url, "--json")[1])["shape"] for url in urls]
+    assert shapes == [[20, 30], [21, 30], [22, 30]]
+    (tmp_path / "no.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
+    given = (names[0], tmp_path / "no.off", tmp_path / "missing.npy", names[1])
+    code, stdout, stderr = run("push", "--each", *given, server)
+    assert code == 1
+    assert len(stdout.splitlines()) == 2
+    assert stderr.splitlines()[1:] == [
+        f"lodestream: {tmp_path / 'missing.npy'}: No such file or directory",
+        "lodestream: 2 of 4 files failed",
+    ]
+    assert "no.off: " in stderr.splitlines()[0]
+    code, stdout, _ = run("push", "--each", *given, server, "--json")
+    told = json.loads(stdout)
+    assert (code, len(told["surfaces"]), [it["file"] for it in told["failed"]]) == (1, 2, [*map(str, given[1:3])])
+    assert run("push", "--each", *names, server, "--name", "all")[0] == 2
+    code, stdout, stderr = run("push", "--each", *names, "http://127.0.0.1:9")
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+
+
 def test_list_finds_and_sorts(run: Run, tmp_path: Path) -> None:
     with running_server(tmp_path / "data", workers=1) as url:
         for name, size in (("Wide valley", 60), ("alp", 40), ("Hill", 50)):
