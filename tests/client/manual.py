@@ -26,6 +26,7 @@ COMMANDS = (
     "list",
     "rm",
     "formats",
+    "completion",
 )
 ACTIONS = {"token": ("create", "list", "revoke")}
 
