@@ -65,12 +65,13 @@ async def upload(
     progress: Progress | None = None,
     token: str | None = None,
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
+    filename: str | None = None,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
     A surface in memory is encoded in a thread, and files are read in threads; `progress` is called from there.
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {})
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
     parcel = await _prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:

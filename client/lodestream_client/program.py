@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import lodestream
 from lodestream.errors import LodestreamError
 
-from .commands import decode, demo, encode, formats, info, pull, push, retry, surfaces, view
+from .commands import completion, convert, decode, demo, encode, formats, info, pull, push, retry, surfaces, view
 from .commands.arguments import Subparsers, add_command
 from .starting import EndingAtOnce
 from .terminal.interrupts import exit_code, unwrapping
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["build_parser", "main"]
 
-_MODULES = (demo, encode, decode, info, push, retry, pull, view, surfaces, formats)
+_MODULES = (demo, encode, decode, convert, info, push, retry, pull, view, surfaces, formats, completion)
 
 
 def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
@@ -83,6 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with EndingAtOnce():
             arguments = sys.argv[1:] if argv is None else argv
+            if completion.ASKED in os.environ and argv is None:
+                completion.complete(build_parser())
             args = build_parser(arguments).parse_args(arguments)
         with clean_warnings(), unwrapping():
             code: int = args.run(args)

@@ -116,6 +116,7 @@ def upload(
     progress: Progress | None = None,
     token: str | None = None,
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
+    filename: str | None = None,
 ) -> Description:
     """Upload a surface.
 
@@ -146,6 +147,9 @@ def upload(
         Token, if the server needs one.
     attribute_precision : mapping of str to Tolerance, float or str, or None
         Maximum error of attributes, by name; the others are lossless.
+    filename : str or None
+        Name of the first file, whose suffix tells formats that content does not (``N37W122.hgt``); None: its own, or
+        none of an open file and of bytes.
 
     Returns
     -------
@@ -164,7 +168,7 @@ def upload(
     UnreachableError
         If there is no connection.
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {})
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
     parcel = prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:

@@ -17,6 +17,7 @@ COMMANDS = (
     "token",
     "encode",
     "decode",
+    "convert",
     "info",
     "push",
     "retry",
@@ -25,6 +26,7 @@ COMMANDS = (
     "list",
     "rm",
     "formats",
+    "completion",
 )
 ACTIONS = {"token": ("create", "list", "revoke")}
 

@@ -214,11 +214,13 @@ def test_levels_as_files_over_http(addresses: dict[str, str], run: Run, tmp_path
     assert run("pull", url, tmp_path / "a.ply", "--level", "2")[0] == 0
     answer = httpx.get(f"{url}/levels/2", params={"format": "ply"})
     assert (answer.status_code, answer.content) == (200, (tmp_path / "a.ply").read_bytes())
-    for name in ("obj", "glb", "vts"):
+    for name in ("obj", "glb", "vts", "vtm", "plot3d"):
         assert httpx.get(f"{url}/levels/1", params={"format": name}).status_code == 200
     refused = httpx.get(f"{url}/levels/1", params={"format": "npy"})
     assert refused.status_code == 422
-    assert "expected one block for npy, got 3: ply, obj, vts and glb hold several" in refused.json()["detail"]
+    assert (
+        "expected one block for npy, got 3: ply, obj, vts, vtm, glb and plot3d hold several" in refused.json()["detail"]
+    )
 
 
 @pytest.mark.parametrize("suffix", ["npy", "tif", "png"])
@@ -230,7 +232,7 @@ def test_blocks_go_into_formats_that_hold_several(
         code, _, err = run(command, place, tmp_path / f"out.{suffix}")
         assert code == 1
         assert err.count("\n") == 1
-        assert "got 3: ply, obj, vts and glb hold several" in err
+        assert "got 3: ply, obj, vts, vtm, glb and plot3d hold several" in err
         assert not list(tmp_path.glob("out*"))
 
 

@@ -29,6 +29,7 @@ __all__ = [
     "add_command",
     "add_json_option",
     "add_rate_option",
+    "add_reading_options",
     "add_size_option",
     "add_surface_options",
     "add_target_options",
@@ -45,6 +46,7 @@ __all__ = [
     "parse_surface",
     "parse_tolerance",
     "quality_of",
+    "reading_options",
     "standard_input_once",
     "standard_output_once",
     "surface_options",
@@ -283,6 +285,11 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
         "with a --precision of the points",
     )
+    add_reading_options(group)
+
+
+def add_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that decide how a file is read, whatever becomes of it."""
     group.add_argument(
         "--closed",
         choices=("auto", "none", "rows", "cols", "both"),
@@ -291,6 +298,13 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "the file decides)",
     )
     group.add_argument("--name", metavar="N", help="name of the surface")
+    group.add_argument(
+        "--format",
+        dest="format_name",
+        metavar="F",
+        help="format of the file, as its name would say it, such as hgt or geotiff; standard input needs it where the "
+        "content does not tell (default: the content decides)",
+    )
     group.add_argument(
         "-o",
         dest="options",
@@ -314,12 +328,15 @@ class SurfaceOptions:
         Name of the surface.
     format_options : mapping of str to str
         The ``-o`` options.
+    format_name : str or None
+        The format that the file must have.
     """
 
     quality: Quality
     closed: Closure
     name: str | None
     format_options: Mapping[str, str]
+    format_name: str | None = None
 
 
 def surface_options(args: argparse.Namespace) -> SurfaceOptions:
@@ -327,7 +344,12 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
     Ends the program if they are wrong, for example if a key is given twice.
     """
-    return SurfaceOptions(quality_of(args), args.closed, args.name, _format_options(args))
+    return reading_options(args, quality_of(args))
+
+
+def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
+    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice."""
+    return SurfaceOptions(quality, args.closed, args.name, _format_options(args), args.format_name)
 
 
 def _format_options(args: argparse.Namespace) -> dict[str, str]:

@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     outcome = Outcome(
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
-        job.read_bytes,
+        job.read.total,
         view.level,
         view.rms,
         view.max_error,
@@ -140,13 +140,14 @@ class _Job:
         progress: Callable[[float], None],
     ) -> None:
         from lodestream.decoding.decoder import Decoder
+        from lodestream.planning.byte_ranges import RangeSet
         from lodestream.planning.selection import selection_of
 
         target = options.target
         self.decoder: Decoder = Decoder(selection_of(target), max_vertices=options.max_vertices, level=target.level)
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
-        self.read_bytes = 0
+        self.read = RangeSet()  # what was read; the header and the index more than once
         self.metadata: dict[str, object] | None = None
         self.by_level = target.level is not None or target.order == "level"
         self._file = file
@@ -176,7 +177,7 @@ class _Job:
     def _read(self, offset: int, length: int) -> bytes:
         self._file.seek(offset)
         data = self._file.read(length)
-        self.read_bytes += len(data)
+        self.read.add(offset, len(data))
         return data
 
     def _late(self) -> bool:

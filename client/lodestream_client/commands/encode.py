@@ -102,7 +102,14 @@ def read_surface(names: Sequence[str], options: SurfaceOptions) -> Surface:
     with input_files(names) as files:
         first, *more = files.paths
         format_options = _format_options(options.format_options)
-        surface = ls.read(first, *more, closed=options.closed, filename=files.filename, **format_options)
+        surface = ls.read(
+            first,
+            *more,
+            closed=options.closed,
+            filename=files.filename,
+            format_name=options.format_name,
+            **format_options,
+        )
     if options.name:
         surface.metadata["name"] = options.name
     return surface
@@ -143,7 +150,7 @@ def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions)
 
 def _format_options(options: Mapping[str, str]) -> dict[str, Any]:
     # Parameters of `read` that are no options of any format.
-    for key in ("path", "closed", "max_vertices", "filename"):
+    for key in ("path", "closed", "max_vertices", "filename", "allowed", "format_name"):
         if key in options:
             raise OptionError(f"{key} is not an option of any format")
     return dict(options)

@@ -110,7 +110,8 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     for kind in ("levels", "layers"):
         if details.get(kind):
             out.print()
-            out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal))
+            exact = details.get("bytes") if kind == "layers" and details.get("exact") else None
+            out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal, exact))
 
 
 def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -168,7 +169,10 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool) -> Any:
+def _states(
+    kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None
+) -> Any:
+    """A table of levels or layers; `exact` are the bytes of all, which end with every value."""
     from rich import box
     from rich.table import Table
 
@@ -184,6 +188,8 @@ def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str],
         figures = (f"{state['bytes']:,}", _figure(state.get("rms")), _figure(state.get("max")))
         own = [_figure(rms) for rms, _ in state.get("channels", [])][: len(shown)]
         table.add_row(*map(cell, (number, *place, *figures, *own)))
+    if exact is not None:
+        table.add_row(*map(cell, ("exact", states[-1]["level"], f"{exact:,}", "0", "0", *("0" for _ in shown))))
     return table
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lodestream.decoding.decoder import View
     from lodestream.surface import Surface
 
-__all__ = ["Outcome", "check_grid", "check_out", "note_unmet"]
+__all__ = ["Outcome", "check_grid", "check_out", "note_unmet", "write_surface"]
 
 
 def check_out(out: str) -> None:
@@ -57,6 +57,16 @@ def check_grid(out: str, header: Header) -> None:
         raise FormatError(f"{'standard output' if out == '-' else out}: {error}") from None
 
 
+def write_surface(surface: Surface, out: str) -> None:
+    """Write a surface to the file OUT; to standard output (``-``) as NPY."""
+    from lodestream import formats
+
+    if out == "-":
+        formats.write_stream(surface, "npy", sys.stdout.buffer)
+    else:
+        formats.write(surface, out)
+
+
 def note_unmet(target: Target, ended: str, view: View, extent: float) -> None:
     """Report a limit that could not be reached although everything arrived."""
     if ended != "complete":
@@ -83,12 +93,7 @@ class Outcome:
 
     def write(self, out: str) -> None:
         """Write the surface; to standard output as NPY."""
-        from lodestream import formats
-
-        if out == "-":
-            formats.write_stream(self.surface, "npy", sys.stdout.buffer)
-        else:
-            formats.write(self.surface, out)
+        write_surface(self.surface, out)
 
     def report(self, as_json: bool) -> None:
         """Print the figures: with ``--json`` on standard output, otherwise as a note on standard error."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..terminal.output import human_size, note_details, print_json, progress_bar, say
+from lodestream.errors import LodestreamError
+
+from ..errors import UnreachableError
+from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
 from .arguments import (
     Subparsers,
     SurfaceOptions,
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["PushOptions", "register", "run"]
 
+_STANDARD_INPUT = "standard input"
+
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-command."""
@@ -44,6 +49,12 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("files", nargs="+", metavar="FILE", help="file to upload; - for standard input")
     parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     add_surface_options(parser)
+    parser.add_argument(
+        "--each",
+        action="store_true",
+        help="each file is a surface of its own: prints one URL a line; a file that fails does not end it, but makes "
+        "the exit code 1",
+    )
     parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has stored the upload")
     add_token_option(parser)
     add_json_option(parser)
@@ -56,6 +67,7 @@ class PushOptions:
     files: tuple[str, ...]
     url: str
     surface: SurfaceOptions
+    each: bool
     wait: bool
     token: str | None
     json: bool
@@ -63,10 +75,13 @@ class PushOptions:
 
 def _options(args: argparse.Namespace) -> PushOptions:
     """The options; ends the program if the command line is wrong."""
+    if args.each and args.name is not None and len(args.files) > 1:
+        args.parser.error("argument --name: not allowed with --each, since all surfaces would have one name")
     return PushOptions(
         standard_input_once(args, args.files),
         args.url,
         surface_options(args),
+        args.each,
         not args.no_wait,
         token_of(args),
         args.json,
@@ -76,6 +91,8 @@ def _options(args: argparse.Namespace) -> PushOptions:
 def run(args: argparse.Namespace) -> int:
     """Upload, wait, print the address."""
     options = _options(args)
+    if options.each:
+        return _run_each(options)
     surface = _uploaded(options)
     note_details(surface.details)
     if options.json:
@@ -83,6 +100,51 @@ def run(args: argparse.Namespace) -> int:
     else:
         say(surface.url)
     return 0
+
+
+def _run_each(options: PushOptions) -> int:
+    """Upload one file after another; 1 if any was refused. A server that is not reached ends it."""
+    made: list[dict[str, object]] = []
+    failed: list[dict[str, str]] = []
+    for name in options.files:
+        try:
+            surface = _uploaded(replace(options, files=(name,)))
+        except UnreachableError:
+            raise
+        except (LodestreamError, OSError) as error:
+            reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+            failed.append({"file": name, "reason": reason})
+            note(reason if name in reason else f"{name}: {reason}")
+            continue
+        note_details(surface.details)
+        made.append({**surface.details, "url": surface.url})
+        if not options.json:
+            say(surface.url)
+    if options.json:
+        print_json({"surfaces": made, "failed": failed})
+    elif failed:
+        note(f"{len(failed)} of {len(options.files)} files failed")
+    return 1 if failed else 0
+
+
+def _filename(options: PushOptions, path: Path) -> str | None:
+    """The name that tells the server the format of the first file; None where its own name and content do.
+
+    Raises
+    ------
+    OptionError
+        If there is no such format.
+    FormatError
+        If the file has another one.
+    """
+    wanted, name = options.surface.format_name, options.files[0]
+    if wanted is None:
+        return None
+    from lodestream.formats import sniff
+
+    format_ = sniff(path, filename=_STANDARD_INPUT if name == "-" else name, format_name=wanted)
+    stem, suffix = (_STANDARD_INPUT, "") if name == "-" else (Path(name).stem, Path(name).suffix.lower())
+    return stem + (suffix if suffix in format_.suffixes else format_.suffixes[0])
 
 
 def _uploaded(options: PushOptions) -> Description:
@@ -104,6 +166,7 @@ def _uploaded(options: PushOptions) -> Description:
         return sync.upload(
             options.url,
             *sources,
+            filename=_filename(options, files.paths[0]),
             precision=wanted.quality.precision,
             rms=wanted.quality.rms,
             attribute_precision=wanted.quality.attributes,

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.output import cell, console, human_size, note, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_server, parse_surface, token_of
+
+if TYPE_CHECKING:
+    from ..requests.api import Description
 
 __all__ = ["register", "run_list", "run_rm"]
 
@@ -15,8 +20,23 @@ _WIDTH = 1 << 20
 
 def register(subparsers: Subparsers) -> None:
     """Add the sub-commands."""
-    parser = add_command(subparsers, "list", run_list, "list the surfaces of a server")
+    parser = add_command(
+        subparsers,
+        "list",
+        run_list,
+        "list the surfaces of a server",
+        "One line for each: URL, state, shape, size of the container (of the upload, before there is one), name,\n"
+        "owner, and why it is not ready.",
+    )
     parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
+    parser.add_argument(
+        "--search",
+        metavar="TEXT",
+        help="only those with this text in their name, file names, owner, URL or reason, in upper or lower case",
+    )
+    parser.add_argument("--state", metavar="S", help="only those in this state, such as ready, waiting or failed")
+    parser.add_argument("--sort", choices=tuple(_KEYS), help="order of the lines (default: the server's)")
+    parser.add_argument("--reverse", action="store_true", help="the other way round")
     add_token_option(parser)
     add_json_option(parser)
     parser = add_command(subparsers, "rm", run_rm, "delete a surface from a server")
@@ -29,7 +49,7 @@ def run_list(args: argparse.Namespace) -> int:
     """Ask, print one line for each: address, state, shape, bytes, name, owner, and why it is not ready."""
     from .. import sync
 
-    surfaces = sync.list_surfaces(args.url, token=token_of(args))
+    surfaces = _chosen(sync.list_surfaces(args.url, token=token_of(args)), args)
     if args.json:
         print_json({"surfaces": [{**surface.details, "url": surface.url} for surface in surfaces]})
         return 0
@@ -40,18 +60,58 @@ def run_list(args: argparse.Namespace) -> int:
     for surface in surfaces:
         details = surface.details
         shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
-        size = human_size(details["bytes"]) if details.get("bytes") is not None else "-"
-        names = [name for name in details.get("filenames") or () if name]
-        name = details.get("name") or ", ".join(names)
-        words = (surface.url, surface.state, shape, size, name, details.get("owner") or "", details.get("reason") or "")
+        size = human_size(_size(surface)) if _size(surface) is not None else "-"
+        owner, reason = details.get("owner") or "", details.get("reason") or ""
+        words = (surface.url, surface.state, shape, size, _name(surface), owner, reason)
         table.add_row(*map(cell, words))
     if surfaces:
         screen = console()
         screen.width = _WIDTH
         screen.print(table)
     else:
-        note("no surfaces")
+        note("no such surfaces" if args.search or args.state else "no surfaces")
     return 0
+
+
+def _name(surface: Description) -> str:
+    names = [str(name) for name in surface.details.get("filenames") or () if name]
+    return str(surface.details.get("name") or ", ".join(names))
+
+
+def _size(surface: Description) -> Any:
+    """Bytes of the container, or of the upload while there is none; None where the server tells neither."""
+    details = surface.details
+    return details["bytes"] if details.get("bytes") is not None else details.get("upload_bytes")
+
+
+#: What the surfaces are sorted by; where two are equal the server's order stays.
+_KEYS: Mapping[str, Callable[[Description], Any]] = {
+    "name": lambda surface: _name(surface).casefold(),
+    "size": lambda surface: _size(surface) or 0,
+    "owner": lambda surface: str(surface.details.get("owner") or "").casefold(),
+    "state": lambda surface: surface.state,
+    "created": lambda surface: str(surface.details.get("created") or ""),
+}
+
+
+def _chosen(surfaces: Sequence[Description], args: argparse.Namespace) -> list[Description]:
+    """Those that are asked for, in the order that is asked for."""
+    text = (args.search or "").casefold()
+    found = [
+        surface
+        for surface in surfaces
+        if (args.state is None or surface.state == args.state)
+        and any(text in word.casefold() for word in _words(surface))
+    ]
+    if args.sort:
+        found.sort(key=_KEYS[args.sort])
+    return found[::-1] if args.reverse else found
+
+
+def _words(surface: Description) -> list[str]:
+    details = surface.details
+    names = [str(name) for name in details.get("filenames") or ()]
+    return [surface.url, _name(surface), *names, *(str(details.get(key) or "") for key in ("owner", "reason"))]
 
 
 def run_rm(args: argparse.Namespace) -> int:

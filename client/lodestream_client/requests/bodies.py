@@ -111,7 +111,9 @@ def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, f
         if len(sources) > 1:
             raise InputError(f"expected a surface in memory as the only source, got {len(sources)} sources")
         return Parcel((("surface.lode", encoded(sources[0], asked, progress)),))
-    return Parcel(tuple(("", cast("File", source)) for source in sources), _parameters(asked))
+    names = [asked.filename or "", *[""] * (len(sources) - 1)]
+    files = tuple((name, cast("File", source)) for name, source in zip(names, sources, strict=True))
+    return Parcel(files, _parameters(asked))
 
 
 @contextmanager
@@ -130,7 +132,7 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
         for name, source in parcel.files:
             if isinstance(source, str | os.PathLike):
                 path = Path(source)
-                files.append((path.name, stack.enter_context(path.open("rb"))))
+                files.append((name or path.name, stack.enter_context(path.open("rb"))))
             elif isinstance(source, bytes | bytearray | memoryview):
                 files.append((name, io.BytesIO(source)))
             else:

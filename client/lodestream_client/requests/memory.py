@@ -41,6 +41,7 @@ class Asked:
     name: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
     attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
+    filename: str | None = None
 
     @property
     def quality(self) -> Quality:

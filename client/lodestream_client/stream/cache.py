@@ -101,6 +101,8 @@ class CacheFile:
         try:
             self._end = self._recover(size)
         except BaseException:
+            if not os.fstat(self._handle).st_size:
+                self._path.unlink(missing_ok=True)  # the disk took not even its head
             os.close(self._handle)
             raise
 
@@ -172,13 +174,17 @@ class CacheFile:
 
 
 def forget_old(folder: Path) -> None:
-    """Remove files that were not used for a month; files of other programs in the folder are not touched."""
+    """Remove files that were not used for a month, and those without data, which a program that was killed leaves.
+
+    Files of other programs in the folder are not touched.
+    """
     if not folder.is_dir():
         return
     before = time.time() - _DAYS_KEPT * 24 * 3600
     for path in folder.glob("*.part"):
         try:
-            if not is_name(path.stem) or path.lstat().st_mtime >= before:
+            found = path.lstat()
+            if not is_name(path.stem) or (found.st_mtime >= before and found.st_size > _HEAD.size):
                 continue
             handle = _locked(path)
         except (OSError, _TakenError):

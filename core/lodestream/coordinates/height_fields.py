@@ -24,6 +24,9 @@ __all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz", "window_axes
 
 _STRIP = 1 << 18
 
+#: The metadata that say where heights lie.
+_PLACE = ("grid", "axes", "geotransform", "nodes", "angles")
+
 
 def to_heights(surface: Surface, exactly: bool = True) -> Surface | None:
     """Take xyz over a regular lattice for heights.
@@ -101,6 +104,17 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     InputError
         When the metadata do not hold such rules.
     """
+    try:
+        return _coordinates(surface)
+    except InputError:
+        raise
+    except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
+        # Whoever made the container may have written anything.
+        said = {key: surface.metadata[key] for key in _PLACE if key in surface.metadata}
+        raise InputError(f"expected rules of coordinates in the metadata, got {str(said)[:80]!a}") from None
+
+
+def _coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     metadata, shape = surface.metadata, surface.shape
     nodes = metadata.get("nodes") or [None, None]
     row, column = (

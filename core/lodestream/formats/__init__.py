@@ -8,10 +8,10 @@ file needs them.
 format, write a module with ``sniff`` and ``read`` or ``write``, and give it a row.
 """
 
-from .reading import read, sniff
+from .reading import read, readable, sniff
 from .source import DEFAULT_MAX_VERTICES, check_allowed
 from .table import Format, formats
-from .writing import check_blocks, for_writing, write, write_stream
+from .writing import check_blocks, for_writing, write, write_stream, written
 
 __all__ = [
     "DEFAULT_MAX_VERTICES",
@@ -21,7 +21,9 @@ __all__ = [
     "for_writing",
     "formats",
     "read",
+    "readable",
     "sniff",
     "write",
     "write_stream",
+    "written",
 ]

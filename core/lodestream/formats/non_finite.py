@@ -11,7 +11,7 @@ from .source import number
 __all__ = ["note_infinities"]
 
 #: Formats of which an infinite coordinate is a value like any other.
-_HOLDING = ("npy", "geotiff")
+_HOLDING = ("npy", "geotiff", "cog")
 
 
 def note_infinities(surface: Surface, format_name: str) -> None:

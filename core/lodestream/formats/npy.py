@@ -17,7 +17,17 @@ from ..surface import Surface
 from .notes import metadata_left_out, warn, warn_left_out
 from .source import Source, number
 
-__all__ = ["MAGIC", "NpyHeader", "read", "read_header", "read_values", "sniff", "write"]
+__all__ = [
+    "MAGIC",
+    "NpyHeader",
+    "read",
+    "read_header",
+    "read_values",
+    "sniff",
+    "with_holes",
+    "write",
+    "write_array",
+]
 
 MAGIC = b"\x93NUMPY"
 
@@ -122,25 +132,30 @@ def read(source: Source) -> Surface:
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write the points as they are; holes of floating-point numbers are NaN.
+    """Write the points as they are; holes of floating-point numbers are NaN."""
+    closure = ["closure"] * any(surface.closed)
+    warn_left_out("NPY", [*surface.attributes, *closure, *metadata_left_out(surface, ())])
+    if surface.mask is not None and surface.points.dtype.kind != "f":
+        warn(f"NPY has integers at all points, including the {number(surface.blocks[0].holes)} holes")
+    write_array(file, with_holes(surface))
+
+
+def write_array(file: BinaryIO, array: NDArray[Any]) -> None:
+    """Write one array of numbers, booleans or text, of any shape, with its header.
 
     `numpy.save` is not used because it asks a real file for its position, which a pipe has not.
     """
-    closure = ["closure"] * any(surface.closed)
-    warn_left_out("NPY", [*surface.attributes, *closure, *metadata_left_out(surface, ())])
-    points = _with_holes(surface)
-    npy_format.write_array_header_1_0(file, npy_format.header_data_from_array_1_0(points))
-    values = points.reshape(-1).view(np.uint8).data
+    array = np.ascontiguousarray(array).reshape(array.shape)  # which makes a single number one of shape (1,)
+    npy_format.write_array_header_1_0(file, npy_format.header_data_from_array_1_0(array))
+    values = array.reshape(-1).view(np.uint8).data
     for start in range(0, len(values), _CHUNK):
         file.write(values[start : start + _CHUNK])
 
 
-def _with_holes(surface: Surface) -> NDArray[Any]:
+def with_holes(surface: Surface) -> NDArray[Any]:
+    """The points of the only block, (H, W) or (H, W, C), NaN in holes where their type has it."""
     points, mask = surface.points, surface.mask
-    if mask is None:
-        return points
-    if points.dtype.kind != "f":
-        warn(f"NPY has integers at all points, including the {number(surface.blocks[0].holes)} holes")
+    if mask is None or points.dtype.kind != "f":
         return points
     coordinates = points if points.ndim == 2 else points[..., :3]
     known = np.isfinite(coordinates) if points.ndim == 2 else np.isfinite(coordinates).all(axis=2)

@@ -16,6 +16,7 @@ from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .notes import listing, warn
 from .npy import NpyHeader, read_header, read_values
+from .npz_writer import HEIGHTS, MASK, POINTS, WORDS
 from .placed import Coordinate, place
 from .source import Source, number, refuse_array
 
@@ -34,6 +35,9 @@ _BOUNDS = (("dx", "xmin", "xmax"), ("dy", "ymin", "ymax"))
 #: How far spacing times count may be from the extent, relative to it.
 _CLOSE = 1e-6
 
+#: Bytes of a text that is kept, four a character.
+_LONGEST = 1 << 16
+
 _MAX_MEMBERS = 1000
 _ENCRYPTED = 1
 
@@ -47,7 +51,8 @@ def read(source: Source) -> Surface:
     """Read the array that is a surface, with the coordinates beside it.
 
     Those are vectors or arrays under the usual names, or under those that options give; or the numbers dx, dy, xmin,
-    xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``.
+    xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``, ``crs`` and
+    ``unit`` by their names. A bool array ``mask`` of the same rows and columns is False in holes.
 
     Raises
     ------
@@ -66,7 +71,10 @@ def read(source: Source) -> Surface:
         scalars = contents.scalars()
         if scalars:
             metadata["scalars"] = scalars
-        taken = {name, *scalars}
+        words = contents.words()
+        metadata |= words
+        mask = contents.mask(header.shape[:2])
+        taken = {name, *scalars, *words, *[MASK] * (mask is not None)}
         if axes[0] is not None and axes[1] is not None:
             taken |= {str(contents.coordinate_name(letter, header.shape[:2], name)) for letter in "xy"}
         if left_out := [other for other in contents.headers if other not in taken]:
@@ -74,11 +82,11 @@ def read(source: Source) -> Surface:
     if axes[0] is not None and axes[1] is not None:
         if values.ndim != 2:
             raise FormatError(f"expected heights of shape (H, W) for coordinates beside them, got shape {values.shape}")
-        return place(values, axes[0], axes[1], closed=source.closed, metadata=metadata)
+        return place(values, axes[0], axes[1], closed=source.closed, mask=mask, metadata=metadata)
     transform = _bounds(metadata.get("scalars", {}), header.shape)
     if transform is not None:
         metadata["geotransform"] = transform
-    return Surface(values, metadata=metadata)
+    return Surface(values, mask=mask, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -146,6 +154,22 @@ class _Contents:
             if header.dtype.kind in "iuf" and header.dtype.itemsize <= 8 and set(header.shape) <= {1}
         }
 
+    def mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """The array that says which points are no holes; None where there is none of this shape."""
+        header = self.headers.get(MASK)
+        if header is None or header.dtype.kind != "b" or header.shape != shape:
+            return None
+        return np.asarray(self.values(MASK))
+
+    def words(self) -> dict[str, str]:
+        """The texts that `WORDS` names."""
+        found = {}
+        for name in WORDS:
+            header = self.headers.get(name)
+            if header is not None and header.dtype.kind == "U" and header.shape == () and header.nbytes <= _LONGEST:
+                found[name] = str(self.values(name))
+        return found
+
 
 def _along(letter: str, shape: tuple[int, ...]) -> dict[tuple[int, ...], int | None]:
     """The shapes that x or y may have, and the axis that each runs along: None for both."""
@@ -199,6 +223,9 @@ def _choose(contents: _Contents) -> str:
     beside |= {str(contents.source.options[letter]) for letter in "xy" if letter in contents.source.options}
     surfaces = [name for name, header in contents.headers.items() if refuse_array(header.shape, header.dtype) is None]
     others = [name for name in surfaces if name.lower() not in beside and name not in beside]
+    ours = [name for name in others if name in (HEIGHTS, POINTS)]
+    if len(ours) == 1:
+        return ours[0]
     if len(others) == 1 or len(surfaces) == 1:
         return (others or surfaces)[0]
     if surfaces:

@@ -1,4 +1,4 @@
-"""Index planes of volumes: which one a reader takes, and how it is laid out in rows and columns."""
+"""Index planes of volumes: which ones a reader takes, and how each is laid out in rows and columns."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from .source import Source
 __all__ = ["HELP", "Cut", "cuts"]
 
 #: Help for the option, for the table of formats.
-HELP = "index plane of a volume, as axis and index: i0, j3, k-1 (the last)"
+HELP = "index planes of a volume, as axis and index, separated by commas: i0, j3, k-1 (the last); each is a block"
 
 _AXES = "ijk"
 _DEFAULT = "i0"
+
+#: All six sides of a volume, and some within.
+_MOST_PLANES = 64
 
 #: Points along i, j and k.
 Dims = tuple[int, int, int]
@@ -51,43 +54,56 @@ class Cut:
         return np.ascontiguousarray(volume[self.key].reshape(*self.shape, *values.shape[1:]))
 
 
-def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[Cut], dict[str, Any]]:
-    """Decide which surface is taken of each block, by the option ``plane``.
+def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[list[Cut]], dict[str, Any]]:
+    """Decide which surfaces are taken of each block, by the option ``plane``.
 
-    An axis of one point is dropped. Of a volume the plane i0 is taken where the option is not given, with a warning.
+    An axis of one point is dropped. Of a volume the plane i0 is taken where the option is not given, with a warning; of
+    several planes each is a surface.
 
     Returns
     -------
-    cuts : list of Cut
+    cuts : list of lists of Cut
+        For each block one for each plane, in their order; one for a block that is no volume.
     metadata : dict
         ``plane`` (as in the option) and ``volumes`` (points along i, j and k of each block); empty without a volume.
 
     Raises
     ------
     OptionError
-        When the option is no plane, lies outside a block, or there is no volume to take a plane of.
+        When the option is no list of planes, one lies outside a block, or there is no volume to take a plane of.
     TooLargeError
         When the surfaces have more points than allowed.
     """
-    axis, index = _parse(source.options.get("plane"))
+    planes = _parse(source.options.get("plane"))
     volumes = [dims for dims in blocks if min(dims) > 1]
-    if source.options.get("plane") is not None and not volumes and any(dims[axis] > 1 for dims in blocks):
+    if source.options.get("plane") is not None and not volumes and any(dims[planes[0][0]] > 1 for dims in blocks):
         raise OptionError(f"expected no plane= for a surface, which {_words(blocks[0])} points are already")
     if source.options.get("plane") is None and volumes:
-        warn(f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose another with plane=, like j3")
-    result = [_cut(dims, axis, index) for dims in blocks]
-    points = sum(cut.shape[0] * cut.shape[1] for cut in result)
-    largest = max(result, key=lambda cut: cut.shape[0] * cut.shape[1])
-    words = f"{len(result)} blocks" if len(result) > 1 else f"{largest.shape[0]} x {largest.shape[1]}"
+        warn(
+            f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose others with plane=, like j3,k-1"
+        )
+    result = [[_cut(dims, axis, index) for axis, index in (planes if min(dims) > 1 else planes[:1])] for dims in blocks]
+    every = [cut for of_block in result for cut in of_block]
+    points = sum(cut.shape[0] * cut.shape[1] for cut in every)
+    largest = max(every, key=lambda cut: cut.shape[0] * cut.shape[1])
+    words = f"{len(every)} blocks" if len(every) > 1 else f"{largest.shape[0]} x {largest.shape[1]}"
     source.check_vertices(points, f"{points:,} ({words})")
-    return result, {"plane": f"{_AXES[axis]}{index}", "volumes": [list(dims) for dims in blocks]} if volumes else {}
+    if not volumes:
+        return result, {}
+    named = ",".join(f"{_AXES[axis]}{index}" for axis, index in planes)
+    return result, {"plane": named, "volumes": [list(dims) for dims in blocks]}
 
 
-def _parse(value: Any) -> tuple[int, int]:
-    match = re.fullmatch(r"([ijk])(-?\d{1,9})", str(_DEFAULT if value is None else value).strip().lower())
-    if match is None:
-        raise OptionError(f"expected plane= an axis and an index, such as i0, j3 or k-1, got {str(value)!r}")
-    return _AXES.index(match[1]), int(match[2])
+def _parse(value: Any) -> list[tuple[int, int]]:
+    words = str(_DEFAULT if value is None else value).lower().split(",")
+    found = [re.fullmatch(r"\s*([ijk])(-?\d{1,9})\s*", word) for word in words[:_MOST_PLANES]]
+    planes = [(_AXES.index(match[1]), int(match[2])) for match in found if match is not None]
+    if len(planes) < len(words) or len(set(planes)) < len(planes):
+        raise OptionError(
+            f"expected plane= an axis and an index, such as i0, j3 or k-1, or up to {_MOST_PLANES} different planes "
+            f"with commas, such as i0,i-1, got {str(value)[:80]!r}"
+        )
+    return planes
 
 
 def _cut(dims: Dims, axis: int, index: int) -> Cut:

@@ -15,7 +15,7 @@ from . import notes
 from .source import DEFAULT_MAX_VERTICES, Source, check_allowed, with_name
 from .table import FORMATS, Format
 
-__all__ = ["read", "sniff"]
+__all__ = ["read", "readable", "sniff"]
 
 #: Bytes at the start of a file that decide about its format.
 _HEAD = 4096
@@ -29,7 +29,7 @@ _CLOSED: Mapping[str, Closed | None] = {
 }
 
 
-def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Format:
+def sniff(path: str | os.PathLike[str], *, filename: str | None = None, format_name: str | None = None) -> Format:
     """Find the format of a file by its first bytes.
 
     Parameters
@@ -38,16 +38,20 @@ def sniff(path: str | os.PathLike[str], *, filename: str | None = None) -> Forma
         An existing file.
     filename : str, optional
         The file's original name, if `path` has another; only its suffix matters, and only for text.
+    format_name : str, optional
+        The format that it must have, or a suffix of it without the dot; as a suffix of the name would say.
 
     Raises
     ------
     FormatError
-        If the file is empty, not a regular file, or of no known format.
+        If the file is empty, not a regular file, of no known format, or not of the one that is asked for.
+    OptionError
+        If no format that is read has this name.
     """
     path = Path(path)
     label = filename or os.fspath(path)
     try:
-        return _sniff(path, Path(label).suffix.lower())
+        return _sniff(path, Path(label).suffix.lower(), format_name)
     except InputError as error:
         raise with_name(error, label) from None
 
@@ -59,6 +63,7 @@ def read(
     max_vertices: int = DEFAULT_MAX_VERTICES,
     filename: str | None = None,
     allowed: Collection[str] | None = None,
+    format_name: str | None = None,
     **options: Any,
 ) -> Surface:
     """Read a surface from a file; the file's content decides its format.
@@ -79,6 +84,9 @@ def read(
         metadata; its suffix helps with text.
     allowed : collection of str, optional
         Names (`Format.names`) of the formats that may be read; by default all.
+    format_name : str, optional
+        The format that the file must have, or a suffix of it without the dot ("hgt"), for a file whose name does not
+        say so.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -101,7 +109,7 @@ def read(
     TooLargeError
         If it announces more vertices than allowed, or expands implausibly.
     OptionError
-        If an option does not exist, or its value is not valid.
+        If an option or `format_name` does not exist, or a value is not valid.
     InputError
         If the values cannot be a surface because none is valid.
     OSError
@@ -116,7 +124,7 @@ def read(
         chosen = _CLOSED[closed] if isinstance(closed, str) else closed
         if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
-        format_ = _sniff(path, name.suffix.lower())
+        format_ = _sniff(path, name.suffix.lower(), format_name)
         if format_.read is None:
             raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
         check_allowed(format_.names, allowed)
@@ -148,10 +156,17 @@ def _closed(surface: Surface, closed: Closed) -> Surface:
     return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=surface.metadata)
 
 
-def _sniff(path: Path, suffix: str) -> Format:
+def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
     _check_regular(path)
     with path.open("rb") as file:
         head = file.read(_HEAD)
+    if wanted is not None:
+        format_ = readable(wanted)
+        suffix = suffix if suffix in format_.suffixes else format_.suffixes[0]
+        if not head or not format_.sniff(head, suffix):
+            got = _describe(head) if head else "an empty file"
+            raise FormatError(f"expected a file of format {format_.name}, got {got}")
+        return format_
     if not any(suffix in it.suffixes for it in FORMATS):
         suffix = ""
     if not head:
@@ -160,6 +175,22 @@ def _sniff(path: Path, suffix: str) -> Format:
         if format_.sniff(head, suffix):
             return format_
     raise FormatError(f"expected {_readable()}, got {_describe(head)}")
+
+
+def readable(name: str) -> Format:
+    """The format that is read under this name, or whose files end so without the dot.
+
+    Raises
+    ------
+    OptionError
+        If there is none; the message names those that exist.
+    """
+    formats = {it.name: it for it in FORMATS if it.read}
+    by_suffix = {suffix[1:]: it for it in reversed(FORMATS) if it.read for suffix in it.suffixes}
+    found = (by_suffix | formats).get(name.lower().removeprefix("."))
+    if found is None:
+        raise OptionError(f"expected format to be one of {', '.join(formats)}, got {name[:80]!a}")
+    return found
 
 
 def _check_regular(path: Path) -> None:

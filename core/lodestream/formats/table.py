@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import BinaryIO
 
 from ..surface import Surface
-from . import bezier, glb, npy, npz, off, text_arrays
+from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
 from .netcdf import reader as netcdf
+from .netcdf import writer as netcdf_writer
 from .obj import reader as obj
 from .obj import writer as obj_writer
 from .pcd import reader as pcd
 from .plot3d import reader as plot3d
+from .plot3d import writer as plot3d_writer
 from .ply import reader as ply
 from .ply import writer as ply_writer
-from .raster import ascii_grid, geotiff, png, srtm_hgt, usgs_dem
+from .raster import ascii_grid, ascii_writer, cog, geotiff, png, srtm_hgt, usgs_dem
 from .source import Source
-from .vtk import cgns
+from .vtk import cgns, multiblock
 from .vtk import legacy as vtk_legacy
 from .vtk import writer as vts_writer
 from .vtk import xml_files as vtk_xml
@@ -57,6 +60,11 @@ class Format:
         Media type for HTTP.
     process : bool
         Whether reading starts a separate process, which must be allowed and needs its own memory.
+    write_suffixes : tuple of str
+        The suffixes under which it is written, if not under all of them.
+    write_beside : callable or None
+        Takes a `Surface` and the path of its file, for a format of several files: it puts them all in place, complete
+        or not at all. `write` makes a ZIP archive of them then.
     """
 
     name: str
@@ -71,6 +79,18 @@ class Format:
     named: Callable[[str], Mapping[str, str]] | None = None
     media_type: str = "application/octet-stream"
     process: bool = False
+    write_suffixes: tuple[str, ...] = ()
+    write_beside: Callable[[Surface, Path], None] | None = None
+
+    @property
+    def suffixes_out(self) -> tuple[str, ...]:
+        """Suffixes of the names under which it is written, the usual one first; none where it is only read."""
+        return (self.write_suffixes or self.suffixes) if self.write else ()
+
+    @property
+    def stream_suffix(self) -> str:
+        """Suffix of a file into which `write` writes; empty where it is only read."""
+        return self.suffixes_out[0] + (".zip" if self.write_beside else "") if self.write else ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +101,9 @@ class Format:
 #: In the order in which they are tried: the first whose `Format.sniff` agrees reads the file.
 FORMATS = (
     Format(name="npy", suffixes=(".npy",), sniff=npy.sniff, read=npy.read, write=npy.write),
-    Format(name="npz", suffixes=(".npz",), sniff=npz.sniff, read=npz.read, options=npz.READ_OPTIONS),
+    Format(
+        name="npz", suffixes=(".npz",), sniff=npz.sniff, read=npz.read, write=npz_writer.write, options=npz.READ_OPTIONS
+    ),
     Format(
         name="geotiff",
         suffixes=(".tif", ".tiff"),
@@ -92,12 +114,21 @@ FORMATS = (
         media_type="image/tiff",
     ),
     Format(
+        name="cog",
+        suffixes=cog.SUFFIXES,
+        sniff=cog.sniff,
+        write=cog.write,
+        media_type="image/tiff; application=geotiff; profile=cloud-optimized",
+    ),
+    Format(
         name="netcdf",
         suffixes=(".nc", ".nc4", ".cdf"),
         sniff=netcdf.sniff,
         read=netcdf.read,
+        write=netcdf_writer.write,
         options=netcdf.READ_OPTIONS,
         kinds=netcdf.KINDS,
+        media_type="application/x-netcdf",
     ),
     Format(
         name="png",
@@ -109,7 +140,14 @@ FORMATS = (
         named=png.named,
         media_type="image/png",
     ),
-    Format(name="esri-ascii", suffixes=(".asc",), sniff=ascii_grid.sniff, read=ascii_grid.read),
+    Format(
+        name="esri-ascii",
+        suffixes=(".asc",),
+        sniff=ascii_grid.sniff,
+        read=ascii_grid.read,
+        write=ascii_writer.write,
+        media_type="text/plain",
+    ),
     Format(name="usgs-dem", suffixes=(".dem",), sniff=usgs_dem.sniff, read=usgs_dem.read),
     Format(
         name="srtm-hgt",
@@ -150,6 +188,15 @@ FORMATS = (
         more=vtk_xml.MORE,
         process=True,
     ),
+    Format(
+        name="vtm",
+        suffixes=multiblock.SUFFIXES,
+        sniff=multiblock.sniff,
+        write=multiblock.write,
+        write_beside=multiblock.write_beside,
+        blocks=True,
+        media_type=multiblock.MEDIA_TYPE,
+    ),
     Format(name="glb", suffixes=(".glb",), sniff=glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
     Format(name="cgns", suffixes=(".cgns",), sniff=cgns.sniff, read=cgns.read, options=cgns.OPTIONS, process=True),
     Format(name="bpt", suffixes=(bezier.SUFFIX,), sniff=bezier.sniff, read=bezier.read, options=bezier.OPTIONS),
@@ -165,6 +212,9 @@ FORMATS = (
         suffixes=plot3d.SUFFIXES,
         sniff=plot3d.sniff,
         read=plot3d.read,
+        write=plot3d_writer.write,
+        blocks=True,
+        write_suffixes=plot3d_writer.SUFFIXES,
         options=plot3d.READ_OPTIONS,
         more=plot3d.MORE,
     ),

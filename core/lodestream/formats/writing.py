@@ -14,7 +14,7 @@ from .non_finite import note_infinities
 from .source import with_name
 from .table import FORMATS, Format
 
-__all__ = ["check_blocks", "for_writing", "write", "write_stream"]
+__all__ = ["check_blocks", "for_writing", "write", "write_stream", "written"]
 
 
 def check_blocks(format_: Format, count: int) -> None:
@@ -40,18 +40,34 @@ def for_writing(path: str | os.PathLike[str]) -> Format:
         If no format that can be written has this suffix; the message names those that exist.
     """
     path = Path(path)
-    format_ = next((it for it in FORMATS if it.write and path.suffix.lower() in it.suffixes), None)
-    if format_ is None:
-        suffixes = ", ".join(suffix for it in FORMATS if it.write for suffix in it.suffixes)
-        raise with_name(OptionError(f"expected a name that ends in one of {suffixes}"), str(path))
-    return format_
+    by_suffix = {suffix: it for it in FORMATS for suffix in it.suffixes_out}
+    fitting = [suffix for suffix in by_suffix if path.name.lower().endswith(suffix) and path.name.lower() != suffix]
+    if not fitting:
+        raise with_name(OptionError(f"expected a name that ends in one of {', '.join(by_suffix)}"), str(path))
+    return by_suffix[max(fitting, key=len)]  # .cog.tif before .tif
+
+
+def written(name: str) -> Format:
+    """The format of this name, or whose files end so: ``geotiff``, ``tif`` and ``tiff`` are one.
+
+    Raises
+    ------
+    OptionError
+        If there is none that is written; the message names those that exist.
+    """
+    formats = {it.name: it for it in FORMATS if it.write}
+    by_suffix = {suffix[1:]: it for it in FORMATS for suffix in it.suffixes_out}
+    found = (by_suffix | formats).get(name)
+    if found is None:
+        raise OptionError(f"expected format to be one of {', '.join(formats)}, got {name[:80]!a}")
+    return found
 
 
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file; the suffix decides the format.
 
-    The file is written under a temporary name and renamed at the end, so it is complete or absent. A `FormatWarning`
-    tells what the format cannot hold.
+    The file is written under a temporary name and renamed at the end, so it is complete or absent; so are both the
+    file and the folder of a .vtm. A `FormatWarning` tells what the format cannot hold.
 
     Raises
     ------
@@ -66,6 +82,12 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
             write_stream(surface, format_.name, file)
         return
     target = path.resolve()  # a link stays a link
+    if format_.write_beside is not None:
+        try:
+            format_.write_beside(_prepared(surface, format_), target)
+        except InputError as error:
+            raise with_name(error, str(path)) from None
+        return
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
@@ -87,7 +109,7 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     ----------
     surface : Surface
     format_name : str
-        Name of a format that can be written, as in `formats`.
+        Name of a format that can be written, as in `formats`, or a suffix of its files without the dot.
     file : binary file
         Only its ``write`` is used.
 
@@ -98,12 +120,15 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
     FormatError
         If the format cannot hold this surface. Nothing has been written then.
     """
-    written = {it.name: it for it in FORMATS if it.write}
-    if format_name not in written:
-        raise OptionError(f"expected a format that is written ({', '.join(written)}), got {format_name!r}")
-    format_ = written[format_name]
-    check_blocks(format_, len(surface.blocks))
+    format_ = written(format_name)
+    surface = _prepared(surface, format_)
     assert format_.write is not None, "it is written"
-    surface = restore(surface)
-    note_infinities(surface, format_name)
     format_.write(surface, file)
+
+
+def _prepared(surface: Surface, format_: Format) -> Surface:
+    """The surface as a writer takes it: with its repeated rows, columns and angles."""
+    check_blocks(format_, len(surface.blocks))
+    surface = restore(surface)
+    note_infinities(surface, format_.name)
+    return surface

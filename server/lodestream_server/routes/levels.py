@@ -9,6 +9,7 @@ from fastapi.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from lodestream.errors import OptionError
+from lodestream.formats import written
 
 from ..access.access import anybody
 from ..access.gate import caller_of
@@ -46,23 +47,29 @@ async def level(
     parts: Parts,
     surface: str,
     level: int,
-    format_name: Annotated[str, Query(alias="format", description=", ".join(MEDIA_TYPES))] = "npy",
+    wanted: Annotated[
+        str, Query(alias="format", description=f"{', '.join(MEDIA_TYPES)}; or a suffix of theirs, such as tif")
+    ] = "npy",
 ) -> Response:
-    """The grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes."""
+    """The grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes.
+
+    Ranges of it are answered, so that a program such as GDAL (``/vsicurl/``) can read what it shows of a ``cog``.
+    """
     record = ready(parts, surface)
-    _check(record, level, format_name)
-    etag = f'"{record.container}-{level}-{format_name}"'
+    _check(record, level)
+    format_ = written(wanted)
+    etag = f'"{record.container}-{level}-{format_.name}"'
     headers = {"etag": etag, "cache-control": "no-cache"}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         return unchanged
-    key = Key(record.container or "", level, format_name)
+    key = Key(record.container or "", level, format_.name)
     with still_there(parts, surface):
         loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
     try:
         sort_out(request, loan.size, etag)
-        headers["content-disposition"] = f'attachment; filename="{record.id}-{level}.{format_name}"'
-        return _Borrowed(loan, headers, MEDIA_TYPES[format_name])
+        headers["content-disposition"] = f'attachment; filename="{record.id}-{level}{format_.stream_suffix}"'
+        return _Borrowed(loan, headers, format_.media_type)
     except BaseException:
         loan.release()
         raise
@@ -82,9 +89,7 @@ class _Borrowed(SentFile):
             self._loan.release()
 
 
-def _check(record: Record, level: int, format_name: str) -> None:
+def _check(record: Record, level: int) -> None:
     finest = len((record.info or {})["levels"]) - 1
     if not 0 <= level <= finest:
         raise OptionError(f"expected a level of 0 to {finest}, got {level}")
-    if format_name not in MEDIA_TYPES:
-        raise OptionError(f"expected format to be one of {', '.join(MEDIA_TYPES)}, got {format_name[:80]!a}")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from rich.console import Console
 
 import lodestream as ls
 from lodestream_client.commands import surfaces
+from lodestream_server import running_server
 
 from ..conftest import Run
 
@@ -242,6 +244,146 @@ def test_encode_takes_surface_options(run: Run, tmp_path: Path) -> None:
     assert described["closed"] == [True, False]
     assert described["metadata"]["name"] == "Ring"
     assert described["exact"] is True
+
+
+class _Input:
+    """Standard input that holds these bytes."""
+
+    def __init__(self, content: bytes) -> None:
+        self.buffer = io.BytesIO(content)
+
+
+def test_standard_input_has_the_format_that_is_said(
+    run: Run, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers, out = b"10.5 20\n30 40\n50 60\n", tmp_path / "a.lode"
+    for format_name in ("text", "csv"):
+        monkeypatch.setattr(sys, "stdin", _Input(numbers))
+        assert run("encode", "-", out, "--format", format_name)[0] == 0
+        np.testing.assert_array_equal(ls.decode(out.read_bytes()).points, [[10.5, 20], [30, 40], [50, 60]])
+    monkeypatch.setattr(sys, "stdin", _Input(numbers))
+    code, stdout, stderr = run("push", "-", server, "--format", "csv", "--json")
+    assert (code, stderr) == (0, "")
+    assert json.loads(stdout)["filenames"] == ["standard input.dat"]
+    assert json.loads(stdout)["shape"] == [3, 2]
+    (tmp_path / "heights.bin").write_bytes(numbers + b"70 80\n")
+    code, stdout, _ = run("push", tmp_path / "heights.bin", server, "--format", "text", "--json")
+    assert (code, json.loads(stdout)["filenames"]) == (0, ["heights.dat"])
+    for command in (("encode", "-", out), ("push", "-", server)):
+        monkeypatch.setattr(sys, "stdin", _Input(numbers))
+        code, stdout, stderr = run(*command, "--format", "pcd")
+        assert (code, stdout) == (1, "")
+        assert "standard input: expected a file of format pcd, got text" in stderr
+
+
+def test_bytes_that_are_read_twice_count_once(run: Run, container_file: Path, tmp_path: Path) -> None:
+    size = container_file.stat().st_size
+    for options in ((), ("--level", "1"), ("--until-rms", "1e-2d")):
+        code, stdout, _ = run("decode", container_file, tmp_path / "a.npy", "--json", *options)
+        assert code == 0
+        assert 0 < json.loads(stdout)["wire_bytes"] <= size
+    assert run("decode", container_file, tmp_path / "a.npy")[2].count("read)") == 1
+
+
+def test_the_last_row_of_layers_is_the_exact_surface(run: Run, container_file: Path, tmp_path: Path) -> None:
+    last = run("info", container_file)[1].splitlines()[-1].split()
+    levels = len(json.loads(run("info", container_file, "--json")[1])["levels"])
+    assert last == ["exact", str(levels - 1), f"{container_file.stat().st_size:,}", "0", "0"]
+    rounded = ls.encode(ls.decode(container_file.read_bytes()), precision=0.5)
+    (tmp_path / "p.lode").write_bytes(rounded)
+    assert "exact" not in run("info", tmp_path / "p.lode")[1].splitlines()[-1]
+
+
+def test_push_of_many_files(run: Run, server: str, tmp_path: Path) -> None:
+    names = []
+    for number in range(3):
+        names.append(tmp_path / f"slope-{number}.npy")
+        np.save(names[-1], np.add.outer(np.arange(20 + number), np.arange(30)))
+    code, stdout, stderr = run("push", "--each", *names, server)
+    assert (code, stderr) == (0, "")
+    urls = stdout.splitlines()
+    shapes = [json.loads(run("info", url, "--json")[1])["shape"] for url in urls]
+    assert shapes == [[20, 30], [21, 30], [22, 30]]
+    (tmp_path / "no.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
+    given = (names[0], tmp_path / "no.off", tmp_path / "missing.npy", names[1])
+    code, stdout, stderr = run("push", "--each", *given, server)
+    assert code == 1
+    assert len(stdout.splitlines()) == 2
+    assert stderr.splitlines()[1:] == [
+        f"lodestream: {tmp_path / 'missing.npy'}: No such file or directory",
+        "lodestream: 2 of 4 files failed",
+    ]
+    assert "no.off: " in stderr.splitlines()[0]
+    code, stdout, _ = run("push", "--each", *given, server, "--json")
+    told = json.loads(stdout)
+    assert (code, len(told["surfaces"]), [it["file"] for it in told["failed"]]) == (1, 2, [*map(str, given[1:3])])
+    assert run("push", "--each", *names, server, "--name", "all")[0] == 2
+    code, stdout, stderr = run("push", "--each", *names, "http://127.0.0.1:9")
+    assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+
+
+def test_list_finds_and_sorts(run: Run, tmp_path: Path) -> None:
+    with running_server(tmp_path / "data", workers=1) as url:
+        for name, size in (("Wide valley", 60), ("alp", 40), ("Hill", 50)):
+            np.save(tmp_path / "a.npy", np.random.default_rng(size).normal(size=(size, size)))
+            assert run("push", tmp_path / "a.npy", url, "--name", name)[0] == 0
+        (tmp_path / "broken.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
+        assert run("push", tmp_path / "broken.off", url)[0] == 1
+
+        def names(*options: str) -> list[str]:
+            code, stdout, _ = run("list", url, "--json", *options)
+            assert code == 0
+            return [surface["name"] or surface["filenames"][0] for surface in json.loads(stdout)["surfaces"]]
+
+        assert sorted(names()) == ["Hill", "Wide valley", "alp", "broken.off"]
+        assert names("--reverse") == names()[::-1]
+        assert names("--sort", "name") == ["alp", "broken.off", "Hill", "Wide valley"]
+        assert names("--sort", "size") == ["broken.off", "alp", "Hill", "Wide valley"]
+        assert names("--sort", "size", "--reverse", "--state", "ready") == ["Wide valley", "Hill", "alp"]
+        assert names("--sort", "created") == ["Wide valley", "alp", "Hill", "broken.off"]
+        assert names("--sort", "state")[0] == "broken.off"
+        assert names("--search", "hill") == ["Hill"]
+        assert names("--search", "AL") == [name for name in names() if name in ("alp", "Wide valley")]
+        line = run("list", url, "--state", "failed")[1]
+        assert "failed" in line
+        assert "24 B" in line
+        assert "broken.off: expected" in line
+        assert run("list", url, "--search", "nothing")[1:] == ("", "lodestream: no such surfaces\n")
+
+
+def test_convert_goes_from_one_format_to_another(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = np.arange(24, dtype=np.float32).reshape(4, 6)
+    np.save(tmp_path / "a.npy", heights)
+    code, stdout, stderr = run("convert", tmp_path / "a.npy", tmp_path / "b.npz")
+    assert (code, stdout) == (0, "")
+    assert stderr.startswith("lodestream: 4 x 6 points written in ")
+    with np.load(tmp_path / "b.npz") as arrays:
+        np.testing.assert_array_equal(arrays["heights"], heights)
+    code, stdout, _ = run("convert", tmp_path / "b.npz", tmp_path / "c.vts", "-o", "array=heights", "--json")
+    assert (code, json.loads(stdout)["shape"]) == (0, [4, 6])
+    assert (tmp_path / "c.vts").stat().st_size > heights.nbytes
+    monkeypatch.setattr(sys, "stdin", _Input(b"1,2\n3,4\n"))
+    assert run("convert", "-", tmp_path / "d.npy", "--format", "csv")[0] == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "d.npy"), [[1, 2], [3, 4]])
+
+
+def test_convert_says_what_it_does_not_do(run: Run, container_file: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.eye(3))
+    for files, words in (
+        ((tmp_path / "a.npy", tmp_path / "b.lode"), "lodestream encode makes containers"),
+        ((container_file, tmp_path / "b.npy"), "lodestream decode reads containers"),
+        ((tmp_path / "a.npy", tmp_path / "b.npy", "--precision", "1"), "--precision"),
+    ):
+        code, stdout, stderr = run("convert", *files)
+        assert (code, stdout) == (2, "")
+        assert words in stderr
+    assert run("convert", tmp_path / "a.npy", tmp_path / "b.docx")[0] == 1
+    points = np.random.default_rng(1).normal(size=(2, 3, 3))
+    blocks = ls.Surface(blocks=[ls.Block(points), ls.Block(points + 9)])
+    ls.write(blocks, tmp_path / "two.p3d")
+    code, _, stderr = run("convert", tmp_path / "two.p3d", tmp_path / "two.npy")
+    assert (code, "two.npy: expected one block for npy, got 2" in stderr) == (1, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npy", "two.p3d"]
 
 
 def test_encode_with_a_precision(run: Run, terrain_file: Path, terrain: Terrain, tmp_path: Path) -> None:

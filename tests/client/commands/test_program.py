@@ -17,6 +17,9 @@ from websockets.sync.server import ServerConnection
 
 import lodestream
 import lodestream_client
+from lodestream.errors import UnavailableError
+from lodestream_client.commands import completion
+from lodestream_client.program import build_parser
 
 from .. import manual
 from ..stream.test_misbehaving import websocket_server
@@ -98,6 +101,57 @@ def test_the_manual_is_the_help(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "100")
     # How lines are broken differs from one version of argparse to the next.
     assert manual.PATH.read_text().split() == manual.render().split(), "run python -m tests.client.manual"
+
+
+def _completions(line: str, folder: Path) -> list[str]:
+    """What a shell is told at the end of a line."""
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+    asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(folder / "told"), "_ARGCOMPLETE_IFS": "\n"}
+    done = subprocess.run(COMMAND, env={**environment(), **asked}, capture_output=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return (folder / "told").read_text().split("\n")
+
+
+def test_shells_complete_commands_and_options(tmp_path: Path) -> None:
+    pytest.importorskip("argcomplete")
+    assert {"encode", "decode"} <= {word.strip() for word in _completions("lodestream ", tmp_path)}
+    assert [word.strip() for word in _completions("lodestream conv", tmp_path)] == ["convert"]
+    assert [word.strip() for word in _completions("lodestream encode --prec", tmp_path)] == ["--precision"]
+    assert [word.strip() for word in _completions("lodestream encode --closed r", tmp_path)] == ["rows"]
+    assert "serve" in [word.strip() for word in _completions("lodestream s", tmp_path)]
+    for shell in ("bash", "zsh", "fish"):
+        printed = call("completion", shell)
+        assert printed.returncode == 0
+        assert b"lodestream" in printed.stdout
+
+
+def test_completion_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "argcomplete", None)
+    with pytest.raises(UnavailableError, match=r"install lodestream\[completion\]"):
+        completion.complete(build_parser())
+
+
+def test_the_package_runs_as_a_module() -> None:
+    command = [sys.executable, "-m", "lodestream"]
+    for arguments in (["--version"], ["formats", "--json"], ["nonsense"]):
+        ours = subprocess.run([*command, *arguments], capture_output=True, env=environment(), timeout=120, check=False)
+        assert ours.returncode == call(*arguments).returncode
+        assert ours.stdout == call(*arguments).stdout
+        assert ours.stderr == call(*arguments).stderr
+
+
+def test_the_module_says_where_its_program_is_not_installed() -> None:
+    code = "import importlib.metadata as m; m.entry_points = lambda **_: (); import lodestream.__main__ as main; "
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}raise SystemExit(main.main())"],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "lodestream: the command is not installed: pip install lodestream\n"
 
 
 def test_pipes(terrain_file: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from pathlib import Path
@@ -137,6 +138,27 @@ def test_what_nobody_comes_back_to_is_removed(tmp_path: Path) -> None:
     cache.forget_old(tmp_path / "nothing")
     used.close()
     assert sorted(path.stem for path in tmp_path.glob("*.part")) == [new, in_use, foreign, "download"]
+
+
+def test_files_without_data_are_not_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [letter * 64 for letter in "abcd"]
+    (tmp_path / f"{names[0]}.part").touch(0o600)  # as a program that is killed leaves it
+    CacheFile(tmp_path, names[1], SIZE).close()
+    with_data = CacheFile(tmp_path, names[2], SIZE)
+    with_data.write(0, b"data")
+    with_data.close()
+    in_use = CacheFile(tmp_path, names[3], SIZE)
+    cache.forget_old(tmp_path)
+    assert sorted(path.stem for path in tmp_path.glob("*.part")) == names[2:]
+    in_use.close()
+
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(OSError, match="No space left"):
+        CacheFile(tmp_path, names[0], SIZE)
+    assert [path.stem for path in tmp_path.glob("*.part")] == [names[2]]
 
 
 def test_the_folder_is_the_users_or_the_one_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -142,8 +142,11 @@ def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pyt
         ls.Surface(np.random.default_rng(1).normal(size=(9, 8, 2)), (True, False)),
         ls.Surface(np.random.default_rng(1).normal(size=(9, 8, 3)), mask=np.eye(9, 8) == 0),
         ls.Surface(np.array([[1.0, np.inf, -np.inf, 2.0]])),
+        ls.Surface(np.zeros((9, 8))),
+        ls.Surface(np.full((9, 8), 7, np.int16)),
+        ls.Surface(np.full((9, 8, 3), 2.5)),
     ],
-    ids=["curve", "plane", "holes", "infinite"],
+    ids=["curve", "plane", "holes", "infinite", "zero", "constant", "one point"],
 )
 def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
     pytest.importorskip("matplotlib")

@@ -285,6 +285,39 @@ def test_the_limit_counts_vertices_before_values_are_read(tmp_path: Path) -> Non
             formats.read(tmp_path / f"a.{suffix}", max_vertices=99)
 
 
+def test_a_format_is_asked_for_where_no_name_tells(tmp_path: Path) -> None:
+    (tmp_path / "numbers").write_text("4 3\n5 6\n")
+    for name in ("text", "csv", ".TXT"):
+        np.testing.assert_array_equal(formats.read(tmp_path / "numbers", format_name=name).points, [[4, 3], [5, 6]])
+    with pytest.raises(FormatError, match="expected a file of format pcd, got text that begins with '4 3 5 6'"):
+        formats.read(tmp_path / "numbers", format_name="pcd")
+    np.save(tmp_path / "a.npy", np.eye(3))
+    (tmp_path / "a.npy").rename(tmp_path / "a.hgt")
+    with pytest.raises(FormatError, match="expected an SRTM tile"):  # any bytes are one, whatever they are
+        formats.read(tmp_path / "a.hgt", format_name="hgt")
+    with pytest.raises(FormatError, match="expected a file of format geotiff, got bytes that begin with 93 4e"):
+        formats.read(tmp_path / "a.hgt", format_name="tif")
+    with pytest.raises(OptionError, match=r"format to be one of npy, .*plot3d, got 'docx'"):
+        formats.read(tmp_path / "a.hgt", format_name="docx")
+    with pytest.raises(OptionError, match="got 'glb'"):
+        formats.sniff(tmp_path / "a.hgt", format_name="glb")
+    (tmp_path / "empty").touch()
+    with pytest.raises(FormatError, match="expected a file of format npy, got an empty file"):
+        formats.read(tmp_path / "empty", format_name="npy")
+    with pytest.raises(SwitchedOffError):
+        formats.read(tmp_path / "numbers", format_name="text", allowed=("npy",))
+
+
+@pytest.mark.parametrize("size", [1201])
+def test_a_tile_without_a_name_is_read_by_its_format(tmp_path: Path, size: int) -> None:
+    pytest.importorskip("rasterio")
+    heights = (np.arange(size * size) % 3000).reshape(size, size).astype(">i2")
+    heights.tofile(tmp_path / "standard-input")
+    surface = formats.read(tmp_path / "standard-input", format_name="hgt", tile="N37W122")
+    np.testing.assert_array_equal(surface.points, heights)
+    assert surface.metadata["geotransform"][0] == pytest.approx(-122, abs=1e-3)
+
+
 def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.eye(3))
     np.savez(tmp_path / "a.npz", np.eye(3))
@@ -344,10 +377,10 @@ def test_write_goes_through_what_is_no_file(tmp_path: Path) -> None:
 
 
 def test_formats_that_are_not_written_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"ends in one of \.npy, .*\.ply, \.obj, \.vts, \.glb"):
+    with pytest.raises(OptionError, match=r"ends in one of \.npy, .*\.ply, \.obj, \.vts, .*\.glb"):
         formats.write(Surface(np.eye(3)), tmp_path / "a.docx")
-    with pytest.raises(OptionError, match=r"a format that is written \(npy, .*ply, obj, vts, glb\), got 'npz'"):
-        formats.write_stream(Surface(np.eye(3)), "npz", io.BytesIO())
+    with pytest.raises(OptionError, match=r"one of npy, .*ply, obj, vts, vtm, glb.*, got 'pcd'"):
+        formats.write_stream(Surface(np.eye(3)), "pcd", io.BytesIO())
     assert list(tmp_path.iterdir()) == []
 
 

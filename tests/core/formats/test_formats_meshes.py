@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lodestream import formats
 from lodestream.coordinates.seams import restore
-from lodestream.errors import FormatError, InputError
+from lodestream.errors import FormatError, FormatWarning, InputError
 from lodestream.surface import Surface
 
 CLOSED = [(False, False), (True, False), (False, True), (True, True)]
@@ -154,6 +154,9 @@ def test_heights_are_drawn_over_columns_and_rows_or_where_they_lie() -> None:
         ("# nothing\n", "expected points .*, got none"),
         ("hello world\n", "line 1: expected an OBJ statement of points and faces .*, got 'hello world'"),
         ("v 0 0 0\ncurv 0 1\n", "line 2: expected an OBJ statement"),
+        ("v 0 0 0\n1 2 3\n", "line 2: expected an OBJ statement of points and faces .*, got '1 2 3'"),
+        ("t crease 1\nv 0 0 0\n", "line 1: expected an OBJ statement"),
+        ("v 0 0 0\nt crease 1 \\\n", "line 2: expected a statement on one line"),
         ("v 0 0 0\nv 1 0 0\nv 2 0 0\nl 1 3 2\n", "line 4: expected lines that join points one after another, got 1 3"),
         ("v 0 0 0\nv 1 0 0\nv 2 0 0\nl 1 2\n", "expected lines that join all 3 points, got 1 segments"),
         ("v 0 0 0\nv 1 0 0\nl 1 2 1 2\n", "line 3: expected lines that join points one after another, got 1 2"),
@@ -162,6 +165,18 @@ def test_heights_are_drawn_over_columns_and_rows_or_where_they_lie() -> None:
 def test_obj_that_is_no_grid(content: str, message: str) -> None:
     with pytest.raises(FormatError, match=message):
         parse(content)
+
+
+def test_obj_lines_that_are_no_geometry_are_passed_over() -> None:
+    plain = text(Surface(np.zeros((4, 5))))
+    with pytest.warns(FormatWarning) as notes:
+        surface = parse(plain + "t crease 2/1/0 1 4 4.7\n" * 3 + "t interpolateboundary 1/0/0 2\nxyz_hint 7\n")
+    assert [str(note.message) for note in notes] == [
+        "statements that are no geometry left out: t crease (3), t interpolateboundary (1), xyz_hint (1)"
+    ]
+    np.testing.assert_array_equal(surface.points, parse(plain).points)
+    with pytest.warns(FormatWarning, match=r"k15 \(1\), others \(9,984\)$"):
+        parse(plain + "".join(f"k{number} 1\n" for number in range(10_000)))
 
 
 def test_faces_that_are_no_grid_are_named() -> None:

@@ -226,6 +226,68 @@ def test_times_and_depths_are_chosen_by_name(tmp_path: Path, kind: str) -> None:
             formats.read(path, closed="auto", **dict[str, Any](options))
 
 
+@pytest.mark.parametrize("own", ["none", "index"])
+def test_dates_of_another_variable_are_found(tmp_path: Path, own: str) -> None:
+    """As in files of NEMO, whose dimension ``time_counter`` has its dates in ``time_centered``."""
+    values = hills((3, 6, 9))
+    dates = np.array([15.0, 45.0, 74.0])
+    variables: Variables = {
+        "t": (("time_counter", "y", "x"), values, {"coordinates": "time_centered"}),
+        "time_instant": ("time_counter", dates + 10, {"units": "days since 2001-01-01"}),
+        "time_centered": ("time_counter", dates, {"units": "days since 2001-01-01"}),
+    }
+    if own == "index":
+        variables["time_counter"] = ("time_counter", np.arange(3))
+    path = save(tmp_path / "a.nc", variables)
+    np.testing.assert_array_equal(formats.read(path, time="2001-02").points, values[1])
+    np.testing.assert_array_equal(formats.read(path, time="2").points, values[2])
+    with pytest.raises(OptionError, match=r"one date of 2001-01-16.* to 2001-03-16.*, got '2002': 0 fit"):
+        formats.read(path, time="2002")
+
+
+def test_dates_along_x_are_no_times(tmp_path: Path) -> None:
+    track: Variables = {
+        "t": (("y", "x"), hills()),
+        "x": ("x", np.arange(9.0), {"units": "m"}),
+        "visited": ("x", np.arange(9.0), {"units": "days since 2001-01-01"}),
+    }
+    with pytest.raises(OptionError, match="expected no time=, got one: the dimensions are y, x"):
+        formats.read(save(tmp_path / "a.nc", track), time="0")
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        *(("nav_lon", "nav_lat"), ("XLONG", "XLAT"), ("XLONG_M", "XLAT_M"), ("lon_rho", "lat_rho"), ("TLONG", "TLAT")),
+        *(("glamt", "gphit"), ("x_rho", "y_rho"), ("lons", "lats"), ("geolon", "geolat"), ("xc", "yc"), ("xx", "yy")),
+        *(("Easting", "Northing"), ("grid_x", "grid_y"), ("longitude_c", "latitude_c"), ("x1", "y1")),
+    ],
+)
+def test_coordinates_are_found_by_their_names(tmp_path: Path, x: str, y: str) -> None:
+    columns, rows = np.meshgrid(np.arange(9.0) ** 1.5, np.arange(6.0) ** 1.2)
+    path = save(tmp_path / "a.nc", {"z": (("j", "i"), hills()), y: (("j", "i"), rows), x: (("j", "i"), columns)})
+    surface = formats.read(path)
+    np.testing.assert_array_equal(surface.points, np.stack((columns, rows, hills()), axis=-1))
+    vectors: Variables = {"z": (("j", "i"), hills()), x: ("i", columns[0]), y: ("j", rows[:, 0])}
+    np.testing.assert_array_equal(formats.read(save(tmp_path / "b.nc", vectors)).points, surface.points)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "attributes"),
+    [
+        *(("dx", "dy", {}), ("x_velocity", "y_velocity", {}), ("x_wind", "y_wind", {}), ("Rxy", "Zxy", {})),
+        *(("x_rho", "y_psi", {}), ("lon_rho", "lat_rho", {"standard_name": "sea_ice_drift"}), ("max", "may", {})),
+        ("xc", "yc", {"units": "m s-1"}),
+    ],
+)
+def test_names_that_say_no_place_are_candidates(tmp_path: Path, x: str, y: str, attributes: dict[str, str]) -> None:
+    grid = {name: (("j", "i"), hills(), attributes) for name in (x, y, *(f"flow{number}" for number in range(30)))}
+    with pytest.raises(FormatError) as refused:
+        formats.read(save(tmp_path / "a.nc", grid))
+    told = str(refused.value).partition("over a surface, got ")[2].partition(": choose with variable=")[0]
+    assert told.split(", ") == list(grid)
+
+
 def world(columns: int, repeat: bool, low: float = -180.0) -> Variables:
     lon = low + 360 / columns * np.arange(columns + repeat)
     heights = hills((5, columns))

@@ -141,7 +141,7 @@ def test_a_size_that_no_layout_fits_is_refused_with_the_nearest(tmp_path: Path) 
     for name, value, message in (
         ("dimensions", "4", "dimensions= from 2 to 3, got 4"),
         ("block", "2", "block= from 1 to 1, got 2"),
-        ("plane", "x3", "plane= an axis and an index, such as i0, j3 or k-1, got 'x3'"),
+        ("plane", "x3", "plane= an axis and an index, such as i0, j3 or k-1, .* got 'x3'"),
         ("plane", "i2", "no plane= for a surface, which 5 x 7 x 1 points are already"),
     ):
         with pytest.raises(OptionError, match=message):
@@ -164,13 +164,36 @@ def test_a_plane_of_a_volume(tmp_path: Path, plane: str, index: Any) -> None:
     np.testing.assert_array_equal(surface.mask, file.blank(0).reshape(5, 3, 4)[index] != 0)
     assert surface.metadata["plane"] == plane
     assert surface.metadata["volumes"] == [[4, 3, 5]]
-    with pytest.warns(FormatWarning, match="took plane i0 of a volume of 4 x 3 x 5 points; choose another with plane="):
+    with pytest.warns(FormatWarning, match="took plane i0 of a volume of 4 x 3 x 5 points; choose others with plane="):
         default = formats.read(path)
     np.testing.assert_array_equal(default.points[:, 0, 0], volume[0, :, 0, 0])
     with pytest.raises(OptionError, match="plane= k from -5 to 4 for a volume of 4 x 3 x 5 points, got 5"):
         formats.read(path, plane="k5")
     with pytest.raises(TooLargeError, match="at most 10 vertices, got 15"):
         formats.read(path, plane="i0", max_vertices=10)
+
+
+def test_several_planes_of_a_volume_are_blocks(tmp_path: Path) -> None:
+    file = Written(((4, 3, 5), (2, 3, 1)), multi=True, iblank=True)
+    path = tmp_path / "grid.x"
+    path.write_bytes(file.binary())
+    surface = formats.read(path, plane="i0, j-1,k2")
+    assert [block.shape for block in surface.blocks] == [(5, 3), (5, 4), (3, 4), (3, 2)]
+    for block, plane in zip(surface.blocks, ("i0", "j-1", "k2"), strict=False):
+        (alone,) = formats.read(path, plane=plane, block="1").blocks
+        np.testing.assert_array_equal(block.points, alone.points)
+        np.testing.assert_array_equal(block.mask, alone.mask)
+    np.testing.assert_array_equal(surface.blocks[3].points.reshape(-1, 3).T, file.coordinates(1))
+    assert surface.metadata["plane"] == "i0,j-1,k2"
+    # Planes that meet share the points of their edge.
+    np.testing.assert_array_equal(surface.blocks[0].points[:, -1], surface.blocks[1].points[:, 0])
+    for plane in ("i0,", "i0,i0", ",".join(f"i{index}" for index in range(65))):
+        with pytest.raises(OptionError, match=r"or up to 64 different planes with commas, such as i0,i-1, got"):
+            formats.read(path, plane=plane)
+    with pytest.raises(OptionError, match=r"plane= j from -3 to 2 .* got 3"):
+        formats.read(path, plane="i0,j3")
+    with pytest.raises(TooLargeError, match=r"at most 40 vertices, got 53 \(4 blocks\)"):
+        formats.read(path, plane="i0,j-1,k2", max_vertices=40)
 
 
 def test_one_block_of_several_and_a_curve(tmp_path: Path) -> None:
@@ -247,6 +270,51 @@ def test_q_and_function_files_give_attributes(tmp_path: Path) -> None:
     (tmp_path / "other.q").write_bytes(records([head, np.array([4, 3, 1, 2, 2, 1], np.int32), *q[2:]]))
     with pytest.raises(FormatError, match=r"other\.q: expected a PLOT3D Q or function file.* dimensions of the grid"):
         formats.read(tmp_path / "g.x", tmp_path / "other.q")
+
+
+@pytest.mark.parametrize("precision", [4, 8])
+@pytest.mark.parametrize("record", [512, 4096])
+def test_a_file_padded_to_a_record_is_read(tmp_path: Path, record: int, precision: int) -> None:
+    grid = Written(((9, 7, 1),), multi=False, iblank=False, precision=precision)
+    (tmp_path / "g.x").write_bytes(grid.binary())
+    fields = np.arange(1, 5 * 63 + 1.0).astype(f"<f{precision}")
+    q = struct.pack("<3i", 9, 7, 1) + np.array([0.5, 2, 1e6, 0.25], fields.dtype).tobytes() + fields.tobytes()
+    padded = q + bytes(-len(q) % record)
+    assert len(padded) > len(q)
+    (tmp_path / "g.q").write_bytes(padded)
+    surface = formats.read(tmp_path / "g.x", tmp_path / "g.q")
+    np.testing.assert_array_equal(surface.attributes["stagnation_energy"].reshape(-1), fields[4 * 63 :])
+    assert surface.metadata["scalars"]["reynolds"] == 1e6
+    # What is no padding: other bytes than zeros, or an end that is not one of a record.
+    for name, content in (
+        ("one.q", padded[:-1] + b"\1"),
+        ("short.q", padded[:-4]),
+        ("long.q", padded + bytes(1 << 17)),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FormatError, match=f"{name}: expected a PLOT3D Q or function file whose size fits"):
+            formats.read(tmp_path / "g.x", tmp_path / name)
+
+
+@pytest.mark.parametrize("more", [0.0, 1.4])
+def test_reference_numbers_in_a_longer_record_are_read(tmp_path: Path, more: float) -> None:
+    grid = Written(((4, 3, 1), (2, 3, 1)), multi=True, iblank=False, endian="<", records=True)
+    (tmp_path / "g.x").write_bytes(grid.binary())
+    reference = np.array([0.5, 2.0, 1e6, 0.25, *[more] * 12])
+    parts = [np.array([2], "<i4"), np.array([4, 3, 1, 2, 3, 1], "<i4")]
+    for count in (12, 6):
+        parts += [reference, np.arange(5.0 * count)]
+    packed = [part.tobytes() for part in parts]
+    marked = b"".join(struct.pack("<i", len(part)) + part + struct.pack("<i", len(part)) for part in packed)
+    (tmp_path / "g.q").write_bytes(marked)
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        surface = formats.read(tmp_path / "g.x", tmp_path / "g.q")
+    assert [str(note.message) for note in notes] == (
+        ["left out 12 numbers of a Q file behind the four reference numbers"] if more else []
+    )
+    assert surface.metadata["scalars"]["time"] == 0.25
+    np.testing.assert_array_equal(surface.blocks[1].attributes["density"].reshape(-1), np.arange(6.0))
 
 
 @pytest.mark.parametrize(

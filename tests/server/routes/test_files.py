@@ -8,6 +8,7 @@ from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import anyio
 import httpx
@@ -149,6 +150,33 @@ def test_levels_come_as_meshes_too(http: httpx.Client, surface: dict[str, Any], 
     assert mesh.points[..., 1].max() == pytest.approx(64)
     ply = http.get(surface["url"] + "/levels/3", params={"format": "ply"})
     assert f"element vertex {rows * columns}\n".encode() in ply.content
+
+
+def test_a_level_of_several_files_is_an_archive(http: httpx.Client, surface: dict[str, Any]) -> None:
+    answer = http.get(surface["url"] + "/levels/3", params={"format": "vtm"})
+    assert answer.headers["content-type"] == "application/zip"
+    assert '-3.vtm.zip"' in answer.headers["content-disposition"]
+    with ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.namelist() == ["surface.vtm", "surface/surface_0.vts"]
+
+
+@pytest.mark.parametrize("name", ["npz", "asc", "nc", "p3d"])
+def test_levels_come_in_what_other_programs_read(
+    http: httpx.Client, surface: dict[str, Any], tmp_path: Path, name: str
+) -> None:
+    if name == "nc":
+        pytest.importorskip("h5netcdf")
+    answer = http.get(surface["url"] + "/levels/3", params={"format": name})
+    assert answer.status_code == 200
+    assert f'-3.{name}"' in answer.headers["content-disposition"]
+    (tmp_path / f"level.{name}").write_bytes(answer.content)
+    if name == "asc":
+        pytest.importorskip("rasterio")
+    expected = np.load(io.BytesIO(http.get(surface["url"] + "/levels/3").content))
+    level = ls.read(tmp_path / f"level.{name}")
+    heights = level.points if level.points.ndim == 2 else level.points[..., 2]
+    # Text goes from north to south, and y grows with the rows here.
+    np.testing.assert_array_equal(heights.astype(expected.dtype), expected[::-1] if name == "asc" else expected)
 
 
 def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any]) -> None:

@@ -11,13 +11,15 @@ import numpy as np
 
 from ...errors import FormatError, OptionError
 from ..source import Source
+from .names import is_longitude, is_time, letters_of, time_of
 
 __all__ = ["Choice", "Found", "choose", "others"]
 
 _REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
-_EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
-_NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n", "degreesn", "degreen")
-_MOST_NAMES = 12
+_ANCILLARY = "ancillary_variables"
+
+#: Names in a refusal: all that a file of a model has, but not thousands.
+_MOST_NAMES = 250
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ def others(dataset: Any, choice: Choice) -> list[str]:
     """Variables over the same two dimensions that are not taken, nor belong to those that are."""
     variables = dataset.variables
     taken = {choice.heights, *choice.attributes, *(found.name for found in (choice.x, choice.y) if found)}
+    letters = letters_of(dataset)
     for variable in variables.values():
         taken |= _referred(variable)
     return [
@@ -112,7 +115,7 @@ def others(dataset: Any, choice: Choice) -> list[str]:
         if str(name) not in taken
         and _numeric(variable)
         and set(choice.dims) <= set(map(str, variable.dims))
-        and _letter(str(name), variable.attrs) is None
+        and str(name) not in letters
     ]
 
 
@@ -137,45 +140,27 @@ def _only(dataset: Any, coordinates: set[str]) -> str:
     variables = dataset.variables
     beside = {str(name) for name in dataset.sizes} | coordinates
     for variable in variables.values():
-        beside |= _referred(variable)
+        beside |= _referred(variable) | set(str(variable.attrs.get(_ANCILLARY, "")).split())
     wide = [
         str(name)
         for name, variable in variables.items()
         if _numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
     ]
-    chosen = [name for name in wide if name not in beside and _letter(name, variables[name].attrs) is None]
+    letters = letters_of(dataset)
+    chosen = [name for name in wide if name not in beside and name not in letters]
     if len(chosen) == 1:
         return chosen[0]
     if not wide:
         raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
     listing = _listing({name: variables[name] for name in chosen or wide})
-    raise FormatError(f"expected one variable over a surface, got {listing}: choose with variable=")
+    raise FormatError(
+        f"expected one variable over a surface, got {listing}: choose with variable=, or planar points with x= and y="
+    )
 
 
 def _referred(variable: Any) -> set[str]:
     """Names of variables that belong to one."""
     return {name for key in _REFERENCES for name in str(variable.attrs.get(key, "")).split()}
-
-
-def _letter(name: str, attributes: Mapping[str, Any]) -> str | None:
-    """Whether the conventions, or a plain name, make a variable x or y."""
-    standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
-    axis = str(attributes.get("axis", "")).upper()
-    plain = name.lower()
-    if standard in ("longitude", "projection_x_coordinate", "grid_longitude") or units in _EAST or axis == "X":
-        return "x"
-    if standard in ("latitude", "projection_y_coordinate", "grid_latitude") or units in _NORTH or axis == "Y":
-        return "y"
-    if plain in ("x", "lon", "longitude", "easting"):
-        return "x"
-    return "y" if plain in ("y", "lat", "latitude", "northing") else None
-
-
-def _is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:
-    standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
-    if units in _EAST:
-        return True
-    return units.startswith("degree") and (standard == "longitude" or name.lower() in ("lon", "longitude"))
 
 
 def _left(dims: tuple[Hashable, ...], index: Mapping[str, int]) -> tuple[str, ...]:
@@ -186,7 +171,7 @@ def _index(source: Source, dataset: Any, dims: tuple[Hashable, ...]) -> dict[str
     """Places along dimensions that options name."""
     index: dict[str, int] = {}
     if "time" in source.options:
-        times = [str(dim) for dim in dims if _is_time(dataset, str(dim))]
+        times = [str(dim) for dim in dims if is_time(dataset, str(dim))]
         if not times:
             raise OptionError(f"expected no time=, got one: the dimensions are {', '.join(map(str, dims))}")
         index[times[0]] = _moment(dataset, times[0], str(source.options["time"]))
@@ -205,20 +190,15 @@ def _number(dataset: Any, dim: str, text: str, option: str) -> int:
     return int(text) % length
 
 
-def _is_time(dataset: Any, dim: str) -> bool:
-    attributes = dataset.variables[dim].attrs if dim in dataset.variables else {}
-    units = str(attributes.get("units", ""))
-    return " since " in units or str(attributes.get("axis", "")).upper() == "T" or dim.lower().startswith("time")
-
-
 def _moment(dataset: Any, dim: str, text: str) -> int:
     """The number of a time, or that of the only date that begins so."""
-    if text.removeprefix("-").isdecimal() and (len(text) < 4 or dim not in dataset.variables):
+    name = time_of(dataset, dim) or (dim if dim in dataset.variables else None)
+    if text.removeprefix("-").isdecimal() and (len(text) < 4 or name is None):
         return _number(dataset, dim, text, "time")
     import xarray
 
     try:
-        times = xarray.decode_cf(dataset[[dim]])[dim].values
+        times = xarray.decode_cf(dataset[[name or dim]])[name or dim].values
         dates = [str(np.datetime_as_string(time)) if isinstance(time, np.datetime64) else str(time) for time in times]
     except Exception as error:  # of dates in any calendar and unit that a file may claim
         raise OptionError(f"expected time= with a number, got {text!r}: the dates are not readable ({error})") from None
@@ -234,7 +214,7 @@ def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[st
     long = [dim for dim in left if dataset.sizes[dim] > 1]
     if len(long) > 2:
         ways = [
-            f"{dim} ({dataset.sizes[dim]}) with {'time=' if _is_time(dataset, dim) else f'at={dim}:'}0 to "
+            f"{dim} ({dataset.sizes[dim]}) with {'time=' if is_time(dataset, dim) else f'at={dim}:'}0 to "
             f"{dataset.sizes[dim] - 1}"
             for dim in long[:-2]
         ]
@@ -254,7 +234,7 @@ def _found(dataset: Any, name: str, dims: tuple[str, str], index: Mapping[str, i
             f"expected {name} over {dims[0]} and {dims[1]} or one of them, got {', '.join(left) or 'none'}"
         )
     axis = None if left == dims else dims.index(left[0])
-    return Found(name, axis, _is_longitude(name, variable.attrs))
+    return Found(name, axis, is_longitude(name, variable.attrs))
 
 
 def _conventional(
@@ -263,12 +243,13 @@ def _conventional(
     """The coordinates that the conventions give a variable: vectors that they know, arrays, then any vectors."""
     variables = dataset.variables
     named = [name for name in str(variables[main].attrs.get("coordinates", "")).split() if name in variables]
-    others = [str(name) for name, variable in variables.items() if _letter(str(name), variable.attrs) and name != main]
+    letters = letters_of(dataset)
+    others = [name for name in letters if name != main]
     ways: list[dict[str, Found]] = [{}, {}]
     for name in (*dims, *named, *others):
         if name not in variables or not _numeric(variables[name]):
             continue
-        left, letter = _left(variables[name].dims, index), _letter(name, variables[name].attrs)
+        left, letter = _left(variables[name].dims, index), letters.get(name)
         if letter and left in (dims, dims[:1], dims[1:]):
             ways[left == dims].setdefault(letter, _found(dataset, name, dims, index))
     for way in ways:

@@ -6,6 +6,7 @@ to other files (``mtllib``) are skipped.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from itertools import groupby, pairwise
@@ -22,11 +23,22 @@ from ..meshes import check_faces
 from ..notes import keep_words
 from ..source import Source, number
 
-__all__ = ["IGNORED", "READ", "ObjFile"]
+__all__ = ["GEOMETRY", "IGNORED", "READ", "ObjFile"]
 
 #: Statements that say nothing about which points there are and how they are joined.
 IGNORED = frozenset(b"g o s mg usemtl mtllib usemap maplib shadow_obj trace_obj bevel c_interp d_interp lod".split())
 READ = frozenset((b"v", b"vt", b"vn", b"f", b"l"))
+
+#: Statements of points, curves and surfaces that are not read: without them it would be another surface.
+GEOMETRY = frozenset(
+    b"vp p curv curv2 surf fo cstype deg bmat step parm trim hole scrv sp con end bzp bsp cdc cdp res call csh".split()
+)
+
+#: What a statement of another program may be called, such as the ``t crease`` of subdivision surfaces.
+_KEYWORD = re.compile(rb"[A-Za-z][A-Za-z0-9_.:-]{0,39}")
+
+#: How many kinds of such statements are counted and named.
+_MOST_KINDS = 16
 
 #: Of these, what a user would miss, in words, and from how many different ones on: a single name parts nothing.
 _LEFT_OUT = (
@@ -73,6 +85,7 @@ class ObjFile:
         self._faces: list[int] = []  # faces of each run
         self._face_starts: list[tuple[int, int]] = []  # number of the first face of a run and of its line
         self._others: dict[bytes, set[bytes]] = {}  # what other statements say, a few of each kind
+        self._foreign: dict[str, int] = {}  # statements of other programs, and how many of each
         self.words: dict[str, str] = {}  # what comments say, as the writer puts it
         for line, run in _runs(source.path):
             self._add(line, run)
@@ -134,10 +147,15 @@ class ObjFile:
             if len(said) < _ENOUGH:
                 said.add(b" ".join(words[1:]).lower())
             return
-        if words[0] not in READ:
+        # Text that begins with something else is no OBJ, whatever it is called.
+        foreign = words[0] not in READ and self._counts[b"v"] > 0 and bool(_KEYWORD.fullmatch(words[0]))
+        if words[0] in GEOMETRY or not (foreign or words[0] in READ):
             raise FormatError(f"line {line}: expected an OBJ statement of points and faces (v, f), got {_shown(text)}")
         if words[-1] == b"\\":
             raise FormatError(f"line {line}: expected a statement on one line, got one that is continued")
+        if foreign:
+            self._pass_over(words)
+            return
         if words[0] in _KINDS:
             self._keep_values(line, words[0], _numbers(line, words, text))
             return
@@ -150,6 +168,14 @@ class ObjFile:
         rows = np.full((3, 1, 4), -1, np.int32)
         rows[:, 0, : len(corners)] = np.array(corners, np.int32).T
         self._keep_faces(line, 1, [row if row.max() >= 0 else None for row in rows])
+
+    def _pass_over(self, words: list[bytes]) -> None:
+        """Count a statement of another program, which says nothing of points and faces."""
+        second = words[1] if len(words) > 1 and words[0] == b"t" and _KEYWORD.fullmatch(words[1]) else b""
+        kind = b" ".join(filter(None, (words[0], second))).decode("ascii")
+        if kind not in self._foreign and len(self._foreign) >= _MOST_KINDS:
+            kind = "others"
+        self._foreign[kind] = self._foreign.get(kind, 0) + 1
 
     def _corner(self, line: int, word: bytes, text: bytes) -> tuple[int, int, int]:
         """The point, texture and normal of a corner; -1 where it has none."""
@@ -212,6 +238,9 @@ class ObjFile:
             said = set().union(*(self._others.get(kind, set()) for kind in kinds))
             if len(said - _NOTHING) >= least:
                 found.append(f"{what} ({', '.join(kind.decode() for kind in kinds if kind in self._others)}) left out")
+        if self._foreign:
+            foreign = ", ".join(f"{kind} ({number(count)})" for kind, count in self._foreign.items())
+            found.append(f"statements that are no geometry left out: {foreign}")
         if self.face_count and self.segments:
             found.append("lines (l) beside faces left out")
         for place, what in ((1, "places in a texture (vt)"), (2, "normals (vn)")):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -40,6 +40,14 @@ _MAX_BLOCKS = 1 << 12
 _MAX_VARIABLES = 1 << 10
 _MAX_POINTS = 1 << 24
 _MARKER = 4
+
+#: Reference numbers of a block in a Q file, and how many more its record may have behind them.
+REFERENCES = 4
+_MOST_REFERENCES = 1 << 9
+
+#: A file of records of one length is filled with zeros to a multiple of it: of this, and of no more than that.
+_RECORD = 512
+_LONGEST_RECORD = 1 << 16
 
 #: What text has no use for.
 _BINARY = ("reals", "endian", "records")
@@ -91,6 +99,8 @@ class Layout:
         As in a type of NumPy.
     records : bool
         Whether each record stands between two copies of its length.
+    references : int
+        Numbers before the fields of each block of a Q file, of which the first four count.
     """
 
     kind: str
@@ -102,6 +112,7 @@ class Layout:
     precision: int = 0
     endian: str = ""
     records: bool = False
+    references: int = REFERENCES
 
     @property
     def item(self) -> int:
@@ -121,7 +132,7 @@ class Layout:
         yield self.integer * per_block * len(self.dims)
         for dims, fields in zip(self.dims, self.variables, strict=True):
             if self.kind == "q":
-                yield 4 * self.item
+                yield self.references * self.item
             yield prod(dims) * (fields * self.item + self.iblank * self.integer)
 
     def size(self) -> int:
@@ -239,6 +250,10 @@ def find_layout(
         layout for layout in _plausible(numbers, kinds, wanted) if dims is None or list(layout.dims) == list(dims)
     ]
     fitting = [layout for layout in plausible if layout.size() == numbers.size and _marked(numbers, layout)]
+    if not fitting:
+        padded = [layout for layout in plausible if _is_padded(numbers, layout) and _marked(numbers, layout)]
+        # A longer layout would have fields that end in zeros, as no field of a flow does.
+        fitting = [layout for layout in padded if layout.size() == min(it.size() for it in padded)]
     if len(fitting) == 1:
         return fitting[0]
     unit = "numbers" if numbers.text else "bytes"
@@ -280,7 +295,10 @@ def _plausible(numbers: Numbers, kinds: Sequence[str], wanted: Mapping[str, obje
             continue
         dims, variables = header
         for precision, iblank in product(choices("reals"), choices("iblank") if kind == "grid" else [False]):
-            yield Layout(kind, multi, dimensions, iblank, dims, variables, precision or 0, endian or "", bool(records))
+            layout = Layout(
+                kind, multi, dimensions, iblank, dims, variables, precision or 0, endian or "", bool(records)
+            )
+            yield replace(layout, references=_references(numbers, layout))
 
 
 def _header(
@@ -309,6 +327,25 @@ def _header(
     else:
         variables = (dimensions + (2 if kind == "q" else 0),) * count
     return dims, variables
+
+
+def _references(numbers: Numbers, layout: Layout) -> int:
+    """How many numbers the record of the reference numbers has; four where none is marked, or it is no such record."""
+    if layout.kind != "q" or not layout.records:
+        return REFERENCES
+    place, _ = layout.places()[1 + layout.multi]
+    length = (numbers.integers(place - _MARKER, 1, layout.endian) or (0,))[0]
+    count, rest = divmod(length, layout.item)
+    return count if not rest and REFERENCES < count <= _MOST_REFERENCES else REFERENCES
+
+
+def _is_padded(numbers: Numbers, layout: Layout) -> bool:
+    """Whether nothing but zeros follows, up to the end of a record."""
+    left = numbers.size - layout.size()
+    if numbers.text or numbers.size % _RECORD or not 0 < left < _LONGEST_RECORD:
+        return False
+    zeros = numbers.integers(layout.size() // 4 * 4, left // 4, "<") if layout.size() % 4 == left % 4 == 0 else None
+    return zeros is not None and not any(zeros)
 
 
 def _marked(numbers: Numbers, layout: Layout) -> bool:

@@ -22,7 +22,7 @@ from ..list_directed import is_text
 from ..notes import warn
 from ..planes import Cut
 from ..source import Source
-from .layouts import Layout, Numbers, dimensions_of, find_layout, open_numbers
+from .layouts import REFERENCES, Layout, Numbers, dimensions_of, find_layout, open_numbers
 
 __all__ = ["MORE", "READ_OPTIONS", "SUFFIXES", "read", "sniff"]
 
@@ -71,8 +71,10 @@ def read(source: Source) -> Surface:
     numbers = open_numbers(source.path)
     layout = find_layout(numbers, ["grid"], dimensions_of(source))
     chosen = source.integer_option("block", 1, len(layout.dims))
-    indices = range(len(layout.dims)) if chosen is None else [chosen - 1]
-    taken, metadata = planes.cuts(source, [layout.dims[index] for index in indices])
+    given = range(len(layout.dims)) if chosen is None else [chosen - 1]
+    of_blocks, metadata = planes.cuts(source, [layout.dims[index] for index in given])
+    indices = [index for index, of_block in zip(given, of_blocks, strict=True) for _ in of_block]
+    taken = [cut for of_block in of_blocks for cut in of_block]
     metadata = source.metadata("plot3d") | metadata
     attributes: list[dict[str, NDArray[Any]]] = [{} for _ in indices]
     functions = 0
@@ -137,6 +139,10 @@ class _Fields:
         """Those of the first block, which all blocks should have."""
         places = self._layout.places()[1 + self._layout.multi :: 2]
         values = [self._numbers.array(place, len(_REFERENCES), self._layout, "f") for place, _ in places]
+        more = self._layout.references - REFERENCES
+        behind = places[0][0] + REFERENCES * self._layout.item
+        if more and np.any(self._numbers.array(behind, more, self._layout, "f")):
+            warn(f"left out {more} numbers of a Q file behind the four reference numbers")
         if any(other.tobytes() != values[0].tobytes() for other in values[1:]):
             warn("left out the reference numbers of later blocks of a Q file, which differ from those of the first")
         return {name: float(value) for name, value in zip(_REFERENCES, values[0], strict=True)}

@@ -5,22 +5,21 @@ from __future__ import annotations
 import shutil
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...coordinates.height_fields import coordinates
 from ...surface import Surface
 from ..notes import listing, metadata_left_out, survives, warn, warn_left_out
 from ..source import Source
 from . import gdal, tiff_guard
 from .tags import describe, missing
-from .writing_heights import even_heights, geotransform
+from .writing_heights import even_heights, geotransform, warn_off
 
-__all__ = ["READ_OPTIONS", "read", "sniff", "write"]
+__all__ = ["READ_OPTIONS", "read", "sniff", "write", "write_tiff"]
 
 READ_OPTIONS = {"band": "number of the band of heights, from 1 (default: 1); the others become attributes"}
 
@@ -32,9 +31,6 @@ _HELD = (
     *("geotransform", "grid", "axes", "crs", "unit", "scale", "offset"),
     *("area_or_point", "description", "tags", "bands"),
 )
-
-#: How far a coordinate may be from the affine rule that is written, in steps of the grid, before it is worth a note.
-_OFF = 1e-6
 
 #: Sides of the tiles of an image that is at least so large.
 _TILE = 256
@@ -57,6 +53,21 @@ def write(surface: Surface, file: BinaryIO) -> None:
     Holes get the value of ``nodata`` in the metadata where their type can hold it and no height has it, else NaN; in
     integers without such a value a mask inside the file says where they are.
     """
+    write_tiff(surface, file, lambda path, predictor: path)
+
+
+def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], Path]) -> None:
+    """Write a GeoTIFF, and what is made of it to `file`.
+
+    Parameters
+    ----------
+    surface : Surface
+    file : binary file
+        Only its ``write`` is used.
+    finish : callable
+        Takes the path of the GeoTIFF, alone in its folder, and TIFF's predictor for its values; returns the path of
+        the file to hand over.
+    """
     rasterio = gdal.require_rasterio(_TITLE)
     surface = even_heights(surface, _TITLE)
     if any(surface.closed):
@@ -68,6 +79,32 @@ def write(surface: Surface, file: BinaryIO) -> None:
         kept = surface.blocks[0].kept
         said = surface.mask if kept is None else surface.mask | kept
         bands[0] = np.where(said, bands[0], bands[0].dtype.type(0 if nodata is None else nodata))
+    profile = _profile(surface, bands, nodata)
+    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        path = Path(folder) / "data.tif"
+        with (
+            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED="NO"),
+            rasterio.open(path, "w", **profile) as dataset,
+        ):
+            crs = _locate(dataset, surface)
+            valid = bands[0] if surface.mask is None else bands[0][surface.mask]
+            describe(dataset, surface.metadata, names, [valid, *bands[1:]])
+            for number, band in enumerate(bands, 1):
+                dataset.write(band, number)
+            if surface.mask is not None and nodata is None:
+                dataset.write_mask(surface.mask)
+        path = finish(path, profile["predictor"])
+        with rasterio.Env(**gdal.ALONE), rasterio.open(path, driver="GTiff") as dataset:
+            lost = missing(dataset, surface.metadata, names)
+            lost += ["all of the CRS"] * (crs is not None and dataset.crs != crs)
+        with path.open("rb") as written:
+            shutil.copyfileobj(written, file)
+    warn_left_out(_TITLE, lost, "which GDAL does not write")
+
+
+def _profile(surface: Surface, bands: Sequence[NDArray[Any]], nodata: float | None) -> dict[str, Any]:
+    """How rasterio makes the file."""
     rows, columns = surface.shape
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -83,26 +120,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     }
     if min(rows, columns) >= _TILE:
         profile |= {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE}
-    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        path = Path(folder) / "data.tif"
-        with (
-            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED="NO"),
-            rasterio.open(path, "w", **profile) as dataset,
-        ):
-            crs = _locate(dataset, surface)
-            valid = bands[0] if surface.mask is None else bands[0][surface.mask]
-            describe(dataset, surface.metadata, names, [valid, *bands[1:]])
-            for number, band in enumerate(bands, 1):
-                dataset.write(band, number)
-            if surface.mask is not None and nodata is None:
-                dataset.write_mask(surface.mask)
-        with rasterio.Env(**gdal.ALONE), rasterio.open(path, driver="GTiff") as dataset:
-            lost = missing(dataset, surface.metadata, names)
-            lost += ["all of the CRS"] * (crs is not None and dataset.crs != crs)
-        with path.open("rb") as written:
-            shutil.copyfileobj(written, file)
-    warn_left_out(_TITLE, lost, "which GDAL does not write")
+    return profile
 
 
 def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
@@ -124,8 +142,8 @@ def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
     """The value that stands for holes; None where there is none."""
     given = surface.metadata.get("nodata")
     valid = heights if surface.mask is None else heights[surface.mask]
-    if given is not None:
-        value = float(given)
+    value = _number(given)
+    if value is not None:
         if heights.dtype.kind == "f" and np.isnan(value):
             return value
         limits: Any = np.finfo(heights.dtype) if heights.dtype.kind == "f" else np.iinfo(heights.dtype)
@@ -133,6 +151,14 @@ def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
         if held and not (valid == heights.dtype.type(value)).any():
             return value
     return float("nan") if surface.mask is not None and heights.dtype.kind == "f" else None
+
+
+def _number(text: Any) -> float | None:
+    """The number that metadata give, which text may be; None where they give none."""
+    try:
+        return float(text) if isinstance(text, int | float | str) else None
+    except (ValueError, OverflowError):
+        return None
 
 
 def _locate(dataset: Any, surface: Surface) -> Any:
@@ -144,23 +170,10 @@ def _locate(dataset: Any, surface: Surface) -> Any:
     transform = geotransform(surface)
     if transform is not None:
         dataset.transform = Affine.from_gdal(*transform)
-        _warn_off(surface, transform)
+        warn_off(surface, transform, _TITLE)
     if surface.metadata.get("crs"):
         try:
             dataset.crs = CRS.from_wkt(str(surface.metadata["crs"]))
         except CRSError as error:
             warn(f"the CRS is left out, which GDAL does not know: {listing([error])}")
     return dataset.crs
-
-
-def _warn_off(surface: Surface, transform: Sequence[float]) -> None:
-    """Say how far the cells are from where the heights are; those of a level have a note of their own."""
-    metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "nodes")}
-    if "nodes" in surface.metadata or not {"grid", "axes"} & metadata.keys():
-        return
-    exact = coordinates(Surface(surface.points, mask=surface.mask, metadata=metadata))
-    affine = coordinates(Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform}))
-    for name, is_, was, steps in zip("xy", affine, exact, (transform[1:3], transform[4:6]), strict=True):
-        off = float(np.abs(is_ - was).max())
-        if off > _OFF * max(map(abs, steps)):
-            warn(f"GeoTIFF assumes evenly spaced rows and columns: {name} changes by up to {off:.3g}")

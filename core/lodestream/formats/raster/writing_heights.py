@@ -1,15 +1,20 @@
-"""What formats for height fields, GeoTIFF and PNG, need of a surface, and what they cannot say of it."""
+"""What formats for height fields need of a surface, and what they cannot say of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+
+import numpy as np
 
 from ...coordinates.height_fields import coordinates, to_heights
 from ...errors import FormatError
 from ...surface import Surface
 from ..notes import warn
 
-__all__ = ["even_heights", "geotransform"]
+__all__ = ["even_heights", "geotransform", "warn_off"]
+
+#: How far a coordinate may be from the affine rule that is written, in steps of the grid, before it is worth a note.
+_OFF = 1e-6
 
 
 def even_heights(surface: Surface, title: str) -> Surface:
@@ -48,3 +53,16 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
         down = (float(plane[-1, 0]) - origin) / max(rows - 1, 1)
         transform += [origin - (across + down) / 2, across, down]
     return transform
+
+
+def warn_off(surface: Surface, transform: Sequence[float], title: str) -> None:
+    """Say how far the cells are from where the heights are; those of a level have a note of their own."""
+    metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "nodes")}
+    if "nodes" in surface.metadata or not {"grid", "axes"} & metadata.keys():
+        return
+    exact = coordinates(Surface(surface.points, mask=surface.mask, metadata=metadata))
+    affine = coordinates(Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform}))
+    for name, is_, was, steps in zip("xy", affine, exact, (transform[1:3], transform[4:6]), strict=True):
+        off = float(np.abs(is_ - was).max())
+        if off > _OFF * max(map(abs, steps)):
+            warn(f"{title} assumes evenly spaced rows and columns: {name} changes by up to {off:.3g}")

@@ -105,6 +105,7 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     taken, metadata = cuts(source, known) if len(known) == len(files) else ([], {})
     blocks: list[Block] = []
     faces: list[dict[str, Any]] = []
+    count = 0
     left_out: list[str] = []
     words: dict[str, str] = {}
     for file in files:
@@ -112,12 +113,15 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
             if not known:
                 taken, metadata = cuts(source, [tuple(grid["dims"]) for grid in grids])
             for grid in grids:
-                cut = taken[len(blocks)] if len(blocks) < len(taken) else None
-                if cut is None or tuple(grid["dims"]) != cut.dims:
+                planes = [_Plane(cut) for cut in taken[count]] if count < len(taken) else []
+                if not planes or tuple(grid["dims"]) != planes[0].cut.dims:
                     raise FormatError(f"expected one grid for each header, got others in {file.path.name}")
-                block, face = _block(grid, cut, output)
-                blocks.append(block)
-                faces.append(face)
+                count += 1
+                _receive(grid, planes, output)
+                for plane in planes:
+                    block, face = plane.block()
+                    blocks.append(block)
+                    faces.append(face)
                 left_out += grid["left_out"]
                 for key, text in grid["words"].items():
                     keep_words(words, key, text)
@@ -175,38 +179,56 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)[:400]
 
 
-def _block(grid: Any, cut: Cut, output: IO[bytes]) -> tuple[Block, dict[str, Any]]:
-    """Take one grid from the pipe; give it and what is to be said of its faces."""
-    points: NDArray[Any] | None = None
-    axes: list[NDArray[Any]] = []
-    attributes: dict[str, NDArray[Any]] = {}
-    mask: NDArray[np.bool_] | None = None
-    hidden: NDArray[np.bool_] | None = None
+def _receive(grid: Any, planes: Sequence[_Plane], output: IO[bytes]) -> None:
+    """Take the arrays of one grid from the pipe, and of each what the planes need."""
+    dims = planes[0].cut.dims
     for array in grid["arrays"]:
         values = _received(output, np.dtype(array["dtype"]), tuple(array["shape"]))
         role, name = array["role"], array["name"]
+        if role not in ("axis", "cell_ghost") and len(values) != prod(dims):
+            raise FormatError(f"expected {number(prod(dims))} values of {name or 'the points'}, got {len(values)}")
+        unheld = role == "cell_ghost" and any(_hidden_cells(values, plane.cut) is None for plane in planes)
+        if unheld and (values & HIDDEN_CELL).any():
+            warn("left out which cells of a volume are hidden")
+        for plane in planes:
+            plane.take(role, name, values)
+
+
+class _Plane:
+    """A surface of one grid, while its arrays arrive."""
+
+    def __init__(self, cut: Cut) -> None:
+        self.cut = cut
+        self._points: NDArray[Any] | None = None
+        self._axes: list[NDArray[Any]] = []
+        self._attributes: dict[str, NDArray[Any]] = {}
+        self._mask: NDArray[np.bool_] | None = None
+        self._hidden: NDArray[np.bool_] | None = None
+
+    def take(self, role: str, name: str, values: NDArray[Any]) -> None:
+        """Keep of one array what lies on the surface."""
         if role == "axis":
-            axes.append(values)
+            self._axes.append(values)
         elif role == "cell_ghost":
-            hidden = _hidden_cells(values, cut)
-            if hidden is None and (values & HIDDEN_CELL).any():
-                warn("left out which cells of a volume are hidden")
-        elif len(values) != prod(cut.dims):
-            raise FormatError(f"expected {number(prod(cut.dims))} values of {name or 'the points'}, got {len(values)}")
+            self._hidden = _hidden_cells(values, self.cut)
         elif role == "points":
-            points = cut.of(values)
+            self._points = self.cut.of(values)
         elif role == "point_ghost":
-            mask = cut.of(values) & HIDDEN_POINT == 0
+            self._mask = self.cut.of(values) & HIDDEN_POINT == 0
         else:
-            attributes[_attribute_name(role, name, values)] = cut.of(values)
-    if axes:
-        points = _rectilinear(axes, cut)
-    if points is None:
-        raise FormatError("expected a grid with points, got none")
-    face: dict[str, Any] = {}
-    if hidden is not None:
-        mask, face = without_hidden(hidden, mask)
-    return Block(points, mask=mask, attributes=attributes), face
+            self._attributes[_attribute_name(role, name, values)] = self.cut.of(values)
+
+    def block(self) -> tuple[Block, dict[str, Any]]:
+        """The surface, and what is to be said of its faces."""
+        points, mask = self._points, self._mask
+        if self._axes:
+            points = _rectilinear(self._axes, self.cut)
+        if points is None:
+            raise FormatError("expected a grid with points, got none")
+        face: dict[str, Any] = {}
+        if self._hidden is not None:
+            mask, face = without_hidden(self._hidden, mask)
+        return Block(points, mask=mask, attributes=self._attributes), face
 
 
 def _received(output: IO[bytes], dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -252,6 +274,8 @@ def without_hidden(
 ) -> tuple[NDArray[np.bool_], dict[str, Any]]:
     """Make holes of the points all of whose cells are hidden; name the other hidden cells.
 
+    A cell with a hidden point says nothing more by being hidden: its other points are valid.
+
     Parameters
     ----------
     hidden : bool array of shape (H - 1, W - 1)
@@ -263,6 +287,8 @@ def without_hidden(
     (bool array of shape (H, W), dict)
         The points that are valid still; what the metadata's ``faces`` say.
     """
+    if mask is not None:
+        hidden = hidden & mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
     around = np.pad(hidden, 1, constant_values=True)
     all_hidden = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
     valid = ~all_hidden if mask is None else mask & ~all_hidden

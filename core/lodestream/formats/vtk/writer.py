@@ -5,6 +5,7 @@ Source: "VTK XML Formats" of the VTK documentation; blanking as in VTK's vtkStru
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -13,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...coordinates.height_fields import coordinates
+from ...errors import FormatWarning
 from ...mesh.cells import unpack_cells
 from ...surface import Block, Surface
 from ..attributes import COLOR, NORMAL, TEXTURE
+from ..closing import MIN_CLOSED, wrapped_ends, wraps
 from ..mesh_output import exact_float, extra_channels, words_of
 from ..notes import warn
 from .ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["Grid", "grid_of", "write"]
+__all__ = ["Grid", "grid_of", "write", "write_block"]
 
-_MIN_CLOSED = 3
 _TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
 _CHUNK = 1 << 20
 
@@ -43,15 +45,29 @@ class Grid:
 def write(surface: Surface, file: BinaryIO) -> None:
     """Write points and attributes, appended as bytes.
 
-    Holes are hidden points (``vtkGhostType``) and cells without a face hidden cells. A closed axis repeats its first
-    points at the end. Several blocks are stacked in one grid, with hidden cells between them, and padded to the widest
-    with hidden points, since a file holds one grid; that is warned of. Name, unit and CRS are strings of field data.
+    Holes are hidden points (``vtkGhostType``); cells with such a corner, and those without a face, are hidden cells. A
+    closed axis repeats its first points at the end. Several blocks are stacked in one grid, with hidden cells between
+    them, and padded to the widest with hidden points, since a file holds one grid; that is warned of. Name, unit and
+    CRS are strings of field data.
     """
     grids = [grid_of(surface, number) for number in range(len(surface.blocks))]
     if len(grids) > 1:
         warn(f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them")
     _warn_of_faces(surface)
-    grid = grids[0] if len(grids) == 1 else _stacked(grids)
+    _write_grid(surface, grids[0] if len(grids) == 1 else _stacked(grids), file)
+
+
+def write_block(surface: Surface, number: int, file: BinaryIO) -> None:
+    """Write one block, as `write` does those that are alone; what is lost of all is said with the first."""
+    if number == 0:
+        _warn_of_faces(surface)
+    with warnings.catch_warnings():
+        if number:
+            warnings.simplefilter("ignore", FormatWarning)
+        _write_grid(surface, grid_of(surface, number), file)
+
+
+def _write_grid(surface: Surface, grid: Grid, file: BinaryIO) -> None:
     rows, columns = grid.points.shape[:2]
     attributes = dict(grid.attributes)
     if grid.hidden_points.any():
@@ -110,17 +126,18 @@ def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
     hidden = np.zeros(block.shape, np.bool_) if block.mask is None else ~block.mask
     if hidden.any():
         points[hidden] = points[~hidden][0]  # inside the box, which VTK takes of all points
-    wraps = [closed and length >= _MIN_CLOSED for closed, length in zip(block.closed, block.shape, strict=True)]
-    ends = [(0, int(wrap)) for wrap in wraps]
-    rows, columns = (length - 1 + int(wrap) for length, wrap in zip(block.shape, wraps, strict=True))
+    rows, columns = (length - 1 + int(wrap) for length, wrap in zip(block.shape, wraps(block), strict=True))
     faces = surface.metadata.get("faces", {})  # one map for all blocks, or a list of one for each
     of_block = faces[number] if isinstance(faces, list) and number < len(faces) else faces
     left_out = unpack_cells(of_block.get("left_out") if isinstance(of_block, dict) else None, (rows, columns))
+    hidden = wrapped_ends(hidden, block)
+    # Programs that draw look at the cells, not at the points that these need.
+    holes = hidden[:-1, :-1] | hidden[:-1, 1:] | hidden[1:, :-1] | hidden[1:, 1:]
     return Grid(
-        _padded(points, ends, "wrap"),
-        {name: _padded(values, ends, "wrap") for name, values in attributes.items()},
-        _padded(hidden, ends, "wrap"),
-        np.zeros((rows, columns), np.bool_) if left_out is None else left_out,
+        wrapped_ends(points, block),
+        {name: wrapped_ends(values, block) for name, values in attributes.items()},
+        hidden,
+        holes if left_out is None else left_out | holes,
     )
 
 
@@ -131,10 +148,10 @@ def _warn_of_faces(surface: Surface) -> None:
     if any("diagonal" in it for it in maps):
         warn("VTS is written with quads in place of the triangles that they were joined from")
     closed = [
-        block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < _MIN_CLOSED
+        block for block in surface.blocks for axis in (0, 1) if block.closed[axis] and block.shape[axis] < MIN_CLOSED
     ]
     if closed:
-        warn(f"VTS is written with open axes in place of closed ones of fewer than {_MIN_CLOSED} points")
+        warn(f"VTS is written with open axes in place of closed ones of fewer than {MIN_CLOSED} points")
     if _GHOSTS in surface.blocks[0].attributes:
         warn(f"VTS is written with the attribute {_GHOSTS} as {_GHOSTS}_, because VTS uses that name for hidden points")
 

@@ -1,0 +1,101 @@
+"""``lodestream convert``: files of one format into a file of another, without a container between them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lodestream.errors import FormatError
+from lodestream.quality import Quality
+
+from ..terminal.interrupts import interruptible
+from ..terminal.output import note, print_json
+from .arguments import (
+    Subparsers,
+    SurfaceOptions,
+    add_command,
+    add_json_option,
+    add_reading_options,
+    reading_options,
+    standard_input_once,
+    standard_output_once,
+)
+from .encode import read_surface
+from .outcome import check_out, write_surface
+
+if TYPE_CHECKING:
+    from lodestream.surface import Surface
+
+__all__ = ["ConvertOptions", "register", "run"]
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the sub-command."""
+    parser = add_command(
+        subparsers,
+        "convert",
+        run,
+        "convert one or several files of a surface into a file of another format",
+        "Reads what encode reads and writes what decode writes, see lodestream formats. The suffix of OUT decides its\n"
+        "format; standard output is NPY. What OUT cannot hold is said.",
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
+    parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
+    add_reading_options(parser.add_argument_group("surface options"))
+    add_json_option(parser)
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """What the command line asks of a conversion: `files` and `out` are names, ``-`` standard input and output."""
+
+    files: tuple[str, ...]
+    out: str
+    surface: SurfaceOptions
+    json: bool
+
+
+def _options(args: argparse.Namespace) -> ConvertOptions:
+    """The options; ends the program if the command line is wrong."""
+    standard_output_once(args, "surface")
+    files = standard_input_once(args, args.files)
+    if Path(args.out).suffix.lower() == ".lode":
+        args.parser.error(f"expected a file of another format last, got {args.out}: lodestream encode makes containers")
+    for name in files:
+        if Path(name).suffix.lower() == ".lode":
+            args.parser.error(f"expected files of other formats, got {name}: lodestream decode reads containers")
+    return ConvertOptions(files, args.out, reading_options(args, Quality()), args.json)
+
+
+@interruptible()
+def run(args: argparse.Namespace) -> int:
+    """Read, write, report."""
+    options = _options(args)
+    check_out(options.out)
+    started = time.monotonic()
+    surface = read_surface(options.files, options.surface)
+    _check_blocks(surface, options.out)
+    write_surface(surface, options.out)
+    shapes = [block.shape for block in surface.blocks]
+    if options.json:
+        shape = list(shapes[0]) if len(shapes) == 1 else None
+        print_json({"out": options.out, "shape": shape, "seconds": round(time.monotonic() - started, 3)})
+    else:
+        grid = " x ".join(map(str, shapes[0])) if len(shapes) == 1 else f"{len(shapes)} blocks of"
+        points = "" if len(shapes) == 1 else f" {sum(map(math.prod, shapes)):,}"
+        note(f"{grid}{points} points written in {time.monotonic() - started:.1f} s")
+    return 0
+
+
+def _check_blocks(surface: Surface, out: str) -> None:
+    """Say by its name that OUT cannot hold several blocks."""
+    from lodestream.formats import check_blocks, for_writing, written
+
+    try:
+        check_blocks(written("npy") if out == "-" else for_writing(out), len(surface.blocks))
+    except FormatError as error:
+        raise FormatError(f"{'standard output' if out == '-' else out}: {error}") from None

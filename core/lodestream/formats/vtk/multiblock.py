@@ -1,0 +1,117 @@
+"""VTM: a file that names one .vts for each block, in a folder beside it; one archive where there is no folder.
+
+Source: "VTK XML Formats" of the VTK documentation; names as ParaView gives them.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+from ...errors import FormatError
+from ...surface import Surface
+from ..archives import new_archive, new_member
+from . import writer
+
+__all__ = ["MEDIA_TYPE", "SUFFIXES", "sniff", "write", "write_beside"]
+
+SUFFIXES = (".vtm",)
+MEDIA_TYPE = "application/zip"
+
+#: What an archive calls the surface.
+_NAME = "surface"
+
+
+def sniff(head: bytes, suffix: str) -> bool:
+    """Never: its blocks are read, as further .vts files of one surface; what a .vtm names is not opened."""
+    return False
+
+
+def write(surface: Surface, file: BinaryIO) -> None:
+    """Write a ZIP archive of ``surface.vtm`` and of the folder ``surface`` with the blocks."""
+    with new_archive(file) as archive:
+        with new_member(archive, f"{_NAME}.vtm") as member:
+            member.write(_index(_NAME, _names(_NAME, len(surface.blocks))))
+        for number, name in enumerate(_names(_NAME, len(surface.blocks))):
+            with new_member(archive, f"{_NAME}/{name}") as member:
+                writer.write_block(surface, number, member)
+
+
+def write_beside(surface: Surface, path: Path) -> None:
+    """Write NAME.vtm, and the folder NAME beside it with NAME_0.vts and so on.
+
+    Both are written under temporary names and put in place by renaming, the folder first. A folder of that name is
+    replaced if nothing but blocks of an earlier NAME.vtm is in it.
+
+    Raises
+    ------
+    FormatError
+        If there is a file of the folder's name, or a folder with other files.
+    OSError
+        If the disk does not take it; what was there before is there again then.
+    """
+    folder = path.with_suffix("")
+    _check_folder(folder)
+    token = secrets.token_hex(4)
+    made, old = (path.with_name(f".{folder.name}.{token}.{word}") for word in ("tmp", "old"))
+    index = path.with_name(f".{path.name}.{token}.tmp")
+    try:
+        made.mkdir()
+        names = _names(folder.name, len(surface.blocks))
+        for number, name in enumerate(names):
+            with (made / name).open("xb") as file:
+                writer.write_block(surface, number, file)
+        index.write_bytes(_index(folder.name, names))
+        if folder.exists():
+            folder.rename(old)
+        try:
+            made.rename(folder)
+            index.replace(path)
+        except BaseException:
+            if old.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                old.rename(folder)
+            raise
+    finally:
+        index.unlink(missing_ok=True)
+        for left in (made, old):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse to replace what a writer of this module has not written."""
+    if not folder.exists() and not folder.is_symlink():
+        return
+    ours = re.compile(re.escape(folder.name) + r"_\d+\.vts")
+    if folder.is_symlink() or not folder.is_dir():
+        raise FormatError(f"expected a place for the folder {folder.name!r} of the blocks, got a file of that name")
+    other = sorted(entry.name for entry in folder.iterdir() if not ours.fullmatch(entry.name))
+    if other:
+        raise FormatError(
+            f"expected the folder {folder.name!r} with nothing but blocks of an earlier .vtm, got {other[0]!r} in it"
+        )
+
+
+def _names(stem: str, count: int) -> list[str]:
+    return [f"{stem}_{number}.vts" for number in range(count)]
+
+
+def _index(folder: str, names: Sequence[str]) -> bytes:
+    from xml.sax.saxutils import quoteattr
+
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="vtkMultiBlockDataSet" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
+        "<vtkMultiBlockDataSet>",
+        *(
+            f'<DataSet index="{number}" name="block {number}" file={quoteattr(f"{folder}/{name}")}/>'
+            for number, name in enumerate(names)
+        ),
+        "</vtkMultiBlockDataSet>",
+        "</VTKFile>",
+    ]
+    return "\n".join(lines).encode() + b"\n"

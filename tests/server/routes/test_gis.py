@@ -1,0 +1,131 @@
+"""Levels that GDAL opens by their address, as docs/gis.md says: tiles by ranges, place, CRS, holes, tokens."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lodestream as ls
+from tests.server.helpers import Keys, hills, push
+from tests.server.programs import server
+
+rasterio = pytest.importorskip("rasterio")
+
+PAGE = (Path(__file__).parents[3] / "docs" / "gis.md").read_text()
+ADDRESS = "https://maps.example.org/v1/surfaces/5f1c0a9b3d7e42a68c10/levels/7?format=cog"
+PLACE = [500000.0, 30.0, 0.0, 4100000.0, 0.0, -30.0]
+
+
+@pytest.fixture(autouse=True)
+def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1,localhost")
+
+
+def terrain() -> ls.Surface:
+    """Heights that need several tiles, with a hole and a place."""
+    heights = hills(700, 600) + np.random.default_rng(1).normal(size=(700, 600)).astype(np.float32)
+    mask = np.ones(heights.shape, np.bool_)
+    mask[5:60, 10:80] = False
+    crs = rasterio.crs.CRS.from_epsg(32611).to_wkt()
+    return ls.Surface(heights, mask=mask, metadata={"geotransform": PLACE, "crs": crs, "unit": "m", "name": "hill"})
+
+
+@pytest.fixture(scope="module")
+def place(keys: Keys) -> Iterator[tuple[str, str]]:
+    """A server that asks for tokens, and the address of a surface's finest level on it."""
+    # In a process of its own: rasterio holds the interpreter's lock while it opens an address.
+    with server(keys.folder / "gis", token_file=str(keys.folder / "tokens.json")) as running:
+        url = running.url
+        headers = {"authorization": f"Bearer {keys.tokens['admin']}"}
+        with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+            surface = push(http, ls.encode(terrain()))
+            yield f"{url}{surface['url']}/levels/{len(surface['levels']) - 1}", keys.tokens["read"]
+
+
+@pytest.fixture
+def authorised(place: tuple[str, str]) -> Iterator[str]:
+    """The address of the level, while GDAL sends the token."""
+    address, token = place
+    with rasterio.Env(GDAL_HTTP_HEADERS=f"Authorization: Bearer {token}"):
+        yield address
+
+
+def read(address: str) -> tuple[Any, NDArray[Any], NDArray[Any]]:
+    with rasterio.open(f"/vsicurl/{address}") as dataset:
+        return dataset.profile, dataset.read(1), dataset.read_masks(1) > 0
+
+
+@pytest.mark.parametrize("name", ["tif", "tiff", "geotiff", "cog", "cog.tif"])
+def test_gdal_opens_a_level_by_its_address(authorised: str, name: str) -> None:
+    profile, heights, valid = read(f"{authorised}?format={name}")
+    surface = terrain()
+    assert surface.mask is not None
+    np.testing.assert_array_equal(valid, surface.mask)
+    np.testing.assert_array_equal(heights[valid], surface.points[surface.mask])
+    assert profile["crs"] == rasterio.crs.CRS.from_epsg(32611)
+    assert list(profile["transform"].to_gdal()) == PLACE
+    assert profile["tiled"]
+
+
+def test_a_cog_is_read_by_ranges_and_has_overviews(authorised: str, place: tuple[str, str]) -> None:
+    address = f"{authorised}?format=cog"
+    with rasterio.open(f"/vsicurl/{address}") as dataset:
+        assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert dataset.overviews(1) == [2]
+        coarse = dataset.read(1, out_shape=(350, 300))
+    assert abs(np.nanmean(coarse) - np.mean(terrain().points[terrain().mask])) < 0.5
+    with httpx.Client(trust_env=False, timeout=60, headers={"authorization": f"Bearer {place[1]}"}) as http:
+        head = http.head(address)
+        assert (head.status_code, head.content, head.headers["accept-ranges"]) == (200, b"", "bytes")
+        assert head.headers["content-type"] == "image/tiff; application=geotiff; profile=cloud-optimized"
+        assert '.cog.tif"' in head.headers["content-disposition"]
+        part = http.get(address, headers={"range": "bytes=0-15"})
+        assert (part.status_code, part.content[:4]) == (206, b"II*\0")
+        assert part.headers["content-range"] == f"bytes 0-15/{head.headers['content-length']}"
+        same = http.get(address.replace("cog", "cog.tif"), headers={"if-none-match": head.headers["etag"]})
+        assert same.status_code == 304
+
+
+def test_a_coarser_level_covers_the_same_ground(authorised: str) -> None:
+    finest = int(authorised.rsplit("/", 1)[1])
+    bounds = []
+    for level in (finest, finest - 2):
+        with rasterio.open(f"/vsicurl/{authorised.rsplit('/', 1)[0]}/{level}?format=tif") as dataset:
+            bounds.append(np.array(dataset.bounds))
+            step = dataset.res[0]
+    # Its cells are larger, and stand around the same outer nodes.
+    np.testing.assert_allclose(bounds[1], bounds[0], atol=step)
+
+
+def test_without_a_token_gdal_is_refused(place: tuple[str, str]) -> None:
+    with pytest.raises(rasterio.errors.RasterioIOError):
+        read(f"{place[0]}?format=tif&without=token")
+
+
+def test_the_lines_of_the_page(place: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(blocks) == 2
+    assert ADDRESS in blocks[0]
+    address, token = place
+    names: dict[str, Any] = {"token": token}
+    with rasterio.Env(GDAL_HTTP_HEADERS=f"Authorization: Bearer {token}"):
+        exec(textwrap.dedent(blocks[0]).replace(ADDRESS, f"{address}?format=cog"), names)
+    assert names["heights"].shape == names["coarse"].shape == (256, 256)
+    assert "EPSG:32611" in capsys.readouterr().out
+    exec(blocks[1], names)
+    assert names["heights"].shape == (700, 600)
+
+
+def test_the_formats_of_the_page_are_written() -> None:
+    named = re.findall(r"^\| `(\w+)` ", PAGE, re.MULTILINE)
+    assert named
+    for name in named:
+        assert ls.formats.written(name).write is not None
