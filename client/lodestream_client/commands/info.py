@@ -169,9 +169,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _states(
-    kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None
-) -> Any:
+def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None) -> Any:
     """A table of levels or layers; `exact` are the bytes of all, which end with every value."""
     from rich import box
     from rich.table import Table

@@ -91,10 +91,8 @@ def _structured(pv: Any, surface: Surface, number: int) -> Any:
         grid.point_data[name] = np.ascontiguousarray(values.reshape(rows * columns, *values.shape[2:]))
     if own.hidden_points.any():
         grid.point_data[_GHOSTS] = own.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
-    hidden = own.hidden_points
-    cells = own.hidden_cells | hidden[:-1, :-1] | hidden[:-1, 1:] | hidden[1:, :-1] | hidden[1:, 1:]
-    if cells.any():
-        grid.cell_data[_GHOSTS] = cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
+    if own.hidden_cells.any():
+        grid.cell_data[_GHOSTS] = own.hidden_cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
     data = grid.point_data
     for name, width, role in ((NORMAL, 3, "active_normals_name"), (TEXTURE, 2, "active_texture_coordinates_name")):
         if name in own.attributes and own.attributes[name].shape[2:] == (width,):
