@@ -58,7 +58,7 @@ def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
 
 
 def empty(shape: tuple[int, int]) -> NDArray[np.int32]:
-    """As `allocate`, whatever it holds."""
+    """As `allocate`, shape (row, column), whatever it holds."""
     rows, columns = shape
     return np.empty((rows, columns + PADDING), np.int32)[:, :columns]
 
