@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         UnsupportedVersionError,
     )
     from .formats import read, write
+    from .planning.selection import Selection
     from .quality import Quality
     from .surface import Block, Surface
     from .target import Target, Tolerance
@@ -65,6 +66,7 @@ _HOMES = {
     "write": "formats",
     "coarsen": "transform.least_squares",
     "hierarchy": "transform.least_squares",
+    "Selection": "planning.selection",
     "Surface": "surface",
     "Target": "target",
     "Tolerance": "target",
@@ -83,6 +85,7 @@ __all__ = [
     "ProtocolError",
     "Quality",
     "RemoteError",
+    "Selection",
     "StreamError",
     "Surface",
     "SwitchedOffError",

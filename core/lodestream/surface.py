@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .joints import Joints
+
+if TYPE_CHECKING:
+    import pyvista
+    import trimesh
+    import xarray
 
 __all__ = ["DTYPES", "Block", "Closed", "Surface"]
 
@@ -238,6 +243,141 @@ class Surface:
     def dtype(self) -> np.dtype[Any]:
         """Type of the points."""
         return self.blocks[0].points.dtype
+
+    def to_xarray(self) -> xarray.Dataset | xarray.DataTree:
+        """This surface for xarray (extra ``xarray``): a Dataset, or a DataTree of ``block_0``, ... for several blocks.
+
+        Heights become a variable over y and x, with coordinates from the geotransform; it is named as the metadata's
+        ``variable``, or z. x, y, z become z over row and column with coordinates x and y. Attributes are variables.
+        Holes are NaN: integers with holes become floats, whose encoding makes them integers again in a file. CRS and
+        geotransform stand in ``spatial_ref``, as rioxarray has them. Closed axes and other metadata are kept in the
+        attribute ``lodestream``, for `from_xarray`.
+
+        Raises
+        ------
+        UnavailableError
+            If xarray is not installed.
+        FormatError
+            If integers with holes need more bits than float64 has.
+        """
+        from .interop.to_xarray import to_xarray
+
+        return to_xarray(self)
+
+    @staticmethod
+    def from_xarray(
+        data: xarray.Dataset | xarray.DataArray | xarray.DataTree,
+        *,
+        attributes: Iterable[str] | None = None,
+        closed: Closed | None = None,
+        **options: str,
+    ) -> Surface:
+        """A surface of an xarray Dataset or DataArray; of a DataTree one block for each node with variables.
+
+        Parameters
+        ----------
+        data : Dataset, DataArray or DataTree
+            What has chunks of dask is computed.
+        attributes : iterable of str, optional
+            Variables that become attributes; None: all over the same two dimensions.
+        closed : (bool, bool), optional
+            Which axes are closed; None: as `to_xarray` left it, or those whose longitudes go around the Earth.
+        **options
+            Those of reading a NetCDF, which decide alike (docs/formats.md): ``variable``, ``x``, ``y``, ``time`` and
+            ``at``.
+
+        Raises
+        ------
+        UnavailableError
+            If xarray is not installed.
+        FormatError, OptionError
+            If there is no variable over two dimensions, or several and none is chosen; the message names them.
+        """
+        from .interop.from_xarray import from_xarray
+
+        return from_xarray(data, attributes=attributes, closed=closed, **options)
+
+    def to_pyvista(self) -> pyvista.StructuredGrid | pyvista.MultiBlock:
+        """This surface for pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.
+
+        Heights stand over their coordinates. Holes are hidden points, and cells without a face or with a hole for a
+        corner are hidden cells. A closed axis repeats its first points at the end. Name, unit and CRS are field data.
+
+        Raises
+        ------
+        UnavailableError
+            If pyvista is not installed.
+        FormatError
+            If integers need more bits than float64 has.
+        """
+        from .interop.pyvista_grids import to_pyvista
+
+        return to_pyvista(self)
+
+    @staticmethod
+    def from_pyvista(data: pyvista.DataObject) -> Surface:
+        """A surface of a structured grid of pyvista, of a MultiBlock of them, or of a mesh of polygons that is a grid.
+
+        Parameters
+        ----------
+        data : StructuredGrid, RectilinearGrid, ImageData, MultiBlock or PolyData
+            A grid has one point along at least one of its three directions: a volume is not a surface. Hidden points
+            and cells are holes. A last row or column that repeats the first makes a closed axis. Of polygons see
+            `from_trimesh`. Data of cells are left out, with a `FormatWarning`.
+
+        Raises
+        ------
+        UnavailableError
+            If pyvista is not installed.
+        FormatError
+            If this is no structured surface.
+        """
+        from .interop.pyvista_grids import from_pyvista
+
+        return from_pyvista(data)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """This surface for trimesh (extra ``trimesh``): its welded mesh, quads cut into two triangles each.
+
+        Blocks are joined where they touch, closed axes by faces, holes left open. Colours, normals and places in a
+        texture go where trimesh has them, other attributes to ``vertex_attributes``, metadata to ``metadata``.
+
+        Raises
+        ------
+        UnavailableError
+            If trimesh is not installed.
+        FormatError
+            If integers need more bits than float64 has, or the surface is a curve.
+        """
+        from .interop.trimesh_meshes import to_trimesh
+
+        return to_trimesh(self)
+
+    @staticmethod
+    def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
+        """A surface of a mesh of triangles that is a structured surface, found as in an OBJ or a PLY.
+
+        Parameters
+        ----------
+        mesh : trimesh.Trimesh
+            Grids whose cells are two triangles each, in any order; open, closed, with poles or holes, one or several.
+
+        Raises
+        ------
+        UnavailableError
+            If trimesh is not installed.
+        FormatError
+            If the mesh is no structured surface; the message names the first faces that are in the way.
+        """
+        from .interop.trimesh_meshes import from_trimesh
+
+        return from_trimesh(mesh)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a small picture and sizes."""
+        from .interop.html import surface_html
+
+        return surface_html(self)
 
     def __repr__(self) -> str:
         return f"Surface({', '.join(map(repr, self.blocks))})"

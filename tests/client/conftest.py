@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from numpy.typing import NDArray
 from lodestream_client.__main__ import main
 from lodestream_client.sync import upload
 from lodestream_server import running_server
+
+ROOT = Path(__file__).parents[2]
 
 
 def make_terrain(rows: int = 97, columns: int = 70) -> NDArray[np.float32]:
@@ -83,3 +87,21 @@ def interrupts() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment in which a distribution with the entry points of pyproject.toml is installed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    folder = tmp_path_factory.mktemp("installed")
+    record = folder / "lodestream-9.9.dist-info"
+    record.mkdir()
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: lodestream\nVersion: 9.9\n")
+    lines = [
+        line
+        for group, points in project["entry-points"].items()
+        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in points.items()))
+    ]
+    (record / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    sources = [str(ROOT / part) for part in ("core", "server", "client")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sources])}

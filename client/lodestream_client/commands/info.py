@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ __all__ = ["InfoOptions", "register", "run"]
 _ERRORS = {"checked": "checked by the server", "told": "stated by the uploader, not checked"}
 
 _MOST_KINDS = 12  # sizes of blocks that are named
+_MOST_CHANNELS = 6  # of which errors are shown; --json has all
 
 
 def register(subparsers: Subparsers) -> None:
@@ -31,7 +32,8 @@ def register(subparsers: Subparsers) -> None:
         run,
         "show the size, levels, layers and errors of a container or of a surface on a server",
         "Levels: the bytes of each level with all coarser ones, and the error of the surface at that level.\n"
-        "Layers: the bytes of the stream up to the end of each layer, and the error of the surface there.",
+        "Layers: the bytes of the stream up to the end of each layer, and the error of the surface there.\n"
+        "Of a container with several coordinates or attributes, the RMS error of each by itself follows.",
     )
     parser.add_argument(
         "what",
@@ -108,7 +110,7 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     for kind in ("levels", "layers"):
         if details.get(kind):
             out.print()
-            out.print(_states(kind, details[kind], out.is_terminal))
+            out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal))
 
 
 def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -166,7 +168,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
+def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool) -> Any:
     from rich import box
     from rich.table import Table
 
@@ -174,12 +176,14 @@ def _states(kind: str, states: list[Mapping[str, Any]], fancy: bool) -> Any:
     # Of several blocks a level has no one grid.
     grids = ["grid"] if kind == "levels" and all(state.get("shape") for state in states) else []
     first = ["level", *grids] if kind == "levels" else ["layer", "level"]
-    for name in (*first, "bytes", "RMS error", "maximum"):
-        table.add_column(name, justify="right")
+    shown = list(channels[:_MOST_CHANNELS]) if any(state.get("channels") for state in states) else []
+    for name in (*first, "bytes", "RMS error", "maximum", *shown):
+        table.add_column(cell(name), justify="right")
     for number, state in enumerate(states):
         place = [_size(state["shape"])] if grids else [str(state["level"])] if kind == "layers" else []
         figures = (f"{state['bytes']:,}", _figure(state.get("rms")), _figure(state.get("max")))
-        table.add_row(*map(cell, (number, *place, *figures)))
+        own = [_figure(rms) for rms, _ in state.get("channels", [])][: len(shown)]
+        table.add_row(*map(cell, (number, *place, *figures, *own)))
     return table
 
 

@@ -124,3 +124,17 @@ class BaseStream:
         complete, level, rms, max, bytes or seconds, as the target says; stopped by this side; truncated by an error.
         """
         return self._session.ended
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: how much has come, and the last view."""
+        from lodestream.interop.html import table
+
+        planned = "" if self.planned is None else f" of {self.planned:,}"
+        rows = [
+            ("source", self.url),
+            ("received", f"{self.received:,}{planned} bytes"),
+            ("transport", f"{self.transport}, {self.connections} connections or requests"),
+            ("state", self.ended or "receiving"),
+        ]
+        layers = self.decoder.layers
+        return table("Stream", rows, None) + (layers[-1]._repr_html_() if layers else "")

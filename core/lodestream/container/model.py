@@ -191,6 +191,15 @@ class Header:
         return min(self.point_channels, 3)
 
     @cached_property
+    def channel_names(self) -> tuple[str, ...]:
+        """Name of each channel: z of heights; x, y, z; of an attribute its name, numbered where it has components."""
+        names = ["z"] if self.point_channels == 1 else list("xyz")[: self.point_channels]
+        names += [f"attribute_{number}" for number in range(self.point_channels - len(names))]
+        for kind in self.attributes:
+            names += [f"{kind.name}_{number}" for number in range(kind.components)] or [kind.name]
+        return tuple(names)
+
+    @cached_property
     def dtypes(self) -> tuple[np.dtype[Any], ...]:
         """Type of each channel."""
         kinds = [kind.dtype for kind in self.attributes for _ in range(kind.channels)]

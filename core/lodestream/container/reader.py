@@ -121,7 +121,8 @@ def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
 
     ``levels`` are the states that hold all of the levels up to one and nothing finer, ``layers`` the steps of quality
     in file order; ``bytes`` are lengths of the container's prefix (layers), of what `plan` sends (levels), and of the
-    whole file. With ``channels`` each of them has RMS and maximum of every channel too, where there are several.
+    whole file. With ``channels`` each of them has RMS and maximum of every channel too, where there are several, and
+    ``channel_names`` says which.
     """
 
     def errors(record: LayerRecord | LevelRecord) -> dict[str, Any]:
@@ -136,6 +137,7 @@ def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
         "closed": only["closed"],
         "blocks": blocks,
         "channels": header.channels,
+        **({"channel_names": list(header.channel_names)} if channels and header.channels > 1 else {}),
         "attributes": [kind.name for kind in header.attributes],
         "holes": sum(header.holes),
         "non_finite": sum(header.kept),

@@ -18,9 +18,9 @@ from ..container.slices import Slices, State
 from ..entropy.dequantize import UNANNOUNCED
 from ..errors import CorruptStreamError, TruncatedStreamError
 from ..library import why_missing
-from ..planning.selection import Selection, select
+from ..planning.selection import Selection, select, selection_of
 from ..surface import Surface
-from ..target import Region
+from ..target import Region, Target
 from .batches import Coded
 from .reconstruction import Progress, Reconstruction
 from .view import View
@@ -41,14 +41,16 @@ class Decoder:
 
     Parameters
     ----------
-    selection : Selection, optional
+    selection : Selection or Target, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
-        not known (NaN) before it is complete.
+        not known (NaN) before it is complete. Of a target its region, its attributes and its level count: where to
+        stop, and in which order slices come, is for whoever feeds them to say (`lodestream.planning.planner.plan`).
     max_vertices : int or None
         Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
         as fits this process's memory.
     level : int or None
-        The finest level that the caller will use; None: the whole surface. Only memory for this level is then counted.
+        The finest level that the caller will use; None: that of a target, else the whole surface. Only memory for this
+        level is then counted.
 
     Raises
     ------
@@ -58,8 +60,15 @@ class Decoder:
     """
 
     def __init__(
-        self, selection: Selection | None = None, *, max_vertices: int | None = None, level: int | None = None
+        self,
+        selection: Selection | Target | None = None,
+        *,
+        max_vertices: int | None = None,
+        level: int | None = None,
     ) -> None:
+        if isinstance(selection, Target):
+            level = selection.level if level is None else level
+            selection = selection_of(selection)
         self._selection = selection or Selection()
         self._finest = level
         self.capacity = Capacity(max_vertices)

@@ -149,6 +149,19 @@ class View:
         surface.joints = header.joints.at(self._nodes(shown))
         return surface
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a small picture, sizes and errors."""
+        from ..interop.html import SMALL, view_html
+
+        header, region = self._reconstruction.header, self._selection.region
+        if region is not None:
+            (top, bottom), (left, right) = region
+            return view_html(self, self.surface(), [(bottom - top, right - left)])
+        layout = header.layout
+        widest = [max(max(layout.shape(g, level)) for g in range(len(layout.grids))) for level in range(layout.levels)]
+        level = next((level for level, width in enumerate(widest) if width >= SMALL), None)
+        return view_html(self, self.surface(level), [shape for shape, _ in header.blocks])
+
     def _blocks(self, level: int) -> list[Block]:
         """All blocks at a level, or the window of the only one; of heights that came with x and y, heights alone."""
         header, region = self._reconstruction.header, self._selection.region

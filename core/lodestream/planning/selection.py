@@ -20,7 +20,15 @@ __all__ = ["SelectedSlices", "Selection", "restored", "select", "selection_of"]
 
 @dataclass(frozen=True)
 class Selection:
-    """The requested part of a surface: a window of its points (None: all) and attributes by name (None: all)."""
+    """The requested part of a surface, for `lodestream.Decoder`.
+
+    Attributes
+    ----------
+    region : ((int, int), (int, int)) or None
+        A window of the points: rows and columns, half-open, in full-resolution indices. None: all.
+    attributes : tuple of str or None
+        Names of attributes. None: all.
+    """
 
     region: Region | None = None
     attributes: tuple[str, ...] | None = None

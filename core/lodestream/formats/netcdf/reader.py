@@ -21,7 +21,7 @@ from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
 from .choice import Choice, choose, others
 
-__all__ = ["KINDS", "READ_OPTIONS", "read", "sniff"]
+__all__ = ["KINDS", "READ_OPTIONS", "read", "sniff", "surface_of"]
 
 #: What is read by other rules than a NetCDF of heights.
 KINDS = ("vmec",)
@@ -74,7 +74,7 @@ def read(source: Source) -> Surface:
         source.check_array(choice.shape, np.dtype(np.float64))
         source.check_expansion(choice.nbytes)
         left_out = others(dataset, choice)
-        surface = _surface(source, dataset, choice)
+        surface = surface_of(source, dataset, choice)
     if left_out:  # said here, for the libraries' own warnings are not shown while the file is open
         warn(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
     return surface
@@ -122,7 +122,14 @@ def _opened(source: Source) -> Iterator[Any]:
         raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None
 
 
-def _surface(source: Source, dataset: Any, choice: Choice) -> Surface:
+def surface_of(source: Source, dataset: Any, choice: Choice) -> Surface:
+    """What was chosen of an xarray Dataset, with values as they are stored.
+
+    Raises
+    ------
+    InputError
+        If the arrays are no surface.
+    """
     metadata = source.metadata("netcdf") | _tags(dataset, choice)
     mask = np.ones(choice.shape, np.bool_)
     axes: list[Coordinate | None] = []

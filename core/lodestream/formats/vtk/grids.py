@@ -32,7 +32,7 @@ from ..planes import Cut, Dims, cuts
 from ..source import Source, number
 from .ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["Reading", "check_arrays", "read_grids"]
+__all__ = ["Reading", "check_arrays", "read_grids", "without_hidden"]
 
 #: What VTK may take for a small file, beside what it takes for itself.
 _MEMORY = 128 << 20
@@ -205,7 +205,7 @@ def _block(grid: Any, cut: Cut, output: IO[bytes]) -> tuple[Block, dict[str, Any
         raise FormatError("expected a grid with points, got none")
     face: dict[str, Any] = {}
     if hidden is not None:
-        mask, face = _without_hidden(hidden, mask)
+        mask, face = without_hidden(hidden, mask)
     return Block(points, mask=mask, attributes=attributes), face
 
 
@@ -247,10 +247,22 @@ def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
     return hidden.reshape(rows, columns) if hidden.size == rows * columns and min(cut.shape) > 1 else None
 
 
-def _without_hidden(
+def without_hidden(
     hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.bool_], dict[str, Any]]:
-    """Make holes of the points all of whose cells are hidden; name the other hidden cells."""
+    """Make holes of the points all of whose cells are hidden; name the other hidden cells.
+
+    Parameters
+    ----------
+    hidden : bool array of shape (H - 1, W - 1)
+    mask : bool array of shape (H, W), or None
+        Valid points.
+
+    Returns
+    -------
+    (bool array of shape (H, W), dict)
+        The points that are valid still; what the metadata's ``faces`` say.
+    """
     around = np.pad(hidden, 1, constant_values=True)
     all_hidden = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
     valid = ~all_hidden if mask is None else mask & ~all_hidden

@@ -20,7 +20,7 @@ from ..mesh_output import exact_float, extra_channels, words_of
 from ..notes import warn
 from .ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["write"]
+__all__ = ["Grid", "grid_of", "write"]
 
 _MIN_CLOSED = 3
 _TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
@@ -31,8 +31,8 @@ _GHOSTS = "vtkGhostType"
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
-    """Arrays of shape (H, W) or (H, W, K); the cells, (H - 1, W - 1)."""
+class Grid:
+    """One block as VTK has grids: arrays of shape (H, W) or (H, W, K); the cells, (H - 1, W - 1)."""
 
     points: NDArray[Any]
     attributes: dict[str, NDArray[Any]]
@@ -47,7 +47,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     points at the end. Several blocks are stacked in one grid, with hidden cells between them, and padded to the widest
     with hidden points, since a file holds one grid; that is warned of. Name, unit and CRS are strings of field data.
     """
-    grids = [_grid(surface, number) for number in range(len(surface.blocks))]
+    grids = [grid_of(surface, number) for number in range(len(surface.blocks))]
     if len(grids) > 1:
         warn(f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them")
     _warn_of_faces(surface)
@@ -93,10 +93,16 @@ def write(surface: Surface, file: BinaryIO) -> None:
     file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-def _grid(surface: Surface, number: int) -> _Grid:
-    """One block as VTK has grids: with three coordinates, none of them NaN, and ends in place of closed axes."""
+def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
+    """One block as VTK has grids: with three coordinates, none of them NaN, and ends in place of closed axes.
+
+    Raises
+    ------
+    FormatError
+        If integers need more bits than float64 has; `kind` is for its message.
+    """
     block = surface.blocks[number]
-    axes = [exact_float(values, axis, "VTS") for values, axis in zip(_coordinates(surface, block), "xyz", strict=True)]
+    axes = [exact_float(values, axis, kind) for values, axis in zip(_coordinates(surface, block), "xyz", strict=True)]
     points = np.stack(axes, axis=-1)
     attributes = {_GHOSTS + "_" if name == _GHOSTS else name: values for name, values in block.attributes.items()}
     for channel, name in extra_channels(block).items():
@@ -110,7 +116,7 @@ def _grid(surface: Surface, number: int) -> _Grid:
     faces = surface.metadata.get("faces", {})  # one map for all blocks, or a list of one for each
     of_block = faces[number] if isinstance(faces, list) and number < len(faces) else faces
     left_out = unpack_cells(of_block.get("left_out") if isinstance(of_block, dict) else None, (rows, columns))
-    return _Grid(
+    return Grid(
         _padded(points, ends, "wrap"),
         {name: _padded(values, ends, "wrap") for name, values in attributes.items()},
         _padded(hidden, ends, "wrap"),
@@ -141,24 +147,24 @@ def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
     return x, y, points[:, :, 2] if points.shape[2] > 2 else np.zeros(block.shape, points.dtype)
 
 
-def _stacked(grids: Sequence[_Grid]) -> _Grid:
+def _stacked(grids: Sequence[Grid]) -> Grid:
     """One grid with the rows of all, the cells between two of them hidden."""
     width = max(grid.points.shape[1] for grid in grids)
-    parts: list[_Grid] = []
+    parts: list[Grid] = []
     for grid in grids:
         more = width - grid.points.shape[1]
         ends = [(0, 0), (0, more)]
         cells = np.pad(grid.hidden_cells, ((0, 1), (0, more)))
         cells[-1] = True
         parts.append(
-            _Grid(
+            Grid(
                 _padded(grid.points, ends, "edge"),
                 {name: _padded(values, ends, "edge") for name, values in grid.attributes.items()},
                 np.pad(grid.hidden_points, ends, constant_values=True),
                 cells,
             )
         )
-    return _Grid(
+    return Grid(
         np.concatenate([part.points for part in parts]),
         {name: np.concatenate([part.attributes[name] for part in parts]) for name in parts[0].attributes},
         np.concatenate([part.hidden_points for part in parts]),

@@ -1,0 +1,335 @@
+"""``xarray.open_dataset(..., engine="lode")``: containers in files, on web servers and on Lodestream servers, lazily.
+
+What is indexed is decoded as an exact window of the surface, so only the bytes that the window needs are read. Of a
+coarser level, and of several blocks, everything is decoded at the first access.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from xarray.backends import BackendArray, BackendEntrypoint
+from xarray.core import indexing
+
+from lodestream.container import read_index
+from lodestream.container.capacity import Capacity
+from lodestream.container.model import ByteRange, Header
+from lodestream.coordinates.height_fields import level_metadata
+from lodestream.decoding.decoder import Decoder, View
+from lodestream.errors import InputError, OptionError
+from lodestream.interop.dataset_layout import Grid, Part, values_of
+from lodestream.interop.to_xarray import dataset
+from lodestream.planning.planner import plan
+from lodestream.surface import Block, Surface
+from lodestream.target import Region, Target
+
+from .requests.addresses import is_surface, is_url
+from .viewer.sources import FileSource, RemoteSource, Source
+
+__all__ = ["Container", "LodeBackend"]
+
+#: Ranges nearer than this to each other are read at once.
+_GAP = 1 << 14
+
+#: Rows and columns of the chunks that dask is told of, at least.
+_CHUNK = 512
+
+#: Windows that are kept decoded: x, y and z of a window are asked for one after another.
+_WINDOWS = 4
+
+
+class LodeBackend(BackendEntrypoint):
+    """The engine ``lode`` of xarray, which finds it by its entry point."""
+
+    description = "Open containers of Lodestream (.lode): files, URLs of files, and surfaces of a server"
+    open_dataset_parameters = ("filename_or_obj", "drop_variables", "level", "block", "token", "max_vertices")
+    supports_groups = True
+
+    def open_dataset(  # type: ignore[override]  # xarray passes what else the engine takes by keyword
+        self,
+        filename_or_obj: str | os.PathLike[str],
+        *,
+        drop_variables: str | Iterable[str] | None = None,
+        level: int | None = None,
+        block: int | None = None,
+        token: str | None = None,
+        max_vertices: int | None = None,
+    ) -> xr.Dataset:
+        """Open one block of a container.
+
+        Parameters
+        ----------
+        filename_or_obj : str or path-like
+            A file, the URL of a file, or the URL of a surface of a server.
+        drop_variables : str or iterable of str, optional
+        level : int, optional
+            A coarser level; None: full resolution.
+        block : int, optional
+            Of several blocks, the one to open; `open_datatree` opens all.
+        token : str, optional
+            Token of the server.
+        max_vertices : int, optional
+            Limit on the memory of what is decoded at once, see `lodestream.Decoder`.
+
+        Raises
+        ------
+        OptionError
+            If there is no such level or block, or there are several blocks and none is chosen.
+        StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
+            If the container is damaged or too large, or cannot be had.
+        """
+        container = Container(_place(filename_or_obj), token, max_vertices)
+        blocks = len(container.header.blocks)
+        if block is None and blocks > 1:
+            raise OptionError(f"expected block= of 0 to {blocks - 1}, or xarray.open_datatree, for {blocks} blocks")
+        if block is not None and not 0 <= block < blocks:
+            raise OptionError(f"expected a block of 0 to {blocks - 1}, got {block}")
+        found = container.dataset(level, block or 0)
+        drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
+        return found.drop_vars(drop, errors="ignore")
+
+    def open_datatree(self, filename_or_obj: Any, **options: Any) -> xr.DataTree:
+        """Open all blocks of a container, as ``block_0``, ``block_1``, ...; parameters as of `open_dataset`.
+
+        Raises
+        ------
+        As `open_dataset`.
+        """
+        return xr.DataTree.from_dict(self.open_groups_as_dict(filename_or_obj, **options))
+
+    def open_groups_as_dict(self, filename_or_obj: Any, **options: Any) -> dict[str, xr.Dataset]:
+        """The Datasets of all blocks by their path; see `open_datatree`."""
+        drop = options.pop("drop_variables", None) or ()
+        level, token = options.pop("level", None), options.pop("token", None)
+        container = Container(_place(filename_or_obj), token, options.pop("max_vertices", None))
+        if options:
+            raise OptionError(f"expected level, token or max_vertices, got {next(iter(options))!r}")
+        names = [drop] if isinstance(drop, str) else list(drop)
+        count = len(container.header.blocks)
+        found = [container.dataset(level, number).drop_vars(names, errors="ignore") for number in range(count)]
+        return {f"/block_{number}": each for number, each in enumerate(found)}
+
+    def guess_can_open(self, filename_or_obj: Any) -> bool:
+        """Whether this is a name that ends in ``.lode``, or the URL of a surface."""
+        if not isinstance(filename_or_obj, str | os.PathLike):
+            return False
+        name = os.fspath(filename_or_obj)
+        if not isinstance(name, str):
+            return False
+        if is_url(name):
+            return name.partition("?")[0].endswith(".lode") or is_surface(name)
+        return name.endswith(".lode")
+
+
+def _place(name: Any) -> str:
+    if not isinstance(name, str | os.PathLike):
+        raise InputError(f"expected a file's name or a URL for engine lode, got {type(name).__name__}")
+    text = os.fspath(name)
+    return text if is_url(text) else os.path.abspath(text)
+
+
+class Container:
+    """A container whose values are decoded when they are asked for; may be pickled, and is opened again then.
+
+    Parameters
+    ----------
+    place : str
+        An absolute path or a URL.
+    token : str or None
+    max_vertices : int or None
+
+    Attributes
+    ----------
+    header : Header
+    close : callable
+        Closes the connection, if there is one; so does the end of this object.
+    """
+
+    def __init__(self, place: str, token: str | None = None, max_vertices: int | None = None) -> None:
+        self._given = place, token, max_vertices
+        self._source: Source
+        if is_url(place):
+            self._source = remote = RemoteSource(place, token)
+            self.close = weakref.finalize(self, remote.close)
+        else:
+            self._source = FileSource(Path(place))
+            self.close = weakref.finalize(self, lambda: None)
+        self._kept: list[tuple[int, bytes]] = []  # header and index, which every window needs
+        self._lock = threading.Lock()
+        self._windows: OrderedDict[Any, Surface] = OrderedDict()
+        self._levels: dict[Any, Surface] = {}
+        self._index = read_index(self._first, self._source.size, Capacity(max_vertices))
+        self.header: Header = self._index.header
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Container, self._given
+
+    def _first(self, offset: int, length: int) -> bytes:
+        data = self._read(offset, length)
+        self._kept.append((offset, data))
+        return data
+
+    def _read(self, offset: int, length: int) -> bytes:
+        for start, data in self._kept:
+            if start <= offset and offset + length <= start + len(data):
+                return data[offset - start : offset - start + length]
+        run = bytearray()
+        while len(run) < length:
+            run += self._source.read(offset + len(run), length - len(run))
+        return bytes(run)
+
+    def dataset(self, level: int | None, block: int) -> xr.Dataset:
+        """The lazy Dataset of a block, at a level or (None) at full resolution.
+
+        Raises
+        ------
+        OptionError
+            If there is no such level.
+        """
+        finest = self.header.levels
+        if level is not None and not 0 <= level <= finest:
+            raise OptionError(f"expected a level of 0 to {finest}, got {level}")
+        level = finest if level is None else level
+        grid = self._grid(level, block)
+
+        def lazily(part: Part) -> tuple[Any, dict[str, Any]]:
+            array = _Lazy(self, part, grid, level, block)
+            chunks = dict(zip(part.dims, (*self._chunks(grid), *array.shape[2:]), strict=True))
+            return indexing.LazilyIndexedArray(array), {"preferred_chunks": chunks}
+
+        found = dataset(grid, lazily)
+        found.set_close(self.close)
+        return found
+
+    def _chunks(self, grid: Grid) -> tuple[int, int]:
+        rows, columns = (
+            min(max(1 << exponent, _CHUNK), length)
+            for exponent, length in zip(self.header.chunk, grid.shape, strict=True)
+        )
+        return rows, columns
+
+    def _grid(self, level: int, block: int) -> Grid:
+        header = self.header
+        shape, closed = header.blocks[block]
+        metadata = dict(self._index.metadata_values)
+        if level < header.levels:
+            # Several blocks are decoded whole anyway; of one the header knows the shape of a level.
+            known = header.level_shape(level)
+            if known is None:
+                one = self.whole(level, ()).blocks[block]
+                return Grid.of(one, metadata)
+            if header.point_channels == 1 and header.plane is None:
+                metadata = level_metadata(metadata, shape, known, closed, header.levels - level)
+            shape = known
+        attributes = tuple((kind.name, kind.dtype, kind.components) for kind in header.attributes)
+        channels = 3 if header.plane is not None else 0 if header.flat else header.point_channels
+        return Grid(shape, closed, channels, header.dtype, attributes, header.masked, metadata)
+
+    def whole(self, level: int, attributes: tuple[str, ...]) -> Surface:
+        """The surface at a level with these attributes, decoded once."""
+        with self._lock:
+            key = level, attributes
+            if key not in self._levels:
+                target = Target(level=level, attributes=attributes)
+                self._levels[key] = self._decoded(target).surface(level)
+            return self._levels[key]
+
+    def window(self, region: Region, attributes: tuple[str, ...]) -> Block:
+        """A window of the only block at full resolution, exact, with these attributes; it has a valid point."""
+        key = region, attributes
+        with self._lock:
+            if key in self._windows:
+                self._windows.move_to_end(key)
+                return self._windows[key].blocks[0]
+        found = self._decoded(Target(region=region, attributes=attributes)).surface()
+        with self._lock:
+            self._windows[key] = found
+            while len(self._windows) > _WINDOWS:
+                self._windows.popitem(last=False)
+        return found.blocks[0]
+
+    def _decoded(self, target: Target) -> View:
+        decoder = Decoder(target, max_vertices=self._given[2])
+        chosen = plan(self._index, target)
+        places = [*chosen.before, *chosen.ranges]
+        for run in _runs(places):
+            data = self._read(run[0].offset, run[-1].end - run[0].offset)
+            for place in run:
+                start = place.offset - run[0].offset
+                decoder.feed_at(place.offset, data[start : start + place.length])
+        return decoder.view()
+
+
+def _runs(places: Sequence[ByteRange]) -> list[list[ByteRange]]:
+    """Ranges in their order, those together that are read at once."""
+    runs: list[list[ByteRange]] = []
+    for place in places:
+        if runs and 0 <= place.offset - runs[-1][-1].end <= _GAP:
+            runs[-1].append(place)
+        else:
+            runs.append([place])
+    return runs
+
+
+class _Lazy(BackendArray):
+    """One variable of a Dataset, decoded where it is indexed."""
+
+    def __init__(self, container: Container, part: Part, grid: Grid, level: int, block: int) -> None:
+        self._container, self._part, self._level, self._block = container, part, level, block
+        components = {name: count for name, _, count in grid.attributes}
+        width = components.get(part.attribute, 0) if part.attribute is not None else 0
+        self.shape = (*grid.shape, width) if width else grid.shape
+        self.dtype = part.dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._taken)
+
+    def _taken(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
+        """Values at numbers and slices along each axis."""
+        header, names = self._container.header, () if self._part.attribute is None else (self._part.attribute,)
+        if self._level < header.levels or len(header.blocks) > 1:
+            return np.array(values_of(self._container.whole(self._level, names).blocks[self._block], self._part)[key])
+        (rows, row), (columns, column) = (_span(at, n) for at, n in zip(key[:2], self.shape[:2], strict=True))
+        if rows[0] == rows[1] or columns[0] == columns[1]:
+            return np.empty((rows[1] - rows[0], columns[1] - columns[0], *self.shape[2:]), self.dtype)[
+                row, column, *key[2:]
+            ]
+        around = self._around((rows, columns))
+        values = values_of(self._container.window(around, names), self._part)
+        (top, _), (left, _) = around
+        cut = values[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]
+        return np.array(cut[row, column, *key[2:]])  # a copy, since others take theirs from the same window
+
+    def _around(self, region: Region) -> Region:
+        """A region that is a surface: it has two points or more, one of them valid, of which there is one somewhere."""
+        mask, by = self._container.header.masks[0], 0
+        while True:
+            (top, bottom), (left, right) = (
+                (max(start - by, 0), min(stop + by, length))
+                for (start, stop), length in zip(region, self.shape, strict=False)
+            )
+            enough = (bottom - top) * (right - left) > 1
+            if enough and (mask is None or mask[top:bottom, left:right].any()):
+                return (top, bottom), (left, right)
+            by = 2 * by + 1
+
+
+def _span(at: int | slice, length: int) -> tuple[tuple[int, int], int | slice]:
+    """The places from the first to the last that an index takes, and the index among these."""
+    if not isinstance(at, slice):
+        place = int(at) % length
+        return (place, place + 1), 0
+    taken = range(*at.indices(length))
+    if not taken:
+        return (0, 0), slice(None)
+    low, high = min(taken[0], taken[-1]), max(taken[0], taken[-1])
+    return (low, high + 1), slice(None, None, taken.step)

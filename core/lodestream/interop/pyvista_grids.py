@@ -1,0 +1,217 @@
+"""Surfaces as grids of pyvista, and back; `read` is what ``pyvista.read`` calls for a container."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container import read_index
+from ..container.capacity import Capacity
+from ..coordinates.seams import merge, restore
+from ..decoding.decoder import Decoder
+from ..errors import FormatError, InputError
+from ..formats.attributes import NORMAL, TEXTURE
+from ..formats.notes import keep_words, listing, warn
+from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
+from ..formats.vtk.grids import without_hidden
+from ..formats.vtk.writer import grid_of
+from ..mesh import Mesh
+from ..planning.planner import plan
+from ..surface import Block, Surface
+from ..target import Target
+from .meshes import surface_of_mesh
+from .optional import require_library
+
+if TYPE_CHECKING:
+    import pyvista
+
+__all__ = ["from_pyvista", "read", "to_pyvista"]
+
+#: How names of arrays begin that VTK makes for itself.
+_OWN = "vtk"
+_GHOSTS = "vtkGhostType"
+_WORDS = ("name", "unit", "crs")
+
+
+def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.StructuredGrid | pyvista.MultiBlock:
+    """A container file for pyvista: what ``pyvista.read("NAME.lode")`` gives.
+
+    Parameters
+    ----------
+    path : str or path-like
+    level : int, optional
+        A coarser level; only what it needs is read. None: the whole surface.
+
+    Raises
+    ------
+    OptionError
+        If there is no such level.
+    StreamError, TooLargeError
+        If the container is damaged or too large.
+    """
+    with open(path, "rb") as file:
+
+        def take(offset: int, length: int) -> bytes:
+            file.seek(offset)
+            return file.read(length)
+
+        target = Target(level=level)
+        decoder = Decoder(target)
+        index = read_index(take, os.fstat(file.fileno()).st_size, Capacity(decoder.capacity.max_vertices))
+        chosen = plan(index, target)
+        for place in (*chosen.before, *chosen.ranges, *chosen.after):
+            decoder.feed_at(place.offset, take(place.offset, place.length))
+    return to_pyvista(decoder.view().surface(level))
+
+
+def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
+    """See `lodestream.Surface.to_pyvista`."""
+    pv = require_library("pyvista", "pyvista")
+    surface = restore(surface)
+    grids: list[pyvista.StructuredGrid] = [_structured(pv, surface, n) for n in range(len(surface.blocks))]
+    if len(grids) == 1:
+        return grids[0]
+    blocks: pyvista.MultiBlock = pv.MultiBlock()
+    for number, grid in enumerate(grids):
+        blocks.append(grid, f"block_{number}")
+    return blocks
+
+
+def _structured(pv: Any, surface: Surface, number: int) -> Any:
+    own = grid_of(surface, number, "pyvista")
+    rows, columns = own.points.shape[:2]
+    grid = pv.StructuredGrid()
+    points = own.points if own.points.dtype.kind == "f" else own.points.astype(np.float64)
+    grid.points = np.ascontiguousarray(points.reshape(-1, 3))
+    grid.dimensions = columns, rows, 1
+    for name, values in own.attributes.items():
+        grid.point_data[name] = np.ascontiguousarray(values.reshape(rows * columns, *values.shape[2:]))
+    if own.hidden_points.any():
+        grid.point_data[_GHOSTS] = own.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
+    hidden = own.hidden_points
+    cells = own.hidden_cells | hidden[:-1, :-1] | hidden[:-1, 1:] | hidden[1:, :-1] | hidden[1:, 1:]
+    if cells.any():
+        grid.cell_data[_GHOSTS] = cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
+    data = grid.point_data
+    for name, width, role in ((NORMAL, 3, "active_normals_name"), (TEXTURE, 2, "active_texture_coordinates_name")):
+        if name in own.attributes and own.attributes[name].shape[2:] == (width,):
+            setattr(data, role, name)
+    for key in _WORDS:
+        if isinstance(surface.metadata.get(key), str):
+            grid.field_data[key] = [surface.metadata[key]]
+    return grid
+
+
+def from_pyvista(data: pyvista.DataObject) -> Surface:
+    """See `lodestream.Surface.from_pyvista`.
+
+    Raises
+    ------
+    InputError
+        If this is no object of pyvista.
+    FormatError
+        If it is no structured surface.
+    """
+    pv = require_library("pyvista", "pyvista")
+    if isinstance(data, pv.PolyData):
+        return _of_polygons(data)
+    if isinstance(data, pv.MultiBlock):
+        grids = [grid for grid in data.recursive_iterator() if grid is not None]
+    else:
+        grids = [data]
+    if not grids:
+        raise FormatError("expected structured grids, got a MultiBlock without any")
+    blocks: list[Block] = []
+    faces: list[dict[str, Any]] = []
+    words: dict[str, str] = {}
+    left_out: list[str] = []
+    for grid in grids:
+        if not isinstance(grid, pv.StructuredGrid | pv.RectilinearGrid | pv.ImageData):
+            if isinstance(grid, pv.DataObject):
+                raise FormatError(f"expected structured grids or a mesh of polygons, got {type(grid).__name__}")
+            raise InputError(f"expected a grid of pyvista, got {type(grid).__name__}")
+        block, face = _block(grid)
+        blocks.append(block)
+        faces.append(face)
+        words |= _words(grid)
+        left_out += [name for name in grid.cell_data if not name.startswith(_OWN)]
+    if left_out:
+        warn(f"left out data that do not belong to points: {listing(dict.fromkeys(left_out))}")
+    metadata: dict[str, Any] = dict(words)
+    if any(faces):
+        metadata["faces"] = faces if len(faces) > 1 else faces[0]
+    return merge(Surface(blocks=blocks, metadata=metadata))
+
+
+def _block(grid: Any) -> tuple[Block, dict[str, Any]]:
+    """A block of a grid, and what is to be said of its faces."""
+    i, j, k = (int(length) for length in grid.dimensions)
+    if 1 not in (i, j, k):
+        raise FormatError(
+            f"expected a grid of one point along one direction, got a volume of {i} x {j} x {k}: "
+            "extract_subset gives one of its planes"
+        )
+    shape = next(pair for length, pair in ((k, (j, i)), (j, (k, i)), (i, (k, j))) if length == 1)
+    attributes = {name: _rows(values, shape) for name, values in grid.point_data.items() if _kept(name, values)}
+    names = grid.point_data
+    for known, role in ((NORMAL, names.active_normals_name), (TEXTURE, names.active_texture_coordinates_name)):
+        if role in attributes and known not in attributes:
+            attributes[known] = attributes.pop(role)
+    mask = None
+    if _GHOSTS in grid.point_data:
+        mask = _rows(grid.point_data[_GHOSTS], shape) & HIDDEN_POINT == 0
+    face: dict[str, Any] = {}
+    if _GHOSTS in grid.cell_data and min(shape) > 1:
+        hidden = np.asarray(grid.cell_data[_GHOSTS]) & HIDDEN_CELL != 0
+        hidden = hidden.reshape(shape[0] - 1, shape[1] - 1)
+        if mask is not None:  # cells of holes are hidden anyway, and say nothing of their other corners
+            hidden &= mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
+        mask, face = without_hidden(hidden, mask)
+    return Block(_rows(grid.points, shape), mask=mask, attributes=attributes), face
+
+
+def _rows(values: Any, shape: tuple[int, int]) -> NDArray[Any]:
+    array = np.array(values)
+    return array.reshape(*shape, *array.shape[1:])
+
+
+def _kept(name: str, values: Any) -> bool:
+    """Whether data of the points become an attribute: numbers, and not VTK's own."""
+    return not name.startswith(_OWN) and np.asarray(values).dtype.kind in "iuf"
+
+
+def _words(grid: Any) -> dict[str, str]:
+    """Name, unit and CRS of the field data."""
+    words: dict[str, str] = {}
+    for key in _WORDS:
+        if key in grid.field_data:
+            text = np.asarray(grid.field_data[key]).ravel()
+            if text.size == 1 and text.dtype.kind in "US":
+                if key == "name":
+                    words.setdefault(key, str(text[0]))
+                keep_words(words, key, str(text[0]))
+    return words
+
+
+def _of_polygons(data: Any) -> Surface:
+    """A surface of faces of three or four corners."""
+    if not data.GetPolys().GetNumberOfCells():
+        raise FormatError(f"expected faces that join points to a grid, got {data.n_points:,} points and no face")
+    pv, polygons = require_library("pyvista", "pyvista"), data.GetPolys()
+    offsets = np.asarray(pv.convert_array(polygons.GetOffsetsArray()))
+    counts = np.diff(offsets)
+    if not np.isin(counts, (3, 4)).all():
+        wrong = int(np.argmax(~np.isin(counts, (3, 4))))
+        raise FormatError(f"expected faces of 3 or 4 corners, got {counts[wrong]} in face {wrong + 1}")
+    corners = np.full((len(counts), 4), -1, np.int32)
+    corners[np.arange(4) < counts[:, None]] = pv.convert_array(polygons.GetConnectivityArray())
+    attributes = {name: np.array(values) for name, values in data.point_data.items() if _kept(name, values)}
+    if TEXTURE not in attributes and data.active_texture_coordinates is not None:
+        attributes[TEXTURE] = np.array(data.active_texture_coordinates)
+    left_out = [name for name in data.cell_data if not name.startswith(_OWN)]
+    if left_out:
+        warn(f"left out data that do not belong to points: {listing(left_out)}")
+    return surface_of_mesh(Mesh(np.array(data.points), corners, attributes), _words(data))

@@ -1,0 +1,103 @@
+"""Surfaces as meshes of trimesh, and back where a mesh is a structured surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..coordinates.seams import restore
+from ..errors import FormatError, InputError
+from ..formats.attributes import COLOR, NORMAL, TEXTURE
+from ..formats.mesh_output import exact_float, output_of
+from ..mesh import Mesh
+from ..surface import Surface
+from .meshes import surface_of_mesh
+from .optional import require_library
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["from_trimesh", "to_trimesh"]
+
+_WORDS = ("name", "unit", "crs")
+
+
+def to_trimesh(surface: Surface) -> trimesh.Trimesh:
+    """See `lodestream.Surface.to_trimesh`.
+
+    Raises
+    ------
+    FormatError
+        If there are no faces.
+    """
+    tm = require_library("trimesh", "trimesh")
+    mesh = output_of(restore(surface))
+    if not len(mesh.quads) and not len(mesh.triangles):
+        raise FormatError("expected a surface with faces for trimesh, got a curve or points without any")
+    vertices = np.stack(
+        [exact_float(axis, name, "trimesh") for name, axis in zip("xyz", mesh.coordinates, strict=True)], axis=-1
+    ).astype(np.float64)
+    faces = np.concatenate([mesh.quads[:, [0, 1, 2]], mesh.quads[:, [0, 2, 3]], mesh.triangles])
+    attributes = dict(mesh.attributes)
+    visual = _visual(tm, attributes)
+    normals = attributes.pop(NORMAL) if _fits(attributes, NORMAL, (3,), "f") else None
+    metadata = {key: value for key, value in surface.metadata.items() if isinstance(value, str | int | float)}
+    made: trimesh.Trimesh = tm.Trimesh(
+        vertices,
+        faces,
+        vertex_normals=normals,
+        vertex_attributes=attributes,
+        visual=visual,
+        metadata=metadata,
+        process=False,  # vertices stay as they are, those with and without faces
+    )
+    return made
+
+
+def _fits(attributes: dict[str, NDArray[Any]], name: str, widths: tuple[int, ...], kinds: str) -> bool:
+    values = attributes.get(name)
+    return values is not None and values.ndim == 2 and values.shape[1] in widths and values.dtype.kind in kinds
+
+
+def _visual(tm: Any, attributes: dict[str, NDArray[Any]]) -> Any:
+    """Colours or places in a texture as trimesh has them, taken out of the attributes."""
+    if _fits(attributes, COLOR, (3, 4), "u") and attributes[COLOR].dtype == np.uint8:
+        return tm.visual.ColorVisuals(vertex_colors=attributes.pop(COLOR))
+    if _fits(attributes, TEXTURE, (2,), "f"):
+        return tm.visual.TextureVisuals(uv=attributes.pop(TEXTURE))
+    return None
+
+
+def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
+    """See `lodestream.Surface.from_trimesh`.
+
+    Raises
+    ------
+    InputError
+        If this is no mesh of trimesh.
+    FormatError
+        If it is no structured surface.
+    """
+    tm = require_library("trimesh", "trimesh")
+    if not isinstance(mesh, tm.Trimesh):
+        raise InputError(f"expected a mesh of trimesh, got {type(mesh).__name__}")
+    if not len(mesh.faces):
+        raise FormatError(f"expected faces that join points to a grid, got {len(mesh.vertices):,} points and no face")
+    corners = np.full((len(mesh.faces), 4), -1, np.int32)
+    corners[:, :3] = mesh.faces
+    count = len(mesh.vertices)
+    attributes = {
+        str(name): np.array(values)
+        for name, values in mesh.vertex_attributes.items()
+        if len(values) == count and np.asarray(values).dtype.kind in "iuf"
+    }
+    if mesh.visual.kind == "vertex":
+        attributes.setdefault(COLOR, np.array(mesh.visual.vertex_colors))
+    elif mesh.visual.kind == "texture" and getattr(mesh.visual, "uv", None) is not None:
+        attributes.setdefault(TEXTURE, np.array(mesh.visual.uv))
+    if "vertex_normals" in mesh._cache:  # those that it came with; others follow from the points
+        attributes.setdefault(NORMAL, np.array(mesh.vertex_normals))
+    words = {key: str(mesh.metadata[key]) for key in _WORDS if isinstance(mesh.metadata.get(key), str)}
+    return surface_of_mesh(Mesh(np.array(mesh.vertices), corners, attributes), words)
