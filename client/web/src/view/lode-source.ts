@@ -1,6 +1,5 @@
 /** The source of containers: a surface of a server, or a container file of any host. Everything happens in a worker. */
 
-import { RemoteError } from "../errors";
 import type { PartReader } from "../transfer/parts";
 import type { DetailWindow, MomentGrids, NodeValues, Region, Source, SourceEvents, Target } from "./source";
 import type { FromSource, Question, ToSource } from "./source-messages";
@@ -99,8 +98,8 @@ export class LodeSource implements Source {
       const own = buffer instanceof ArrayBuffer && buffer.byteLength === part.data.byteLength;
       this.post({ kind: "part", id, part }, own ? [buffer] : []);
     } catch (error) {
-      const detail = error instanceof Error ? error.message : String(error);
-      this.post({ kind: "no part", id, detail, code: error instanceof RemoteError ? error.code : "" });
+      const { message: detail = String(error), code } = (error ?? {}) as { message?: string; code?: unknown };
+      this.post({ kind: "no part", id, detail, code: typeof code === "string" ? code : "" });
     }
   }
 
