@@ -127,7 +127,7 @@ class Widget(AnyWidget):
     rms = traitlets.CFloat(None, allow_none=True).tag(sync=True)
     max_error = traitlets.CFloat(None, allow_none=True).tag(sync=True)
     region = traitlets.Any(None, allow_none=True).tag(sync=True)
-    selected = traitlets.Dict(None, allow_none=True).tag(sync=True)
+    selected = traitlets.Dict(default_value=None, allow_none=True).tag(sync=True)
 
     def __init__(
         self,
