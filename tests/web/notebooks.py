@@ -51,8 +51,12 @@ class Model {
     for (const answer of await window.toKernel(this.id, { method: "custom", content })) this.deliver(answer);
   }
   deliver({ content, buffers, state }) {
-    if (state !== undefined) for (const [name, value] of Object.entries(state)) { this.state[name] = value; this.trigger(`change:${name}`); }
-    else this.trigger("msg:custom", content, buffers.map((text) => new DataView(bytes(text).buffer)));
+    if (state !== undefined) {
+      for (const [name, value] of Object.entries(state)) {
+        this.state[name] = value;
+        this.trigger(`change:${name}`);
+      }
+    } else this.trigger("msg:custom", content, buffers.map((text) => new DataView(bytes(text).buffer)));
   }
 }
 window.show = async (id, state) => {

@@ -31,7 +31,9 @@ def notebook(browser: Browser, heard: Heard, fake_page: Kernel) -> Any:
 @pytest.fixture(scope="module")
 def hills() -> ls.Surface:
     rows, columns = np.mgrid[:300, :400]
-    heights = np.round(60 * np.sin(rows / 41) * np.cos(columns / 67) + np.random.default_rng(1).normal(size=(300, 400)), 2)
+    heights = np.round(
+        60 * np.sin(rows / 41) * np.cos(columns / 67) + np.random.default_rng(1).normal(size=(300, 400)), 2
+    )
     attributes = {"rain": np.cos(rows / 30), "wind": np.stack([np.sin(columns / 50), rows / 300], axis=2)}
     return ls.Surface(heights, attributes=attributes, metadata={"name": "hills", "unit": "m"})
 
@@ -101,7 +103,7 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
     expect(view.get_by_label("Colour map")).to_have_value("grey")
     expect(view.get_by_label("Colours begin at")).to_have_value("0.25")
     expect(view.get_by_label("Quad lines")).to_be_checked()
-    expect(view.locator("output[for=exaggeration]")).to_have_text("× 2")
+    expect(view.locator("output[for=exaggeration]")).to_have_text("\N{MULTIPLICATION SIGN} 2")
     field.select_option(label="wind[1]")
     until(notebook, lambda: (widget.field, widget.colour_map, widget.value_range) == ("wind[1]", None, None))
     view.get_by_label("Colour map").select_option("cividis")
@@ -115,7 +117,7 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
     expect(field.locator("option:checked")).to_have_text("Slope")
     expect(view.get_by_label("Colour map")).to_have_value("red-blue")
     expect(view.get_by_label("Colours end at")).to_have_value("3")
-    expect(view.locator("output[for=exaggeration]")).to_have_text("× 4")
+    expect(view.locator("output[for=exaggeration]")).to_have_text("\N{MULTIPLICATION SIGN} 4")
     assert (widget.field, widget.colour_map, widget.exaggeration) == ("slope", "red-blue", 4)
 
 
