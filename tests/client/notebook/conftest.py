@@ -38,7 +38,8 @@ class Page:
     @property
     def opening(self) -> dict[str, Any]:
         """Values of the last widget as it was made; its layout is a widget too."""
-        return [data["state"] for data, _ in self.heard if "_esm" in data.get("state", {})][-1]
+        states: list[dict[str, Any]] = [data.get("state", {}) for data, _ in self.heard]
+        return [state for state in states if "_esm" in state][-1]
 
     @property
     def custom(self) -> list[tuple[dict[str, Any], list[bytes]]]:
