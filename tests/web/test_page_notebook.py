@@ -95,7 +95,9 @@ def test_several_places_and_widgets_in_one_page(notebook: Notebook, container: b
 
 
 def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook: Notebook, container: bytes) -> None:
-    widget: Any = Widget(container, field="wind", colour_map="grey", exaggeration=2, lines=True, value_range=(0.25, 0.5))
+    widget: Any = Widget(
+        container, field="wind", colour_map="grey", exaggeration=2, lines=True, value_range=(0.25, 0.5)
+    )
     view = notebook.show(widget)
     everything(notebook, view)
     field = view.get_by_label("Coloured by", exact=True)
