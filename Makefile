@@ -77,7 +77,7 @@ bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the fir
 	@$(BIN)/python -m benchmarks.web $(ARGS)
 
 $(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES) | $(WEB_TOOLS)
-	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page -- --logLevel warn
+	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page
 	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
 
 # The compiler of the kernels, and what drives Chromium.

@@ -34,8 +34,9 @@ CHECK = """
 import numpy as np
 import lodestream as ls
 from lodestream.library import NATIVE, why_missing
-from lodestream.page import assets
+from lodestream.page import assets, widget_modules
 assert "index.html" in assets(), "the page of the browser is not there"
+assert widget_modules() is not None, "the modules of widgets are not there"
 assert why_missing() is None, why_missing()
 points = np.sqrt(np.arange(12.0)).reshape(3, 4)
 assert np.array_equal(ls.decode(ls.encode(points)).points, points)

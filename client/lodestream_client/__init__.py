@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from .aio import list_surfaces as list
     from .errors import SilenceError, UnreachableError
+    from .notebook.widget import Widget
     from .requests.api import Description, Identity
 
 _HOMES = {
@@ -32,6 +33,7 @@ _HOMES = {
     "SilenceError": ("errors", "SilenceError"),
     "Stream": ("aio", "Stream"),
     "UnreachableError": ("errors", "UnreachableError"),
+    "Widget": ("notebook.widget", "Widget"),
     "connect": ("aio", "connect"),
     "delete": ("aio", "delete"),
     "describe": ("aio", "describe"),
@@ -50,6 +52,7 @@ __all__ = [
     "SilenceError",
     "Stream",
     "UnreachableError",
+    "Widget",
     "connect",
     "delete",
     "describe",

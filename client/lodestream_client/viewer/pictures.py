@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from lodestream.planning.planner import plan
 from lodestream.target import Target
 
 from ..terminal.output import human_size, replacing
-from .sources import Source
+from .sources import Source, read_fully
 
 if TYPE_CHECKING:
     from lodestream.decoding.view import View
@@ -48,13 +49,7 @@ def view_after(source: Source, most: int | None, max_vertices: int | None = None
     StreamError, TooLargeError
         If the container is damaged or too large.
     """
-
-    def read(offset: int, length: int) -> bytes:
-        run = bytearray()
-        while len(run) < length:
-            run += source.read(offset + len(run), length - len(run))
-        return bytes(run)
-
+    read = functools.partial(read_fully, source)
     decoder = Decoder(max_vertices=max_vertices)
     index = read_index(read, source.size, Capacity(decoder.capacity.max_vertices))
     chosen = plan(index, Target(max_bytes=most))

@@ -1,4 +1,4 @@
-"""Where the bytes of a container come from that is shown: a file, or a server."""
+"""Where the bytes of a container come from that is shown: a file, memory, or a server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lodestream.errors import LodestreamError, RemoteProtocolError
 from .. import sync
 from ..requests import api, calls
 
-__all__ = ["FileSource", "RemoteSource", "Source"]
+__all__ = ["FileSource", "MemorySource", "RemoteSource", "Source", "read_fully"]
 
 # Bytes of one request to a server, so that a browser that goes away costs no more than these.
 _AT_ONCE = 1 << 20
@@ -44,6 +44,40 @@ class Source(Protocol):
         LodestreamError, OSError
             If they cannot be had.
         """
+
+
+def read_fully(source: Source, offset: int, length: int) -> bytes:
+    """All bytes of a part, fewer only where the container ends.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        If they cannot be had.
+    """
+    run = bytearray()
+    while len(run) < min(length, source.size - offset):
+        run += source.read(offset + len(run), length - len(run))
+    return bytes(run)
+
+
+class MemorySource:
+    """A container in memory.
+
+    Parameters
+    ----------
+    data : bytes
+    name : str
+    """
+
+    def __init__(self, data: bytes, name: str) -> None:
+        self.name = name
+        self.size = len(data)
+        self.tag = "memory"
+        self._data = memoryview(data)
+
+    def read(self, offset: int, length: int) -> bytes:
+        """At most ``length`` bytes from ``offset`` on."""
+        return bytes(self._data[offset : offset + min(length, _AT_ONCE)])
 
 
 class FileSource:

@@ -1,7 +1,8 @@
 """The page that shows surfaces in a browser: static files that `client/web` builds into the folder ``static``.
 
 Server and client both serve them, and neither needs Node for it: a wheel and a source distribution hold the built
-files. In a working tree they are there after ``make page``.
+files. In a working tree they are there after ``make page``. Widgets in notebooks show the same element, from the same
+file.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["FOLDER", "HEADERS", "HOW_TO_BUILD", "INDEX", "Asset", "assets"]
+__all__ = ["FOLDER", "HEADERS", "HOW_TO_BUILD", "INDEX", "Asset", "assets", "widget_modules"]
 
 FOLDER = Path(__file__).with_name("static")
 INDEX = "index.html"
+_WIDGET = "notebook.js"
+_ELEMENT = "assets/view-*.js"
 
 HOW_TO_BUILD = "The page is not built. In a working tree, make page builds it; that needs Node 20 or newer."
 
@@ -82,8 +85,20 @@ def assets(folder: Path = FOLDER) -> dict[str, Asset]:
         return {}
     found = {}
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.suffix in _TYPES:
-            name = path.relative_to(folder).as_posix()
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and path.suffix in _TYPES and name != _WIDGET:
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             found[name] = Asset(name, path, _TYPES[path.suffix], f'"{digest[:32]}"', name.startswith("assets/"))
     return found
+
+
+def widget_modules(folder: Path = FOLDER) -> tuple[Path, Path] | None:
+    """The module of a widget in notebooks, and that of the viewer's element, which it loads; None: not built.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they are.
+    """
+    widget, elements = folder / _WIDGET, sorted(folder.glob(_ELEMENT))
+    return (widget, elements[0]) if widget.is_file() and len(elements) == 1 else None

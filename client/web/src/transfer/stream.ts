@@ -16,7 +16,7 @@ import type { Journey } from "./journey";
 import type { Progress, StreamOptions, StreamState } from "./options";
 import { Link, windowFor } from "./pacing";
 import { fromCode } from "./problems";
-import { BlobRanges, HttpRanges } from "./range-sources";
+import { BlobRanges, HttpRanges, type RangeSource } from "./range-sources";
 import { ReceiverState } from "./receiver-state";
 import { platformSocket } from "./socket";
 import { Transports, type UsedTransport } from "./transports";
@@ -51,12 +51,12 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   private began: number | undefined;
 
   /**
-   * @param source URL of a surface on a server or of a container file, or a file.
+   * @param source URL of a surface on a server or of a container file, a file, or what gives ranges of one.
    * @param decoder One that decodes what the target asks for.
    * @throws OptionError
    */
   constructor(
-    source: string | Blob,
+    source: string | Blob | RangeSource,
     target: Target,
     decoder: StreamDecoder<View>,
     private readonly options: StreamOptions = {},
@@ -76,7 +76,10 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
       this.socket = new SocketTransport(this, transports.url, { token, window }, sockets);
       this.transports = transports;
-    } else this.makeRanges = () => new RangeTransport(this, new BlobRanges(source));
+    } else {
+      const ranges = source instanceof Blob ? new BlobRanges(source) : source;
+      this.makeRanges = () => new RangeTransport(this, ranges);
+    }
     this.reception = new ReceiverState(target, decoder, {
       store: options.store,
       container: options.container,

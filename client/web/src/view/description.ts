@@ -7,6 +7,7 @@ import { INDEX_GROWTH, indexFrom, readMetadata } from "../container/reader";
 import { FOOTER_LENGTH, type Metadata, parseFooter } from "../container/sections";
 import { readWindowErrors, type WindowErrors } from "../planning/window-errors";
 import { containerUrl, isSurface } from "../transfer/addresses";
+import { PART, type PartReader } from "../transfer/parts";
 import { attributesIn } from "./grids";
 import type { Price, SurfaceInfo } from "./source";
 
@@ -38,15 +39,23 @@ const LARGEST_TAIL = 1 << 20;
  * @param header - Of the container, once it is known.
  * @throws Error if neither works; the stream may all the same.
  */
-export async function describe(url: string, token: string | null, header: Promise<Header>): Promise<Description> {
+export async function describe(
+  url: string | PartReader,
+  token: string | null,
+  header: Promise<Header>,
+): Promise<Description> {
+  if (typeof url !== "string") return fromEnd(await openEnd(readingParts(url), await header));
   const headers: Record<string, string> = token === null ? {} : { authorization: `Bearer ${token}` };
   if (isSurface(url)) {
     const answer = await fetch(url, { headers });
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
     const described = fromServer((await answer.json()) as Record<string, unknown>);
-    return { ...described, windows: async () => windowsOf(await openEnd(containerUrl(url), headers, await header)) };
+    return {
+      ...described,
+      windows: async () => windowsOf(await openEnd(fetching(containerUrl(url), headers), await header)),
+    };
   }
-  return fromEnd(await openEnd(containerUrl(url), headers, await header));
+  return fromEnd(await openEnd(fetching(containerUrl(url), headers), await header));
 }
 
 function fromServer({ metadata, layers, bytes }: Record<string, unknown>): Omit<Description, "windows"> {
@@ -68,8 +77,11 @@ interface Opened {
   read(offset: number, length: number): Promise<Uint8Array>;
 }
 
-async function openEnd(url: string, headers: Record<string, string>, header: Header): Promise<Opened> {
-  const part = async (first: number, past: number): Promise<{ data: Uint8Array; size: number }> => {
+/** Bytes `first` to `past` of a container, and how many it has. @throws Error if they cannot be had. */
+type Reading = (first: number, past: number) => Promise<{ readonly data: Uint8Array; readonly size: number }>;
+
+function fetching(url: string, headers: Record<string, string>): Reading {
+  return async (first, past) => {
     const range = { range: `bytes=${first}-${past - 1}` };
     const answer = await fetch(url, { headers: { ...headers, ...range }, cache: "no-store" });
     const size = Number(/\/(\d{1,15})$/.exec(answer.headers.get("content-range") ?? "")?.[1] ?? Number.NaN);
@@ -79,6 +91,22 @@ async function openEnd(url: string, headers: Record<string, string>, header: Hea
     }
     return { data: await bytesOf(answer, past - first), size };
   };
+}
+
+function readingParts(read: PartReader): Reading {
+  return async (first, past) => {
+    const all = new Uint8Array(past - first);
+    for (let at = 0; ; ) {
+      const { data, size } = await read(first + at, Math.min(PART, all.length - at));
+      if (data.length === 0) throw new Error(`expected ${all.length} bytes of the container, got ${at}`);
+      all.set(data, at);
+      at += data.length;
+      if (at === all.length) return { data: all, size };
+    }
+  };
+}
+
+async function openEnd(part: Reading, header: Header): Promise<Opened> {
   const { size } = await part(0, 1);
   let first = Math.max(0, size - Math.min(TAIL + Math.ceil(size / 512), LARGEST_TAIL));
   let { data } = await part(first, size);

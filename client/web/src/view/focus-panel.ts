@@ -114,6 +114,23 @@ export class FocusPanel {
     if (Number(this.rate.value) > 0) this.actions.throttle(Number(this.rate.value));
   }
 
+  /** Chooses a target, as the user would. */
+  choose({ rms, max, bytes, level }: Target): void {
+    const [kind, amount] =
+      (
+        [
+          ["rms", rms],
+          ["max", max],
+          ["bytes", bytes === undefined ? undefined : bytes / 1000],
+          ["level", level],
+        ] as const
+      ).find(([, value]) => value !== undefined) ?? (["all", undefined] as const);
+    this.target.value = kind;
+    this.amount.value = amount === undefined ? "" : String(amount);
+    this.amount.hidden = kind === "all";
+    this.sendTarget();
+  }
+
   /** Says whether it stops below a pixel. */
   setBelowPixel(on: boolean): void {
     this.below.checked = on;
@@ -177,7 +194,9 @@ export class FocusPanel {
     if (kind === "all") this.actions.setTarget({});
     else if (!Number.isFinite(amount) || amount < 0 || this.amount.value === "") return;
     else if (kind === "level")
-      this.actions.setTarget({ level: Math.min(Math.round(amount), this.last?.info?.levels ?? 0) });
+      this.actions.setTarget({
+        level: Math.min(Math.round(amount), this.last?.info?.levels ?? Number.POSITIVE_INFINITY),
+      });
     else if (kind === "bytes") this.actions.setTarget({ bytes: Math.round(amount * 1000) });
     else this.actions.setTarget(kind === "rms" ? { rms: amount } : { max: amount });
   }

@@ -9,5 +9,8 @@ LodestreamView.sources.push((src, { token }) => {
 });
 if (customElements.get("lodestream-view") === undefined) customElements.define("lodestream-view", LodestreamView);
 
-export type { Moment, Progress, Source, SourceEvents, SurfaceInfo, Target } from "./source";
-export { LodestreamView };
+export type { Part, PartReader } from "../transfer/parts";
+export type { Appearance } from "./appearance";
+export { fieldName, fieldsOf } from "./look";
+export type { Moment, NodeValues, Progress, Region, Source, SourceEvents, SurfaceInfo, Target } from "./source";
+export { LodeSource, LodestreamView };

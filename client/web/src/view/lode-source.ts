@@ -1,5 +1,6 @@
 /** The source of containers: a surface of a server, or a container file of any host. Everything happens in a worker. */
 
+import type { PartReader } from "../transfer/parts";
 import type { DetailWindow, MomentGrids, NodeValues, Region, Source, SourceEvents, Target } from "./source";
 import type { FromSource, Question, ToSource } from "./source-messages";
 import SourceWorker from "./source-worker?worker&inline";
@@ -16,11 +17,11 @@ export class LodeSource implements Source {
   private asked = 0;
 
   /**
-   * @param url - Absolute address.
+   * @param place - Absolute address; or what gives the bytes, which is asked on the page's thread.
    * @param token - For a server that wants one.
    */
   constructor(
-    private readonly url: string,
+    private readonly place: string | PartReader,
     private readonly token: string | null,
   ) {}
 
@@ -30,6 +31,7 @@ export class LodeSource implements Source {
       else if (data.kind === "moment") events.moment(data.moment);
       else if (data.kind === "progress") events.progress(data.progress);
       else if (data.kind === "refined") events.refined();
+      else if (data.kind === "read") void this.give(data.id, data.offset, data.length);
       else {
         const waiting = this.waiting.get(data.id);
         this.waiting.delete(data.id);
@@ -41,7 +43,7 @@ export class LodeSource implements Source {
       const detail = event.message || "the worker that decodes could not be started";
       events.progress({ state: "failed", bytes: 0, planned: 0, rate: 0, detail });
     };
-    this.post({ kind: "open", url: this.url, token: this.token });
+    this.post({ kind: "open", url: typeof this.place === "string" ? this.place : null, token: this.token });
   }
 
   async grids(moment: number | null, level: number, window: DetailWindow | null): Promise<MomentGrids> {
@@ -82,8 +84,23 @@ export class LodeSource implements Source {
     this.waiting.clear();
   }
 
-  private post(message: ToSource): void {
-    this.worker.postMessage(message);
+  private post(message: ToSource, transfer: Transferable[] = []): void {
+    this.worker.postMessage(message, transfer);
+  }
+
+  /** Gives the worker bytes that it has asked for. */
+  private async give(id: number, offset: number, length: number): Promise<void> {
+    if (typeof this.place === "string") return;
+    try {
+      const part = await this.place(offset, length);
+      // What was made for this answer alone is handed over; a piece of something larger is copied.
+      const { buffer } = part.data;
+      const own = buffer instanceof ArrayBuffer && buffer.byteLength === part.data.byteLength;
+      this.post({ kind: "part", id, part }, own ? [buffer] : []);
+    } catch (error) {
+      const { message: detail = String(error), code } = (error ?? {}) as { message?: string; code?: unknown };
+      this.post({ kind: "no part", id, detail, code: typeof code === "string" ? code : "" });
+    }
   }
 
   private ask(question: Question): Promise<FromSource> {

@@ -1,5 +1,6 @@
 /** `<lodestream-view>`: a surface that comes into focus, with its controls. */
 
+import { type Appearance, changesOf, sharedWith, withAppearance } from "./appearance";
 import type { Orbit } from "./camera";
 import { html, isStill, setText } from "./dom";
 import { FocusPanel } from "./focus-panel";
@@ -12,7 +13,7 @@ import { LookPanel } from "./look-panel";
 import { Probe } from "./probe";
 import { Session } from "./session";
 import { Sharing } from "./sharing";
-import type { Moment, Source, SurfaceInfo } from "./source";
+import type { Moment, Source, SurfaceInfo, Target } from "./source";
 import { Stage } from "./stage";
 import { styles } from "./styles";
 import type { SharedView } from "./url-state";
@@ -31,7 +32,9 @@ export type SourceMaker = (src: string, options: { readonly token: string | null
  * in place of the surface's.
  *
  * Events: `lodestream-info`, `lodestream-moment`, `lodestream-progress`, each with what has come as `detail`, and
- * `lodestream-drawn` when a picture is drawn.
+ * `lodestream-drawn` when a picture is drawn; `lodestream-look` with what the user has changed of the `Appearance`,
+ * `lodestream-region` with the region in the view that is asked for first or null, and `lodestream-values` with the
+ * `NodeValues` under the pointer or null.
  */
 export class LodestreamView extends HTMLElement {
   static readonly observedAttributes = ["src", "max-triangles", "autostop"];
@@ -75,10 +78,14 @@ export class LodestreamView extends HTMLElement {
       stopBelowPixel: (on) => this.stopBelowPixel(on),
     });
     this.lookPanel = new LookPanel(
-      (look) => this.setLook(look),
+      (look) => this.changeLook(look),
       (which) => this.command(which),
     );
-    this.probe = new Probe(this.values, () => this.stage?.draw());
+    this.probe = new Probe(
+      this.values,
+      () => this.stage?.draw(),
+      (values) => this.tell("values", values),
+    );
     root.append(
       html(
         "div",
@@ -121,6 +128,32 @@ export class LodestreamView extends HTMLElement {
   /** All moments so far. */
   get moments(): readonly Moment[] {
     return this.session?.moments ?? [];
+  }
+
+  /** What is asked for; kept for other surfaces too. Of several limits the first that is given counts. */
+  set target(target: Target) {
+    this.focusPanel.choose(target);
+  }
+
+  /** Ends the transmission. */
+  stop(): void {
+    this.session?.stop();
+  }
+
+  /** Goes on, after the end of a target or a failure too. */
+  resume(): void {
+    this.goOn();
+  }
+
+  /** Sets some of how the surface looks; what is null follows the surface. */
+  setAppearance(by: Appearance): void {
+    const { framing } = this.viewpoint;
+    if (framing === null) this.shared = sharedWith(this.shared, by);
+    const info = this.session?.info ?? null;
+    const look = withAppearance(this.look, by, info, framing?.exaggeration ?? 1);
+    if (look.field !== this.look.field) this.setLook({ ...this.look, field: look.field });
+    this.setLook(look);
+    if (by.exaggeration === null) this.viewpoint.unchoose();
   }
 
   connectedCallback(): void {
@@ -214,6 +247,7 @@ export class LodestreamView extends HTMLElement {
         refined: () => this.session !== null && this.probe.again(this.session),
         drawn: (patches, moment) => this.drawn(patches, moment),
         failed: (detail) => setText(this.notice, detail),
+        region: (region) => this.tell("region", region),
       },
       this.mostTriangles,
     );
@@ -272,9 +306,7 @@ export class LodestreamView extends HTMLElement {
     this.refresh();
     if (!patches.fresh) return;
     this.probe.again(session);
-    this.dispatchEvent(
-      new CustomEvent("lodestream-drawn", { detail: { moment, level: patches.level, triangles: patches.triangles } }),
-    );
+    this.tell("drawn", { moment, level: patches.level, triangles: patches.triangles });
   }
 
   private get aspect(): number {
@@ -310,6 +342,10 @@ export class LodestreamView extends HTMLElement {
 
   private changed(kind: "info" | "moment" | "progress", detail: unknown): void {
     this.refresh();
+    this.tell(kind, detail);
+  }
+
+  private tell(kind: string, detail: unknown): void {
     this.dispatchEvent(new CustomEvent(`lodestream-${kind}`, { detail }));
   }
 
@@ -337,6 +373,13 @@ export class LodestreamView extends HTMLElement {
 
   private watchSilence(): void {
     if (this.session?.progress.state === "receiving" && performance.now() - this.silentSince > 2500) this.refresh();
+  }
+
+  /** Sets a look as the user wants it. */
+  private changeLook(look: Look): void {
+    const before = this.look;
+    this.setLook(look);
+    this.tell("look", changesOf(before, this.look));
   }
 
   private setLook(look: Look): void {
@@ -391,7 +434,7 @@ export class LodestreamView extends HTMLElement {
         else this.goOn();
         break;
       case "lines":
-        this.setLook({ ...this.look, lines: !this.look.lines });
+        this.changeLook({ ...this.look, lines: !this.look.lines });
         break;
       case "earlier":
         this.focusPanel.step(-1);
@@ -407,7 +450,7 @@ export class LodestreamView extends HTMLElement {
         break;
       case "exaggerate":
       case "flatten":
-        this.setLook({
+        this.changeLook({
           ...this.look,
           exaggeration: Math.min(Math.max(this.look.exaggeration * (name === "flatten" ? 0.8 : 1.25), 0.1), 100),
         });

@@ -19,14 +19,17 @@ export class Probe {
   /**
    * @param element - Where the values are shown.
    * @param changed - Called when `at` is another place.
+   * @param found - Called with the values that are shown; null: none are any more.
    */
   constructor(
     private readonly element: HTMLElement,
     private readonly changed: () => void,
+    private readonly found: (values: NodeValues | null) => void,
   ) {}
 
   /** Shows that nothing is under the pointer. */
   clear(): void {
+    if (this.at !== null) this.found(null);
     this.at = null;
     this.changed();
     this.element.replaceChildren(
@@ -40,6 +43,7 @@ export class Probe {
     this.last = ray;
     if (ray !== null && !this.busy) void this.ask(session);
     if (ray !== null) return;
+    if (this.at !== null) this.found(null);
     this.at = null;
     this.changed();
   }
@@ -69,7 +73,10 @@ export class Probe {
           .valuesAt(moment.number, hit.block, row % shape[0], column % shape[1])
           .catch(() => null);
         if (values === null) this.clear();
-        else this.show(values, info, moment);
+        else {
+          this.show(values, info, moment);
+          this.found(values);
+        }
       }
     } finally {
       this.busy = false;

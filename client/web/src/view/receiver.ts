@@ -7,6 +7,7 @@ import { CorruptStreamError, RemoteError, UnsupportedVersionError } from "../err
 import { loadKernels } from "../kernels/instance";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { WindowErrors } from "../planning/window-errors";
+import { PartRanges, type PartReader } from "../transfer/parts";
 import { CutShortError } from "../transfer/problems";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
@@ -42,8 +43,8 @@ export class Receiver {
 
   constructor(private readonly events: SourceEvents) {}
 
-  /** Begins to receive. */
-  async open(url: string, token: string | null): Promise<void> {
+  /** Begins to receive from an address, or from what gives the bytes. */
+  async open(url: string | PartReader, token: string | null): Promise<void> {
     this.began = performance.now();
     this.progress();
     const header = new Promise<Header>((resolve) => {
@@ -57,7 +58,8 @@ export class Receiver {
     void header.then(() => setTimeout(() => described(NO_DESCRIPTION), PATIENCE));
     try {
       this.decoder = new Decoder(await loadKernels());
-      this.stream = new Stream<View>(url, makeTarget(this.options()), this.decoder, {
+      const source = typeof url === "string" ? url : new PartRanges(url);
+      this.stream = new Stream<View>(source, makeTarget(this.options()), this.decoder, {
         token: token ?? undefined,
         limitRate: this.rate ?? undefined,
         latest: true,

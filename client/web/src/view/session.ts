@@ -20,6 +20,8 @@ export interface SessionEvents {
   /** Something else is drawn: a picture (`fresh`), or the same in other patches or colours. */
   drawn(patches: Patches, moment: Moment): void;
   failed(detail: string): void;
+  /** The view rests, and what is in it is asked for before the rest; null: all of it alike. */
+  region(region: Region | null): void;
 }
 
 /** How long the view rests before the source is asked for what is in it, in milliseconds. */
@@ -285,6 +287,7 @@ export class Session {
     this.focusTimer = setTimeout(() => {
       this.focused = region;
       this.source.focus(region);
+      this.events.region(region);
     }, REST);
   }
 }

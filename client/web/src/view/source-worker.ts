@@ -1,6 +1,7 @@
 /** The worker of `LodeSource`: stream, decoder and conversion to grids share one thread that is not the page's. */
 
 import { Answers } from "./answers";
+import { AskedParts } from "./asked-parts";
 import { Receiver } from "./receiver";
 import type { FromSource, ToSource } from "./source-messages";
 
@@ -15,11 +16,16 @@ const receiver = new Receiver({
   refined: () => scope.postMessage({ kind: "refined" }),
 });
 const answers = new Answers(receiver, (answer, transfer) => scope.postMessage(answer, transfer));
+const parts = new AskedParts((message) => scope.postMessage(message));
 
 scope.onmessage = ({ data }) => {
   switch (data.kind) {
     case "open":
-      void receiver.open(data.url, data.token);
+      void receiver.open(data.url ?? parts.read, data.token);
+      break;
+    case "part":
+    case "no part":
+      parts.take(data);
       break;
     case "question":
       answers.take(data.id, data.question);

@@ -1,5 +1,10 @@
 /** The element's style sheet, adopted by its shadow root: a Content-Security-Policy without inline styles allows that. */
 
+const DARK = `
+  --paper: #12181b; --sheet: #182024; --ink: #e4eaec; --soft: #9babb2; --line: #2c373c; --field: #222c31;
+  --accent: #58bcd6; --accent-ink: #06222b; --warn: #f0a860; --second: #e08ab8; --sky: linear-gradient(#1b2428, #0f1416 75%);
+`;
+
 const CSS = `
 :host {
   display: block; position: relative; container-type: size; min-height: 20rem; contain: layout paint;
@@ -8,12 +13,9 @@ const CSS = `
   color: var(--ink); background: var(--paper); font: 13px/1.45 system-ui, "Segoe UI", "DejaVu Sans", sans-serif;
   font-variant-numeric: tabular-nums;
 }
-@media (prefers-color-scheme: dark) {
-  :host {
-    --paper: #12181b; --sheet: #182024; --ink: #e4eaec; --soft: #9babb2; --line: #2c373c; --field: #222c31;
-    --accent: #58bcd6; --accent-ink: #06222b; --warn: #f0a860; --second: #e08ab8; --sky: linear-gradient(#1b2428, #0f1416 75%);
-  }
-}
+@media (prefers-color-scheme: dark) { :host(:not([theme="light"])) { ${DARK} } }
+:host([theme="light"]) { color-scheme: light }
+:host([theme="dark"]) { color-scheme: dark; ${DARK} }
 :host([hidden]) { display: none }
 * { box-sizing: border-box }
 [hidden] { display: none !important }

@@ -126,6 +126,11 @@ export class Viewpoint {
     this.put({ orbit: { ...pose.orbit, target }, exaggeration });
   }
 
+  /** Lets the exaggeration follow the surface again. */
+  unchoose(): void {
+    this.chosen = null;
+  }
+
   /** Draws what has moved until now. @returns whether it goes on. */
   advance(now: number): boolean {
     const { glide, aim } = this;

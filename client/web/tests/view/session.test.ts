@@ -57,6 +57,7 @@ it("moments that come while another is drawn are left out, but for the last", as
     refined: () => {},
     drawn: (_: unknown, { number }: Moment) => drawn.push(number),
     failed: (detail: string) => expect.fail(detail),
+    region: () => {},
   };
   const session = new Session(source, stage, told, 1e6);
   const come = (): void => {

@@ -1,0 +1,165 @@
+"""What a widget is given, as the bytes of a container that are read part by part."""
+
+from __future__ import annotations
+
+import functools
+import os
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lodestream as ls
+from lodestream.container import Header, read_index
+from lodestream.container.capacity import Capacity
+from lodestream.container.sections import MAGIC
+from lodestream.errors import InputError, OptionError
+from lodestream.quality import Quality
+from lodestream.surface import Surface
+from lodestream.target import Target, Tolerance
+
+from ..requests.addresses import is_url
+from ..viewer.sources import FileSource, MemorySource, RemoteSource, Source, read_fully
+
+__all__ = ["Opened", "field_names", "limit_of", "opened"]
+
+#: What is called by one name each in the viewer, beside attributes.
+_FIELDS = ("height", "slope", "change", "none")
+
+#: Components of one attribute that the viewer offers.
+_MOST_COMPONENTS = 16
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A container that can be shown.
+
+    Attributes
+    ----------
+    source : Source
+        Its bytes.
+    header : Header
+    remote : bool
+        Whether reading waits for another machine.
+    resources : ExitStack
+        Closes what was opened for it.
+    """
+
+    source: Source
+    header: Header
+    remote: bool
+    resources: ExitStack
+
+
+def opened(source: Any, *, token: str | None = None, quality: Quality | None = None, name: str | None = None) -> Opened:
+    """Open what a widget is to show, and read its header and index.
+
+    Parameters
+    ----------
+    source : Surface, array, bytes, str or path-like
+        See `Widget`.
+    token : str or None
+        Of the server of a URL.
+    quality : Quality or None
+        How closely what is not a container yet is encoded; None: exactly.
+    name : str or None
+        In place of the source's own.
+
+    Raises
+    ------
+    InputError
+        If it is something else, an option does not go with it, or a file cannot be read.
+    OSError
+        If there is no such file.
+    StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
+        If the container is damaged or too large, or cannot be had.
+    """
+    remote = isinstance(source, str) and is_url(source)
+    if token is not None and not remote:
+        raise OptionError(f"expected a URL, to whose server the token belongs, got {_kind(source)}")
+    with ExitStack() as stack:
+        chosen = _remote(source, token, stack) if remote else _local(source, quality)
+        if quality is not None and not (isinstance(chosen, MemorySource) and not isinstance(source, bytes | bytearray)):
+            raise OptionError(
+                "expected a surface to encode with this quality, got a container, which is shown as it is"
+            )
+        if name is not None:
+            chosen.name = name
+        index = read_index(functools.partial(read_fully, chosen), chosen.size, Capacity())
+        return Opened(chosen, index.header, remote, stack.pop_all())
+
+
+def _remote(url: str, token: str | None, stack: ExitStack) -> Source:
+    source = RemoteSource(url, token)
+    stack.callback(source.close)
+    return source
+
+
+def _local(source: Any, quality: Quality | None) -> Source:
+    if isinstance(source, bytes | bytearray | memoryview):
+        return MemorySource(bytes(source), "")
+    if isinstance(source, Surface | np.ndarray):
+        return _encoded(source, quality, "")
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        with path.open("rb") as file:
+            ready = file.read(len(MAGIC)) == MAGIC
+        return FileSource(path) if ready else _encoded(ls.read(path), quality, path.stem)
+    hint = "; a view has surface()" if isinstance(source, ls.View) else ""
+    raise InputError(
+        "expected a Surface, an array of points, a container as bytes, the path of a file or a URL, "
+        f"got {_kind(source)}{hint}"
+    )
+
+
+def _encoded(surface: Surface | np.ndarray[Any, Any], quality: Quality | None, name: str) -> Source:
+    data = ls.encode(surface, quality=quality)
+    own = surface.metadata.get("name") if isinstance(surface, Surface) else None
+    return MemorySource(data, own if isinstance(own, str) and own else name)
+
+
+def _kind(source: Any) -> str:
+    return repr(source) if isinstance(source, str) else type(source).__name__
+
+
+def field_names(header: Header) -> list[str]:
+    """What a surface can be coloured by: kinds, attributes (a vector's length), and components of attributes."""
+    names = [*_FIELDS, *(f"channel {channel}" for channel in range(3, header.point_channels))]
+    for kind in header.attributes:
+        names.append(kind.name)
+        if kind.channels > 1:
+            names += [f"{kind.name}[{component}]" for component in range(min(kind.channels, _MOST_COMPONENTS))]
+    return names
+
+
+def limit_of(target: Target | None, header: Header) -> dict[str, float]:
+    """A target as the viewer has it: at most one limit, errors in the surface's unit.
+
+    Raises
+    ------
+    OptionError
+        If it has several limits, or anything else than a limit, or the surface has no such level.
+    """
+    if target is None:
+        return {}
+    if not isinstance(target, Target):
+        raise OptionError(f"expected a lodestream.Target or None, got {type(target).__name__}")
+    others = (target.seconds, target.region, target.attributes, target.first)
+    errors = {"rms": target.until_rms, "max": target.until_max}
+    limits: dict[str, float] = {
+        key: Tolerance.of(error).absolute(header.extent) for key, error in errors.items() if error is not None
+    }
+    if target.max_bytes is not None:
+        limits["bytes"] = target.max_bytes
+    if target.level is not None:
+        if target.level > header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {target.level}")
+        limits["level"] = target.level
+    if len(limits) > 1 or any(other is not None for other in others) or target.order != "quality":
+        raise OptionError(
+            "expected a target of one limit (level, until_rms, until_max or max_bytes) and nothing else, as the viewer "
+            f"has it, got {target}"
+        )
+    return limits
