@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Lock
+from threading import Condition
 from typing import Generic, TypeVar
 
 from .errors import OptionError
@@ -67,8 +67,8 @@ class _Spread(Generic[_Item, _Result]):
     """Items that several threads take one after another."""
 
     def __init__(self, work: Callable[[_Item], _Result], items: list[_Item]) -> None:
-        self._work, self._items, self._lock = work, items, Lock()
-        self._next, self._end = 0, len(items)
+        self._work, self._items, self._lock = work, items, Condition()
+        self._next, self._end, self._helping = 0, len(items), 0
         self._found: dict[int, _Result] = {}
         self._errors: dict[int, Exception] = {}
 
@@ -76,16 +76,32 @@ class _Spread(Generic[_Item, _Result]):
         """All results in order, with the help of so many other threads."""
         helping: list[Future[None]] = []
         try:
-            helping += _helpers(self._take, others)
+            helping += _helpers(self._help, others)
             self._take()
         finally:
-            self._end = 0
+            with self._lock:
+                self._end = 0
             for helper in helping:
                 if not helper.cancel():
                     helper.result()
+            with self._lock:
+                # A pool that could not start a thread has taken the work all the same: another thread may be at it.
+                self._lock.wait_for(lambda: not self._helping)
         if self._errors:
             raise self._errors[min(self._errors)]
         return [self._found[number] for number in range(len(self._items))]
+
+    def _help(self) -> None:
+        with self._lock:
+            if not self._end:
+                return
+            self._helping += 1
+        try:
+            self._take()
+        finally:
+            with self._lock:
+                self._helping -= 1
+                self._lock.notify_all()
 
     def _take(self) -> None:
         while True:

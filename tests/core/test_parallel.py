@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import NoReturn
 
 import pytest
 
+from lodestream import parallel
 from lodestream.errors import OptionError
 from lodestream.parallel import VARIABLE, spread, threads
 
@@ -92,6 +95,31 @@ def test_without_another_thread_the_caller_does_all(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_work_that_a_pool_has_taken_is_waited_for_though_it_could_start_no_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(VARIABLE, "3")
+    free, begun = threading.Event(), threading.Event()
+
+    def refuse() -> NoReturn:
+        raise RuntimeError("can't start new thread")
+
+    def work(item: int) -> int:
+        if item == 0:
+            free.set()
+            assert begun.wait(30)
+        else:
+            begun.set()
+            time.sleep(0.1)
+        return item
+
+    with ThreadPoolExecutor(2) as pool:
+        pool.submit(free.wait, 30)
+        monkeypatch.setattr(pool, "_adjust_thread_count", refuse)
+        monkeypatch.setattr(parallel, "_pools", {2: pool})
+        assert spread(work, range(2)) == [0, 1]
+
+
 def test_a_forked_process_starts_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "2")
     spread(lambda item: time.sleep(0.001), range(8))

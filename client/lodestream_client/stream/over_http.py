@@ -104,16 +104,16 @@ def _answered(session: Session, request: Get, *, beside: bool) -> Flow[Head]:
 def _body(session: Session, download: RangeDownload, turns: int, url: str) -> Flow[None]:
     """Read an answer to its end, or until the stream ends or something else comes first."""
     while True:
+        left = _tick(session, download)
+        if session.ended is not None or _elsewhere(session, download, turns):
+            return
         if session.transports.beside and (request := download.ahead()) is not None:
-            yield Ahead(_get(session, url, request, None))
+            yield Ahead(_get(session, url, request, left))
         chunk = yield from _chunk(session)
         if not chunk:
             return
         yield from session.pace(len(chunk))
         session.take(partial(download.receive, chunk))
-        _tick(session, download)
-        if session.ended is not None or _elsewhere(session, download, turns):
-            return
 
 
 def _chunk(session: Session) -> Flow[bytes]:

@@ -1,6 +1,8 @@
 import { expect, it } from "vitest";
 import { readIndex } from "../src/container";
 import { CorruptStreamError, OptionError } from "../src/errors";
+import { plan } from "../src/planning/planner";
+import { makeTarget } from "../src/planning/target";
 import { readWindowErrors } from "../src/planning/window-errors";
 import type { Region } from "../src/types";
 import { containerOf } from "./golden";
@@ -27,7 +29,14 @@ it("bounds of errors of windows are those of the Python library", { timeout: 300
       expect(maximum).toBe(bounds[1]);
     }
     expect(() => errors.bounds(cases[0]!.region, index.layers.length)).toThrow(OptionError);
-    const place = index.optional[0]!.range.offset + 20;
+    // They come behind the index, in whatever order the slices come.
+    const section = index.optional[0]!.range;
+    for (const first of [undefined, cases[1]!.region]) {
+      const target = makeTarget({ region: cases[0]!.region, first });
+      const chosen = plan(index, target, undefined, { windows: errors, bounded: true });
+      expect(chosen.before).toEqual([index.index, section]);
+    }
+    const place = section.offset + 20;
     data[place]! ^= 1;
     await expect(readWindowErrors(index, reading(data))).rejects.toBeInstanceOf(CorruptStreamError);
   }

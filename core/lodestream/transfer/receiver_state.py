@@ -181,6 +181,7 @@ class ReceiverState:
         self._wanted: RangeSet | None = None
         self._service: tuple[tuple[int, int], ...] = ()  # index, metadata, and bounds of the errors of windows
         self._windows: WindowErrors | None = None
+        self._section: tuple[int, int] | None = None  # of those bounds, where a server has told it and it is not read
         self._bounded = True  # whether the other side tells errors of a window
         self._deadline: float | None = None
         if self.target.first is not None:
@@ -226,6 +227,7 @@ class ReceiverState:
         self.planned, self._service = planned, (index, metadata)
         if windows is not None and windows[1]:
             self._service = index, metadata, windows
+            self._section = windows if self._windows is None else None
         if self._bounded != (windows is not None):
             self._bounded = windows is not None
             if self.index is not None:
@@ -245,7 +247,7 @@ class ReceiverState:
         OptionError
             If the container cannot meet the target.
         """
-        self._windows = windows
+        self._windows, self._section = windows, None
         self._plan(index)
         return self._advance()
 
@@ -253,12 +255,17 @@ class ReceiverState:
         from ..planning.planner import plan
 
         chosen = plan(index, self.target, windows=self._windows, bounded=self._bounded)
-        self.index, self._learning = index, False
-        places = index.index, index.metadata, *(place for place in chosen.before if place != index.index)
-        self._service = tuple((place.offset, place.length) for place in places)
+        # Where a server stops may stand in bounds that it sends and that were not known when the index was read.
+        self.index, self._learning = index, self._section is not None
+        surface, before, after = (
+            [(place.offset, place.length) for place in part] for part in (chosen.ranges, chosen.before, chosen.after)
+        )
+        if self._section is not None:
+            before.append(self._section)
+        own = index.index.offset, index.index.length
+        self._service = own, *after, *(place for place in before if place != own)
         self.planned, self.plan = chosen.bytes, chosen
-        parts = (chosen.ranges, chosen.before, chosen.after)
-        self._follow(*([(place.offset, place.length) for place in part] for part in parts))
+        self._follow(surface, before, after)
 
     def focus(self, region: Region | None) -> None:
         """Change which region comes first (`Target.first`).
@@ -438,8 +445,10 @@ class ReceiverState:
         from ..planning.selection import selection_of
 
         store = self._store
-        if store is None or not self._service or not store.ranges.covers(*self._service[0]):
+        if store is None or not self._service or not all(store.ranges.covers(*place) for place in self._needed()):
             return None
+        if self.index is not None:
+            return self.follow(self.index, self._errors_of_windows(store, self.index))
         place = self._service[0]
         header = self.decoder.header
         if header is None:
@@ -451,11 +460,13 @@ class ReceiverState:
             header = scratch.header
         if header is None or (header.masked and not header.holes):
             return None  # the section of masks, without which the index cannot be counted through, is not there yet
-        if len(self._service) > 2 and not store.ranges.covers(*self._service[2]):
-            return None
         self.decoder.capacity.take(INDEX_GROWTH * place[1])
         index = index_from(store.read(*place), ByteRange(*place), header)
         return self.follow(index, self._errors_of_windows(store, index))
+
+    def _needed(self) -> tuple[tuple[int, int], ...]:
+        """What the order of slices stands in: the index, and bounds of the errors of windows where they come."""
+        return self._service[:1] + self._service[2:]
 
     def _errors_of_windows(self, store: Store, index: Index) -> WindowErrors | None:
         """The bounds that the other side has sent, if it has."""

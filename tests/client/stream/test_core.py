@@ -110,6 +110,13 @@ def test_the_next_range_is_asked_for_before_the_last_one_has_come_and_before_a_v
     assert waiting <= 1
 
 
+def test_a_request_made_ahead_takes_no_longer_than_the_target_allows() -> None:
+    world = World(url=FILE, target=ls.Target(order="level", seconds=0.5)).run()
+    asked = [effect.get for effect in world.effects if isinstance(effect, Ahead)]
+    assert asked
+    assert all(get.seconds <= 0.5 for get in asked)
+
+
 def test_a_server_that_refuses_a_second_request_is_asked_one_by_one() -> None:
     world = World(url=FILE, target=ls.Target(order="level"))
     while not isinstance(effect := next_effect(world.core), Ahead):

@@ -116,6 +116,20 @@ def test_a_section_of_another_length_or_with_a_flipped_bit_is_refused(large: byt
         parse_window_errors(memoryview(payload), 0, huge)
 
 
+def test_many_cells_of_few_bytes_are_checked_alike(large: bytes) -> None:
+    header = replace(index_of(large).header, blocks=(((9, 40), (False, False)),), layer_count=3)
+    rng = np.random.default_rng(4)
+    codes = rng.integers(0, 256, (360, 3, 2), np.uint8)
+    rows = [row.tobytes() + sections.check_of(row.tobytes()).to_bytes(2, "little") for row in codes]
+    payload = b"\0" + b"".join(rows)
+    assert np.array_equal(parse_window_errors(memoryview(payload), 0, header).codes, codes)
+    for bit in range(8, 8 * len(payload), 59):
+        damaged = bytearray(payload)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ls.CorruptStreamError, match=f"errors of cell {(bit // 8 - 1) // 8} that"):
+            parse_window_errors(memoryview(bytes(damaged)), 0, header)
+
+
 def test_bounds_that_are_too_small_are_refused_where_the_surface_is_exact(large: bytes) -> None:
     index, found = windows_of(large)
     assert inspect(io.BytesIO(large), max_vertices=1_000_000).errors_checked

@@ -124,3 +124,26 @@ def test_a_stream_goes_on_at_a_server_of_another_release() -> None:
     said, shown = talk(reception, earlier_server=True)
     assert said[0].window_errors is None
     assert shown[-1] == Ended("complete")
+
+
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize("pieces", [3, 12])
+def test_a_stream_goes_on_at_a_server_that_tells_more(stored: bool, pieces: int) -> None:
+    reception = ReceiverState(TARGET, store=MemoryStore() if stored else None)
+    talk(reception, earlier_server=True, pieces=pieces)
+    said, shown = talk(reception)
+    assert said[0].window_errors is not None
+    assert shown[-1] == Ended("rms")
+    assert reception.received == reception.planned == expected().bytes
+    assert (shown[-2].rms, shown[-2].max_error) == (expected().rms, expected().max_error)
+
+
+def test_errors_of_windows_that_are_told_and_not_there_are_not_waited_for() -> None:
+    reception = ReceiverState(ls.Target(region=REGION), store=MemoryStore())
+    reception.follow(index())
+    places = ((place.offset, place.length) for place in (index().index, index().metadata))
+    reception.expect(1, *places, windows=(10, 20), prefix=False)
+    for place in plan(index(), reception.target).slices:
+        reception.take(place.offset, read(place.offset, place.length))
+    reception.take(10, read(10, 20))
+    assert reception.decoder.complete

@@ -56,7 +56,7 @@ export function regionFirst(index: Index, chosen: Plan, region: Region): Plan {
   }
   return {
     ...chosen,
-    before: [index.index, ...chosen.before.filter((place) => place.offset !== index.index.offset)],
+    before: [index.index, ...chosen.before.filter((place) => place !== index.index)],
     ranges: [...head, ...first, ...rest],
     marks: [...reordered(steps)],
     prefix: false,

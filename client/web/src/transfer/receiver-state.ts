@@ -83,6 +83,7 @@ export class ReceiverState<View extends ViewInfo> {
   private wantedSet: RangeSet | undefined;
   private service: readonly [index: Place, metadata: Place, windows?: Place] | undefined;
   private windows: WindowErrors | null = null;
+  private section: Place | undefined; // of those bounds, where a server has told it and it is not read
   private bounded = true; // whether the other side tells errors of a window
   private deadline: number | undefined;
   private kept = 0;
@@ -125,6 +126,7 @@ export class ReceiverState<View extends ViewInfo> {
     checkMetadataLength(metadata[1], metadata[0], true);
     this.planned = planned;
     this.service = window_errors?.[1] ? [index, metadata, window_errors] : [index, metadata];
+    this.section = this.windows === null ? this.service[2] : undefined;
     if (this.bounded !== (window_errors !== undefined)) {
       this.bounded = window_errors !== undefined;
       if (this.index !== undefined) this.makePlan(this.index); // a server of another release stops elsewhere
@@ -141,6 +143,7 @@ export class ReceiverState<View extends ViewInfo> {
    */
   learn(index: Index, windows: WindowErrors | null = null): View[] {
     this.windows = windows;
+    this.section = undefined;
     this.makePlan(index);
     return this.advance();
   }
@@ -237,8 +240,8 @@ export class ReceiverState<View extends ViewInfo> {
 
   /** What the decoder has read of the index is known here too, once the bounds that come behind it are. */
   private learnFromDecoder(): void {
-    const { index } = this.decoder;
-    if (this.index !== undefined || index === null) return;
+    const index = this.index ?? this.decoder.index;
+    if (index === null || (this.index !== undefined && this.section === undefined)) return;
     const windows = this.windowsIn(this.aside, index);
     if (windows !== undefined) this.learn(index, windows);
   }
@@ -300,13 +303,17 @@ export class ReceiverState<View extends ViewInfo> {
     const { windows, bounded } = this;
     const chosen = plan(index, this.target, undefined, { windows, bounded });
     this.index = index;
-    this.learning = false;
-    const section = chosen.before.find((place) => place !== index.index);
+    // Where a server stops may stand in bounds that it sends and that were not known when the index was read.
+    this.learning = this.section !== undefined;
+    const known = chosen.before.find((place) => place !== index.index);
+    const section = known === undefined ? this.section : placeOf(known);
     const places = [placeOf(index.index), placeOf(index.metadata)] as const;
-    this.service = section === undefined ? places : [...places, placeOf(section)];
+    this.service = section === undefined ? places : [...places, section];
     this.planned = endOf(chosen).bytes;
     this.plan = chosen;
-    this.follow(chosen.ranges.map(placeOf), chosen.before.map(placeOf), chosen.after.map(placeOf));
+    const before = chosen.before.map(placeOf);
+    if (this.section !== undefined) before.push(this.section);
+    this.follow(chosen.ranges.map(placeOf), before, chosen.after.map(placeOf));
   }
 
   private follow(surface: readonly Place[], before: readonly Place[], after: readonly Place[]): void {
@@ -388,6 +395,10 @@ export class ReceiverState<View extends ViewInfo> {
 
   /** The order of slices stands in the index, which needs the header to be read; undefined: not all is there. */
   private learnFromStore(store: Store): View[] | undefined {
+    if (this.index !== undefined) {
+      const windows = this.windowsIn(store, this.index);
+      return windows === undefined ? undefined : this.learn(this.index, windows);
+    }
     if (this.service === undefined || !store.ranges.covers(...this.service[0])) return undefined;
     const [offset, length] = this.service[0];
     const own = this.decoder.header;
