@@ -50,13 +50,15 @@ class Frame:
 class FrameReader:
     """Sections in file order.
 
-    Memory grows with what has arrived, never with what a length promises. Metadata that are too long are refused as
-    soon as they say so.
+    Memory grows with what has arrived, never with what a length promises: a section that lies whole in the bytes of
+    one call is a window of these, others are put together. Metadata that are too long are refused as soon as they say
+    so.
     """
 
     def __init__(self) -> None:
-        self._data = bytearray()
-        self._offset = 0  # of _data in the container
+        self._data: bytes | bytearray = b""  # of one call; or, while a section waits for its rest, of several
+        self._place = 0  # of what was not taken yet, in bytes of one call
+        self._offset = 0  # of the same in the container
         self._started = False
         self.ended = False  # the index was read: nothing but the footer follows
 
@@ -68,7 +70,7 @@ class FrameReader:
     @property
     def pending(self) -> int:
         """Bytes that wait for the rest of their section."""
-        return len(self._data)
+        return len(self._data) - self._place
 
     def feed(self, data: bytes | memoryview) -> Iterator[Frame]:
         """Take bytes, yield the sections that are now complete.
@@ -80,7 +82,12 @@ class FrameReader:
         UnsupportedVersionError
             Where the container is of another version, or a section that must be understood is not known.
         """
-        self._data += data
+        if not self.pending:
+            self._data, self._place = bytes(data), 0
+        elif isinstance(self._data, bytes):
+            self._data, self._place = bytearray(self._data[self._place :]) + data, 0
+        else:
+            self._data += data
         while not self.ended and (frame := self._next()) is not None:
             if frame.kind in _KNOWN:
                 self.ended = frame.kind == sections.INDEX
@@ -88,32 +95,46 @@ class FrameReader:
 
     def rest(self) -> bytes:
         """Take the bytes after the index, once it was read."""
-        rest, self._data = bytes(self._data), bytearray()
+        rest, self._data, self._place = bytes(self._ahead()), b"", 0
         return rest
 
     def _next(self) -> Frame | None:
         if not self._started and not self._start():
             return None
-        if self._offset == _START and self._data and self._data[0] != sections.HEADER:
-            raise CorruptStreamError(f"expected the header section first, got kind {self._data[0]}", _START)
-        extent = section_extent(self._data, self._offset)
-        if extent is None or len(self._data) < extent[1]:
+        first = self._ahead(_LONGEST_START)
+        if self._offset == _START and first and first[0] != sections.HEADER:
+            raise CorruptStreamError(f"expected the header section first, got kind {first[0]}", _START)
+        extent = section_extent(first, self._offset)
+        if extent is None or self.pending < extent[1]:
             return None
         start, length = extent
-        kind, offset = self._data[0], self._offset
-        frame = bytes(self._data[:length])
-        del self._data[:length]  # without a copy of what is left
-        self._offset += length
-        return checked(frame, kind, offset, start)
+        offset = self._offset
+        return checked(self._take(length), first[0], offset, start)
 
     def _start(self) -> bool:
-        sections.check_signature(bytes(self._data[:_START]))
-        if len(self._data) < _START:
+        first = self._ahead(_START)
+        sections.check_signature(bytes(first))
+        if len(first) < _START:
             return False
-        del self._data[:_START]
-        self._offset = _START
+        self._take(_START)
         self._started = True
         return True
+
+    def _ahead(self, length: int | None = None) -> bytes | bytearray:
+        """So many of the bytes that wait, or all."""
+        return self._data[self._place : None if length is None else self._place + length]
+
+    def _take(self, length: int) -> bytes | memoryview:
+        """Bytes that wait, and wait no longer."""
+        taken: bytes | memoryview
+        if isinstance(self._data, bytes):
+            taken = memoryview(self._data)[self._place : self._place + length]
+            self._place += length
+        else:
+            taken = bytes(self._data[:length])
+            del self._data[:length]  # without a copy of what is left
+        self._offset += length
+        return taken
 
 
 def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
@@ -182,7 +203,7 @@ def index_sections(data: bytes, offset: int) -> tuple[Frame, Frame]:
     return whole_section(data[:end], offset, sections.PAGES), root
 
 
-def checked(frame: bytes, kind: int, offset: int, start: int) -> Frame:
+def checked(frame: bytes | memoryview, kind: int, offset: int, start: int) -> Frame:
     """A whole section, whose payload starts at ``start`` of it, after its CRC was checked."""
     payload, crc = memoryview(frame)[start:-4], int.from_bytes(frame[-4:], "little")
     if zlib.crc32(memoryview(frame)[:-4]) != crc:

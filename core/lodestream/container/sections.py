@@ -212,15 +212,15 @@ def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
     return bytes(out.data) + b"".join(chunks)
 
 
-def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[bytes, int]]]:
-    """The errors that a residual section, which stands at ``offset``, leaves; its chunks and their places."""
+def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[memoryview, int]]]:
+    """The errors that a residual section, which stands at ``offset``, leaves; its chunks, within it, and their places."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     lengths = [fields.varint(len(payload)) for _ in chunk_places(header)]
     chunks = []
     for length in lengths:
         at = fields.at
-        chunks.append((bytes(fields.take(length)), at))
+        chunks.append((fields.take(length), at))
     fields.end()
     return errors, chunks
 

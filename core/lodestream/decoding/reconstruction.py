@@ -56,7 +56,7 @@ class Reconstruction:
         self._added = self._taken = self._forgotten = 0
         self._begun: tuple[int, list[list[Reading]]] = 0, []  # the batch on its way: what it ends before, its rounds
         self._lock = Lock()
-        self._chunks: dict[int, tuple[bytes, int]] = {}
+        self._chunks: dict[int, tuple[bytes | memoryview, int]] = {}
         self._tiles: list[Tiles] = []
 
     @property
@@ -69,7 +69,7 @@ class Reconstruction:
         self._queue.update(enumerate(segments, self._added))
         self._added += len(segments)
 
-    def correct(self, number: int, data: bytes, offset: int) -> None:
+    def correct(self, number: int, data: bytes | memoryview, offset: int) -> None:
         """Take a chunk of the residual section, which stands at ``offset``."""
         if data:
             self._chunks[number] = data, offset
@@ -201,7 +201,7 @@ class Reconstruction:
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]
                 places = slice(None) if valid is None else valid
                 known = values[places]
-                values[places] = self._restored(known.ravel(), data, offset).reshape(known.shape)
+                values[places] = self._restored(known.ravel(), bytes(data), offset).reshape(known.shape)
 
     def _restored(self, known: NDArray[Any], chunk: bytes, offset: int) -> NDArray[Any]:
         """The values of a chunk of the residual section."""
