@@ -213,7 +213,7 @@ def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
 
 
 def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[memoryview, int]]]:
-    """The errors that a residual section, which stands at ``offset``, leaves; its chunks, within it, and their places."""
+    """The errors that a residual section, which stands at ``offset``, leaves; its chunks in it, and their places."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     lengths = [fields.varint(len(payload)) for _ in chunk_places(header)]
