@@ -5,6 +5,7 @@ import { boundsOf, boxOf, type FrameOptions, frameOf, gridsFit } from "./bounds"
 import { extremes, type FieldInput, fieldBefore, fieldValues, inner, NO_VALUE } from "./fields";
 import type { Box, Colouring, Eye, Field, Hit, PatchBuffers } from "./geometry-messages";
 import { type Frame, latticeBetween, latticeOf, placesOf } from "./lattice";
+import { withoutJumps } from "./maps";
 import { normalSums, packedNormals } from "./normals";
 import { isLine, linesOf, type Patch, patchesOf, patchSize, piecesOf, quadsOf } from "./patches";
 import { pick } from "./picking";
@@ -208,7 +209,8 @@ export class Geometry {
     const blended = withBefore && old !== undefined && before !== null && beforeAround !== null ? before : null;
     const valuesBefore = blended !== null && old !== undefined ? fieldBefore(this.field, old, input) : null;
     const beside = patch.beside.map((other) => (other < 0 ? 0 : this.strides[other]!)) as unknown as StridesBeside;
-    const triangles = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
+    const whole = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
+    const triangles = withoutJumps(whole, nodes.points, this.frame.scale, grid.periods);
     const { centre, half } = this.bounds[number]!;
     const line = isLine(patch);
     return {

@@ -83,7 +83,10 @@ export interface Grid {
   readonly columnsAt: Float64Array;
   /** Lengths of the axes at full resolution. */
   readonly full: readonly [number, number];
+  /** Of a map that goes round, the first line follows the last one a turn further, and the axis is not closed. */
   readonly closed: readonly [boolean, boolean];
+  /** Full turns of those coordinates that are angles, 0 for others; without it, none is. */
+  readonly periods?: readonly [number, number, number];
   /** [row, column, xyz] in the surface's unit. */
   readonly points: Float64Array;
   /** [row, column], 0 at holes; null: there are none. */
