@@ -360,7 +360,7 @@ export class LodestreamView extends HTMLElement {
     if (latest === null || range === null || stage === null) return;
     const { low, span } = latest.colouring;
     stage.setLook(look, (range[0] - low) / span, (range[1] - low) / span);
-    this.legend.draw(legendOf(look, range, session?.info ?? null));
+    this.legend.draw(legendOf(look, range, session?.info ?? null, this.viewpoint.framing?.isFitted));
   }
 
   /** Draws what lies over the picture: scale, north, and the place whose values are shown. */

@@ -56,7 +56,10 @@ export interface SurfaceInfo {
   readonly geographic: boolean;
   /** Whether sides of the blocks are joined, so that all of it has to be drawn at one level. */
   readonly joined: boolean;
+  /** Of heights, and of all coordinates where x and y are no other: see `planeUnit`. */
   readonly unit: string;
+  /** Of x and y: `°`, a length, or empty where it is not known. */
+  readonly planeUnit: string;
   /** Whether the end is exact. */
   readonly exact: boolean;
   readonly attributes: readonly AttributeInfo[];

@@ -246,6 +246,15 @@ describe("colours and values", () => {
     expect(drawn.geometry.colouring().range[0]).toBeCloseTo(45, 6);
   });
 
+  it("slope is that of the coordinates where heights are drawn at a scale of their own", () => {
+    const geometry = new Geometry();
+    const options = { joined: false, geographic: false, heights: true, diagonal: 0, relief: 0, fresh: true };
+    geometry.setPicture([plane(30, 40, (i) => 100 * i)], options);
+    expect(geometry.frame.scale[2]).not.toBeCloseTo(geometry.frame.scale[0], 3);
+    geometry.setField({ kind: "slope" });
+    expect(geometry.colouring().range[0]).toBeCloseTo((Math.atan(100) * 180) / Math.PI, 6);
+  });
+
   it("an attribute has its own range", () => {
     const drawn = new Drawn().picture([plane(3, 4, () => 0)]);
     drawn.take(drawn.geometry.setField({ kind: "attribute", name: "twice", component: 0 }).patches);
