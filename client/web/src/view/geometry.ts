@@ -41,6 +41,7 @@ export class Geometry {
   private ends: BoundaryNormals = new Map();
   private joined = false;
   private geographic = false;
+  private heights = false;
   private field: Field = { kind: "height" };
   private known: [number, number] | null = null;
   private base: { low: number; span: number } | null = null;
@@ -75,6 +76,7 @@ export class Geometry {
     this.grids = grids;
     this.joined = joined;
     this.geographic = options.geographic;
+    this.heights = options.heights;
     const fitting = frameOf(this.box, options);
     if (this.fixed === null || isOther(this.fixed, fitting)) this.fixed = fitting;
     this.ends = boundaryNormals(grids, this.fixed);
@@ -129,11 +131,13 @@ export class Geometry {
     return this.chosen?.finer ?? 0;
   }
 
-  /** Pixels of a length of 1 in the surface's unit where it is nearest. */
+  /** Pixels of an error of 1 in the surface's unit where it is nearest. */
   get pixels(): number {
     const { chosen, eye } = this;
     if (chosen === null || eye === null || !Number.isFinite(chosen.nearest)) return 0;
-    return (eye.focal / chosen.nearest) * Math.max(this.frame.scale[0], this.frame.scale[2] * eye.exaggeration);
+    const upwards = this.frame.scale[2] * eye.exaggeration;
+    // Heights err in z only, which may have a scale of its own.
+    return (eye.focal / chosen.nearest) * (this.heights ? upwards : Math.max(this.frame.scale[0], upwards));
   }
 
   /** What of the only block is in the view, at full resolution; null: more than half of it, or there are more blocks. */
