@@ -23,8 +23,9 @@ def surface(name: str) -> ls.Surface:
 
     ``terrain``: 200 x 250 heights in m, float32. ``holes``: the same without its middle. ``attribute``: with a
     temperature that is the number of the column. ``torus``: closed both ways, float32. ``wind``: with a vector of the
-    numbers of row and column. ``line``: 1 x 250 heights. ``round``: 120 x 240 heights that go once round the Earth, from
-    south to north and 0.75 E to 359.25 E, each as high as its longitude. ``halves``: 150 x 600 heights, the right half even.
+    numbers of row and column. ``line``: 1 x 250 heights. ``round``: 120 x 240 heights that go once round the Earth,
+    from south to north and 0.75 E to 359.25 E, each as high as its longitude. ``halves``: 150 x 600 heights, the
+    right half even.
     """
     heights = terrain((200, 250), 1).astype(np.float32)
     metadata = {"name": name, "unit": "m"}

@@ -61,7 +61,7 @@ def small_png(surface: Surface) -> bytes | None:
     if len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2:
         surface = Surface(blocks=[_as_map(surface)])
     blocks = [_thinned(block) for block in surface.blocks]
-    angles = {key: surface.metadata[key] for key in ("angles", "turn") if key in surface.metadata}
+    angles: dict[str, Any] = {key: surface.metadata[key] for key in ("angles", "turn") if key in surface.metadata}
     draw_surface(figure, Surface(blocks=blocks, metadata=angles), SMALL)
     file = io.BytesIO()
     figure.savefig(file, format="png")
@@ -182,9 +182,7 @@ def _wrapped(
     return points
 
 
-def _go_on(
-    points: NDArray[np.float64], first: NDArray[np.float64], around: NDArray[np.float64], axis: int
-) -> None:
+def _go_on(points: NDArray[np.float64], first: NDArray[np.float64], around: NDArray[np.float64], axis: int) -> None:
     """Add 360 to x or y of `first`, where that is how they go on along an axis; around: (row, column, xyz)."""
     steps = np.diff(points, axis=axis)
     for channel in (0, 1):

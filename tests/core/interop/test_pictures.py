@@ -37,7 +37,7 @@ def _mapped(metadata: dict[str, Any], heights: NDArray[np.float64]) -> NDArray[n
 @pytest.fixture
 def points(monkeypatch: pytest.MonkeyPatch) -> Callable[[ls.Surface], NDArray[np.float64]]:
     """Draws a surface, and gives the points that matplotlib is told, [row, column, xyz]."""
-    from mpl_toolkits.mplot3d import Axes3D
+    from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 
     told: list[NDArray[np.float64]] = []
     original = Axes3D.plot_surface
