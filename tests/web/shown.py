@@ -23,7 +23,9 @@ def surface(name: str) -> ls.Surface:
 
     ``terrain``: 200 x 250 heights in m, float32. ``holes``: the same without its middle. ``attribute``: with a
     temperature that is the number of the column. ``torus``: closed both ways, float32. ``wind``: with a vector of the
-    numbers of row and column. ``line``: 1 x 250 heights. ``halves``: 150 x 600 heights, the right half even.
+    numbers of row and column. ``line``: 1 x 250 heights. ``round``: 120 x 240 heights that go once round the Earth,
+    from south to north and 0.75 E to 359.25 E, each as high as its longitude. ``halves``: 150 x 600 heights, the
+    right half even.
     """
     heights = terrain((200, 250), 1).astype(np.float32)
     metadata = {"name": name, "unit": "m"}
@@ -41,6 +43,11 @@ def surface(name: str) -> ls.Surface:
         return ls.Surface(heights, attributes={"wind": np.ascontiguousarray(wind)}, metadata=metadata)
     if name == "line":
         return ls.Surface(heights[100:101], metadata=metadata)
+    if name == "round":
+        longitudes = np.arange(0.75, 360, 1.5, np.float32)
+        crs = 'GEOGCRS["WGS 84",ID["EPSG",4326]]'
+        placed = {"geotransform": [0.0, 1.5, 0.0, -90.0, 0.0, 1.5], "crs": crs}
+        return ls.Surface(np.tile(longitudes, (120, 1)), (False, True), metadata={**metadata, **placed})
     if name == "halves":
         rough = terrain((150, 600), 2).astype(np.float32)
         return ls.Surface(np.where(np.arange(600) < 256, rough, rough[:, 256:257]), metadata=metadata)

@@ -113,6 +113,60 @@ def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, s
         assert float(values["height"].removesuffix(" m")) == pytest.approx(float(value), rel=1e-7)
 
 
+def test_a_slow_link_can_be_seen_once_everything_has_come(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain"))
+    tab.everything("m")
+    tab.choose("Link", "56 kbit/s")
+    tab.shown("Receiving")
+    tab.until(lambda: tab.moments and not tab.moments[-1]["complete"])
+    tab.until(lambda: "b=7000" in tab.page.url)
+    again = tabs(tab.page.url)
+    again.until(lambda: again.moments and not again.moments[-1]["complete"])
+    assert again.view.get_by_label("Link", exact=True).input_value() == "7000"
+    again.choose("Link", "As it comes")
+    again.shown("Complete: exact", "Below a pixel: paused")
+    again.until(lambda: "b=" not in again.page.url)
+
+
+def test_going_back_claims_nothing_that_is_not_drawn(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain"))
+    tab.everything("m")
+    slider = tab.view.locator("#moment")
+    seen = tab.page.evaluate(
+        """() => {
+          const root = document.querySelector("lodestream-view").shadowRoot;
+          const slider = root.querySelector("#moment");
+          const seen = [];
+          const look = () => {
+            seen.push([
+              root.querySelector(".status").textContent,
+              root.querySelector(".figures dd").textContent,
+              root.querySelector("output[for=moment]").textContent,
+              slider.getAttribute("aria-valuetext"),
+            ]);
+          };
+          slider.value = "0";
+          slider.dispatchEvent(new Event("input"));
+          return new Promise((resolve) => {
+            const end = performance.now() + 3000;
+            const next = () => {
+              look();
+              if (performance.now() < end) requestAnimationFrame(next);
+              else resolve(seen);
+            };
+            requestAnimationFrame(() => requestAnimationFrame(next));
+          });
+        }"""
+    )
+    assert seen[-1][0] == "Earlier moment"
+    assert seen[-1][1] != "0 m"
+    assert slider.input_value() == "0"
+    for status, rms, label, spoken in seen:
+        assert spoken.startswith(label + " after ")
+        assert (status == "Earlier moment") == (rms != "0 m"), (status, rms)
+        assert status in ("Drawing the moment chosen", "Earlier moment")
+
+
 def test_status_and_errors_are_of_one_moment_while_detail_is_blended_in(tabs: Tabs, shelf: Shelf) -> None:
     tab = tabs(shelf.address("terrain"), reduced_motion="no-preference")
     tab.everything("m")

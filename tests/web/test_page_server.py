@@ -38,26 +38,27 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
     expect(tab.page.locator("header .facts")).to_contain_text("60 \N{MULTIPLICATION SIGN} 80 points")
 
 
-def drop(tab: Tab, name: str, data: bytes) -> None:
-    """Let go of a file above the page's place for files."""
-    tab.page.locator(".drop").wait_for()
+def drop(tab: Tab, name: str, data: bytes, place: str = ".drop") -> None:
+    """Let go of a file above the page's place for files, or another element."""
+    tab.page.locator(place).wait_for()
     tab.page.evaluate(
-        """([name, text]) => {
+        """([name, text, place]) => {
           const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
           const dataTransfer = new DataTransfer();
           dataTransfer.items.add(new File([bytes], name));
           for (const kind of ["dragenter", "dragover", "drop"])
-            document.querySelector(".drop").dispatchEvent(
+            document.querySelector(place).dispatchEvent(
               new DragEvent(kind, { dataTransfer, bubbles: true, cancelable: true }));
         }""",
-        [name, base64.b64encode(data).decode()],
+        [name, base64.b64encode(data).decode(), place],
     )
 
 
-def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Path) -> None:
+@pytest.mark.parametrize("place", [".drop", "body"])
+def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Path, place: str) -> None:
     tab = tabs(shelf.server)
     page = tab.page
-    drop(tab, file.name, file.read_bytes())
+    drop(tab, file.name, file.read_bytes(), place)
     link = page.get_by_role("link", name=file.stem, exact=True)
     link.wait_for()
     expect(page.get_by_role("list", name="Uploads").get_by_role("listitem")).to_have_count(0)
@@ -132,6 +133,29 @@ def test_a_token_that_is_not_for_this_is_told_as_such(
     dialog.get_by_label("Token").fill(token)
     dialog.get_by_label("Token").press("Enter")
     tab.page.get_by_role("link", name=file.stem, exact=True).wait_for()
+
+
+def test_what_a_token_does_not_allow_is_no_longer_offered(
+    tabs: Tabs, closed: tuple[str, str], reader: str, file: Path, heard: Heard
+) -> None:
+    heard.allow("status of 40[13]")
+    server, token = closed
+    upload(server, surface("torus"), token=token)
+    tab = tabs(server)
+    dialog = tab.page.get_by_role("dialog")
+    dialog.get_by_label("Token").fill(reader)
+    dialog.get_by_label("Token").press("Enter")
+    remove = tab.page.get_by_role("button", name="Delete torus")
+    expect(remove).to_be_visible()
+    tab.page.get_by_label("Files to upload").set_input_files(file)
+    dialog.get_by_role("button", name="Cancel").click()
+    expect(remove).to_have_count(0)
+    expect(tab.page.locator(".drop")).to_be_hidden()
+    expect(tab.page.get_by_role("link", name="torus").first).to_be_visible()
+    sent = len(heard.requests)
+    drop(tab, "other.npy", b"x" * 100, "body")
+    tab.page.wait_for_timeout(500)
+    assert len(heard.requests) == sent
 
 
 def test_without_a_token_nothing_is_shown(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:

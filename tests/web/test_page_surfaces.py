@@ -86,6 +86,24 @@ def test_a_torus_is_closed_both_ways(tabs: Tabs, shelf: Shelf) -> None:
     assert float(values["z"]) == pytest.approx(float(surface("torus").points[row, column, 2]), rel=1e-6)
 
 
+def test_a_map_that_goes_round_is_not_joined_across(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("round", VIRIDIS))
+    tab.everything("m")
+    picture = from_above(tab)
+    covered = drawn(picture)
+    assert has_no_gap(covered)
+    # Longitudes rise from left to right, and so do heights and their colours: no sheet leads back over them.
+    columns = np.flatnonzero(covered[covered.shape[0] // 2])
+    left, width = columns[0] / covered.shape[1], np.ptp(columns) / covered.shape[1]
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9):
+        values = tab.point(left + share * width, 0.5)
+        assert float(values["x"].split()[0]) == pytest.approx(360 * share, abs=8)
+        assert float(values["height"].split()[0]) == pytest.approx(360 * share, abs=8)
+    violet, yellow = (at(picture, left + share * width, 0.5) for share in (0.05, 0.9))
+    assert violet[2] > violet[1] + 20
+    assert yellow[1] > yellow[2] + 20
+
+
 @pytest.mark.parametrize("name", ["cube-sphere", "sphere-closed", "sphere-halves", "sphere-seam"])
 def test_spheres_of_any_make_have_no_cracks(tabs: Tabs, shelf: Shelf, name: str) -> None:
     tab = tabs(shelf.address(name, VIRIDIS))

@@ -211,11 +211,19 @@ def _wait() -> None:
 
 
 def _draw(options: ViewOptions, out: Path) -> None:
-    from ..viewer.pictures import draw, view_after
+    from ..viewer.pictures import draw, least_size, view_after
 
     require_folder(out)
     with _source(options) as source:
-        for label, most in options.at or (("", None),):
+        sizes = options.at or (("", None),)
+        least = least_size(source, options.max_vertices)
+        if all(most is not None and most < least for _, most in sizes):
+            words = ", ".join(label for label, _ in sizes)
+            raise OptionError(f"--at {words}: expected {least} bytes or more, which the first picture takes")
+        for label, most in sizes:
+            if most is not None and most < least:
+                note(f"--at {label}: no picture, since the first one takes {least} bytes")
+                continue
             path = out.with_name(f"{out.stem}-{label}{out.suffix}") if label else out
             view, layout = view_after(source, most, options.max_vertices)
             draw(view, layout, source.name, path)

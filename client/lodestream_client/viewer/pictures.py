@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
 
-__all__ = ["draw", "view_after"]
+__all__ = ["draw", "least_size", "view_after"]
 
 _PIXELS = 1000  # along the longer side of a height field
 
@@ -49,13 +49,20 @@ def view_after(source: Source, most: int | None, max_vertices: int | None = None
     StreamError, TooLargeError
         If the container is damaged or too large.
     """
-    read = functools.partial(read_fully, source)
+    read = partial(read_fully, source)
     decoder = Decoder(max_vertices=max_vertices)
     index = read_index(read, source.size, Capacity(decoder.capacity.max_vertices))
     chosen = plan(index, Target(max_bytes=most))
-    for place in (*chosen.before, *chosen.ranges):
+    for place in (*chosen.before, index.metadata, *chosen.ranges):
         decoder.feed_at(place.offset, read(place.offset, place.length))
     return decoder.view(), index.header.layout
+
+
+def least_size(source: Source, max_vertices: int | None = None) -> int:
+    """Bytes that the first picture of a container takes; the parameters are those of `view_after`."""
+    decoder = Decoder(max_vertices=max_vertices)
+    index = read_index(partial(read_fully, source), source.size, Capacity(decoder.capacity.max_vertices))
+    return index.layers[0].end
 
 
 def draw(view: View, layout: Layout, name: str, path: Path) -> None:

@@ -1,7 +1,7 @@
 import { afterEach, describe, expect, it, vi } from "vitest";
 import type { Header } from "../src/container/header";
 import { readIndex } from "../src/container/reader";
-import { describe as description } from "../src/view/description";
+import { describe as description, infoOf, NO_DESCRIPTION } from "../src/view/description";
 import { containerOf, NAMES } from "./golden";
 
 afterEach(() => vi.unstubAllGlobals());
@@ -28,6 +28,23 @@ describe("what is read of the end of a container", () => {
     const found = await description(URL, null, header());
     expect(found.size).toBe(data.length);
     expect(found.prices!.length).toBeGreaterThan(0);
+  });
+
+  it.each([
+    [{ crs: 'GEOGCRS["WGS 84"]' }, "°"],
+    [{ geotransform: [0, 90, 0, 0, 0, 1], unit: "METERS" }, "°"],
+    [{ geotransform: [0, 1, 0, 0, 0, 1], unit: "METERS" }, ""],
+    [{ geotransform: [0, 1, 0, 0, 0, 1], crs: 'PROJCS["x",GEOGCS["y",UNIT["degree",1]],UNIT["metre",1]]' }, "m"],
+    [{ unit: "m" }, "cells"],
+    [{ axes: 3 }, ""],
+  ])("tells the unit of x and y: %j", async (metadata, unit) => {
+    const closed = [false, true] as const;
+    const heights = { ...(await header()), pointChannels: 1, plane: null, shape: [3, 4], closed } as unknown as Header;
+    const info = infoOf({ ...heights, blocks: [{ shape: [3, 4], closed }] } as unknown as Header, {
+      ...NO_DESCRIPTION,
+      metadata,
+    });
+    expect(info.planeUnit).toBe(unit);
   });
 
   it("is no more than was asked for", async () => {

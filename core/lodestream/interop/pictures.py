@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..coordinates.height_fields import coordinates
+from ..errors import InputError
 from ..surface import Block, Surface
 
 if TYPE_CHECKING:
@@ -23,6 +25,9 @@ SMALL = 320
 
 _LIGHT = 315, 45  # azimuth and altitude in degrees: north-west, as maps have it
 _FLAT = 1e-300  # heights that differ by no more have no relief, and no factor would give them one
+_DEGREES = 360.0  # of a full turn
+_OTHER_UNIT = 10  # so many times higher than wide are surfaces whose z has another unit
+_FITTED = 0.2  # height of these, in widths of the surface
 _RELIEF = 0.15  # height of the relief for its shading, in widths of the surface
 
 
@@ -39,7 +44,7 @@ def draw_surface(figure: Figure, surface: Surface, pixels: int) -> None:
         draws each quad as a polygon.
     """
     if len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2:
-        _heights(figure, surface.blocks[0], pixels)
+        _heights(figure, _as_map(surface), pixels)
     else:
         _in_space(figure, surface, pixels)
 
@@ -53,10 +58,35 @@ def small_png(surface: Surface) -> bytes | None:
         return None
     figure = Figure(layout="constrained", dpi=DPI)
     FigureCanvasAgg(figure)
-    draw_surface(figure, Surface(blocks=[_thinned(block) for block in surface.blocks]), SMALL)
+    if len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2:
+        surface = Surface(blocks=[_as_map(surface)])
+    blocks = [_thinned(block) for block in surface.blocks]
+    angles: dict[str, Any] = {key: surface.metadata[key] for key in ("angles", "turn") if key in surface.metadata}
+    draw_surface(figure, Surface(blocks=blocks, metadata=angles), SMALL)
     file = io.BytesIO()
     figure.savefig(file, format="png")
     return file.getvalue()
+
+
+def _as_map(surface: Surface) -> Block:
+    """The heights of a surface with north at the top, where its metadata say where they lie."""
+    block = surface.blocks[0]
+    metadata = surface.metadata
+    if not any(metadata.get(key) is not None for key in ("grid", "axes", "geotransform")):
+        return block
+    try:
+        x, y = (np.asarray(values, np.float64) for values in coordinates(surface))
+    except InputError:
+        return block  # a picture does not fail for its metadata
+    points, mask = block.points, block.mask
+    if isinstance(axes := metadata.get("axes"), dict) and axes.get("rows") == "x":
+        points, x, y = points.T, x.T, y.T
+        mask = None if mask is None else mask.T
+    # Most steps count, since longitudes may begin again on the way.
+    down = slice(None, None, -1 if np.median(np.sign(np.diff(y[:, :1], axis=0))) > 0 else 1) if len(y) > 1 else ...
+    across = slice(None, None, -1 if np.median(np.sign(np.diff(x[:1], axis=1))) < 0 else 1) if x.shape[1] > 1 else ...
+    points = points[down][:, across]
+    return Block(points, mask=None if mask is None else mask[down][:, across])
 
 
 def _thinned(block: Block) -> Block:
@@ -98,9 +128,11 @@ def _in_space(figure: Figure, surface: Surface, pixels: int) -> None:
     figure.set_size_inches(0.8 * pixels / DPI, 0.8 * pixels / DPI)
     most = pixels // 4
     axes: Any = figure.add_subplot(projection="3d")
+    periods, lift = _periods(surface.metadata), _lift(surface)
     for block in surface.blocks:
         points = _placed(_valid(block.points.astype(np.float64), block.mask))
-        points = _wrapped(points, block.closed)
+        points = _without_jumps(_wrapped(points, block.closed, periods), periods)
+        points[..., 2] *= lift
         every = [max(1, -(-count // most)) for count in points.shape[:2]]
         if min(points.shape[:2]) == 1:
             axes.plot(*points.reshape(-1, 3).T, color="#3b6ea5")
@@ -130,8 +162,77 @@ def _placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points[..., :3]
 
 
-def _wrapped(points: NDArray[np.float64], closed: tuple[bool, bool]) -> NDArray[np.float64]:
+def _wrapped(
+    points: NDArray[np.float64], closed: tuple[bool, bool], periods: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    """Points (row, column, xyz) with the first ones of closed axes repeated, where angles go on by a full turn."""
     for axis in (0, 1):
-        if closed[axis]:
-            points = np.concatenate([points, np.take(points, [0], axis)], axis)
+        if not closed[axis]:
+            continue
+        length = points.shape[axis]
+        first, last = np.take(points, [0], axis), np.take(points, [length - 1], axis)
+        around = (last - first) * (length / max(length - 1, 1))
+        for channel, period in enumerate(periods):
+            if period:
+                turns = np.rint(around[..., channel] / period)
+                first[..., channel] += period * np.where(np.isfinite(turns), turns, 0)
+        if not any(periods):
+            _go_on(points, first, around, axis)
+        points = np.concatenate([points, first], axis)
     return points
+
+
+def _go_on(points: NDArray[np.float64], first: NDArray[np.float64], around: NDArray[np.float64], axis: int) -> None:
+    """Add 360 to x or y of `first`, where that is how they go on along an axis; around: (row, column, xyz)."""
+    steps = np.diff(points, axis=axis)
+    for channel in (0, 1):
+        turns = around[..., channel]
+        known = np.isfinite(turns)
+        with np.errstate(invalid="ignore"):
+            even = known & (np.abs(np.abs(turns) - _DEGREES) <= _DEGREES / points.shape[axis])
+            even &= ~(steps[..., channel] * turns <= 0).any(axis=axis, keepdims=True)
+        if 2 * even.sum() > known.sum():
+            first[..., channel] += _DEGREES * np.sign(np.median(turns[even]))
+
+
+def _periods(metadata: dict[str, Any]) -> tuple[float, float, float]:
+    """Full turns of x, y and z; 0: no angle."""
+    periods = [0.0, 0.0, 0.0]
+    angles = metadata.get("angles")
+    said = [(each.get("channel"), each.get("period")) for each in angles or () if isinstance(each, dict)]
+    turn = metadata.get("turn")
+    if isinstance(turn, (list, tuple)) and len(turn) == 3:
+        said.append((turn[0], turn[1]))
+    for channel, period in said:
+        if isinstance(period, (int, float)) and channel in (0, 1, 2):
+            periods[channel] = abs(float(period))
+    return periods[0], periods[1], periods[2]
+
+
+def _without_jumps(points: NDArray[np.float64], periods: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Points with NaN where an angle changes by more than half a turn from the row or column before."""
+    for channel, period in enumerate(periods):
+        if not period:
+            continue
+        values = points[..., channel].copy()
+        with np.errstate(invalid="ignore"):
+            points[1:][np.abs(np.diff(values, axis=0)) > period / 2] = np.nan
+            points[:, 1:][np.abs(np.diff(values, axis=1)) > period / 2] = np.nan
+    return points
+
+
+def _lift(surface: Surface) -> float:
+    """What z is multiplied by: 1, but where z has another unit than x and y, so that the relief can be seen."""
+    boxes = [_box(_placed(_valid(block.points.astype(np.float64), block.mask))) for block in surface.blocks]
+    low = np.nanmin([box[0] for box in boxes], axis=0)
+    high = np.nanmax([box[1] for box in boxes], axis=0)
+    width, height = float(max(high[:2] - low[:2])), float(high[2] - low[2])
+    return _FITTED * width / height if width > 0 and height > _OTHER_UNIT * width else 1.0
+
+
+def _box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    known = points.reshape(-1, 3)
+    known = known[np.isfinite(known).all(axis=1)]
+    if not len(known):
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return known.min(axis=0), known.max(axis=0)

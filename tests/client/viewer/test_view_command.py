@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -132,7 +133,35 @@ def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pyt
     assert sizes[0] == sizes[1]
     assert min(sizes[0]) > 200
     assert (tmp_path / "out-1kB.png").read_bytes() != (tmp_path / "out-all.png").read_bytes()
-    assert main(["view", str(container), "--png", str(tmp_path / "out.png"), "--at", "1"]) == 1
+
+
+def test_a_size_that_is_too_small_does_not_lose_the_other_pictures(
+    tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out.png"
+    assert main(["view", str(container), "--png", str(out), "--at", "3B,all"]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["out-all.png"]
+    first, _ = capsys.readouterr().err.splitlines()
+    least = int(re.fullmatch(r"lodestream: --at 3B: no picture, since the first one takes (\d+) bytes", first)[1])  # type: ignore[index]
+    assert main(["view", str(container), "--png", str(out), "--at", f"1,{least - 1}"]) == 1
+    assert f"--at 1, {least - 1}: expected {least} bytes or more" in capsys.readouterr().err
+    assert main(["view", str(container), "--png", str(out), "--at", f"{least}B"]) == 0
+
+
+def test_a_picture_of_a_prefix_has_north_at_the_top(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("matplotlib")
+    ramp = np.repeat(np.arange(60.0), 80).reshape(60, 80)
+    drawn = []
+    for name, step in (("up", 1.0), ("down", -1.0)):
+        metadata = {"geotransform": [0.0, 1.0, 0.0, 0.0, 0.0, step]}
+        (tmp_path / "a.lode").write_bytes(ls.encode(ls.Surface(ramp, metadata=metadata)))
+        assert main(["view", str(tmp_path / "a.lode"), "--png", str(tmp_path / f"{name}.png"), "--at", "200B"]) == 0
+        with image.open(tmp_path / f"{name}-200B.png") as picture:
+            drawn.append(np.asarray(picture.convert("RGB"), np.int64))
+    up, down = (each[len(each) // 3, each.shape[1] // 3] for each in drawn)
+    assert np.abs(up - down).max() > 20
 
 
 @pytest.mark.parametrize(

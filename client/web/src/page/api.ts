@@ -46,10 +46,22 @@ export function problemOf(status: number, text: string): ProblemError {
 
 /** Requests to one server. */
 export class Server {
-  token: string | null = null;
+  /** The server has refused to write with this token. */
+  readsOnly = false;
+  private given: string | null = null;
 
   /** @param base - Address of the page. */
   constructor(private readonly base: string) {}
+
+  /** What is sent with each request; null: nothing. */
+  get token(): string | null {
+    return this.given;
+  }
+
+  set token(value: string | null) {
+    this.given = value;
+    this.readsOnly = false;
+  }
 
   /** One page of surfaces, oldest first, and the address of the next one. */
   async page(address: string | null): Promise<{ surfaces: ListedSurface[]; next: string | null }> {

@@ -35,6 +35,7 @@ export class Listing {
   private readonly surfaces = new Map<string, ListedSurface>();
   private timer: ReturnType<typeof setTimeout> | undefined;
   private closed = false;
+  private readonly uploads: Uploads;
   readonly element: HTMLElement;
 
   /** @param allowed - Asks for a token if one is needed; false: it was not given. */
@@ -42,7 +43,7 @@ export class Listing {
     private readonly server: Server,
     private readonly allowed: (error: ProblemError) => Promise<boolean>,
   ) {
-    const uploads = new Uploads(server, allowed, (surface) => {
+    this.uploads = new Uploads(server, allowed, (surface) => {
       this.surfaces.set(surface.id, surface);
       this.draw();
       this.poll();
@@ -52,12 +53,24 @@ export class Listing {
       "main",
       { class: "list" },
       html("div", { class: "title" }, html("h1", {}, "Surfaces"), this.search),
-      uploads.element,
+      this.uploads.element,
       html("div", { class: "scroll" }, this.table),
       this.message,
     );
     this.table.hidden = true;
+    this.uploads.showRights();
     void this.load();
+  }
+
+  /** Uploads files. */
+  take(files: FileList): void {
+    this.uploads.take(files);
+  }
+
+  /** Hides what the token does not allow, as far as the server has said so. */
+  showRights(): void {
+    this.uploads.showRights();
+    this.draw();
   }
 
   /** Asks the server no more. */
@@ -132,7 +145,8 @@ export class Listing {
     const remove = html("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
     remove.addEventListener("click", () => void this.remove(surface, name));
     const actions = html("td", { class: "actions" });
-    if (surface.state === "waiting" || surface.state === "missing") {
+    const mayWrite = !this.server.readsOnly;
+    if (mayWrite && (surface.state === "waiting" || surface.state === "missing")) {
       const retry = html(
         "button",
         { type: "button", class: "plain", "aria-label": `Retry the build of ${name}` },
@@ -141,7 +155,7 @@ export class Listing {
       retry.addEventListener("click", () => void this.retry(surface));
       actions.append(retry);
     }
-    actions.append(remove);
+    if (mayWrite) actions.append(remove);
     const reason = surface.state === "failed" || surface.state === "waiting" || surface.state === "missing";
     return html(
       "tr",

@@ -25,6 +25,8 @@ function allowed(error: ProblemError): Promise<boolean> {
   asking ??= askToken(server.token === null ? "no-token" : error.code, error.message).then((token) => {
     asking = null;
     if (token !== null) server.token = token;
+    else if (error.code === "small-scope") server.readsOnly = true;
+    listing?.showRights();
     return token !== null;
   });
   return asking;
@@ -183,12 +185,13 @@ function start(surfaces: ShownSurface[] | null): void {
   showConfigured(surfaces).catch(fail);
 }
 
-// A file dropped beside the place for it would be opened by the browser in the place of this page and its transfers.
+// A list takes files wherever they are dropped; elsewhere they would be opened by the browser in the place of this page and its transfers.
 for (const name of ["dragover", "drop"] as const) {
   addEventListener(name, (event) => {
     if (event.defaultPrevented || !event.dataTransfer?.types.includes("Files")) return;
     event.preventDefault();
-    event.dataTransfer.dropEffect = "none";
+    if (listing === null || server.readsOnly) event.dataTransfer.dropEffect = "none";
+    else if (name === "drop") listing.take(event.dataTransfer.files);
   });
 }
 

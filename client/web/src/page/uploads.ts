@@ -35,7 +35,7 @@ export class Uploads {
     this.drop = html(
       "div",
       { class: "drop" },
-      html("p", { class: "hint" }, "Drop a surface here: a grid, raster, mesh or container file."),
+      html("p", { class: "hint" }, "Drop a surface anywhere on this page: a grid, raster, mesh or container file."),
       choose,
       this.input,
     );
@@ -52,13 +52,16 @@ export class Uploads {
     }
     for (const name of ["dragleave", "drop"] as const)
       this.drop.addEventListener(name, () => this.drop.classList.remove("over"));
-    this.drop.addEventListener("drop", (event) => {
-      event.preventDefault();
-      this.take(event.dataTransfer?.files ?? null);
-    });
   }
 
-  private take(files: FileList | null): void {
+  /** Shows the place for files only where the token may write. */
+  showRights(): void {
+    this.drop.hidden = this.server.readsOnly;
+  }
+
+  /** Uploads files. */
+  take(files: FileList | null): void {
+    if (this.server.readsOnly) return;
     for (const file of files ?? []) void this.upload(file);
   }
 

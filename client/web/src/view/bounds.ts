@@ -7,7 +7,7 @@ import type { Grid } from "./source";
 import type { PatchBounds } from "./strides";
 
 /** Metres of a degree of latitude. */
-const DEGREE = 111_320;
+export const DEGREE = 111_320;
 
 /** The box around the valid points of all grids; a point at 0 if there is none. */
 export function boxOf(grids: readonly Grid[]): Box {

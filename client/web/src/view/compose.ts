@@ -78,7 +78,7 @@ export function composed(coarse: Grid, fine: Grid): Grid {
     );
     return { name, components, values: result };
   });
-  return { rowsAt: rows.at, columnsAt: columns.at, full, closed, points, mask, attributes };
+  return { ...coarse, rowsAt: rows.at, columnsAt: columns.at, points, mask, attributes };
 }
 
 /** Every stride-th line of a grid, and the last one. */

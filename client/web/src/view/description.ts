@@ -8,7 +8,8 @@ import { FOOTER_LENGTH, type Metadata, parseFooter } from "../container/sections
 import { readWindowErrors, type WindowErrors } from "../planning/window-errors";
 import { containerUrl, isSurface } from "../transfer/addresses";
 import { PART, type PartReader } from "../transfer/parts";
-import { attributesIn } from "./grids";
+import { attributesIn, placeOf } from "./grids";
+import { periodsOf } from "./maps";
 import type { Price, SurfaceInfo } from "./source";
 
 /** Metadata and price list. */
@@ -176,6 +177,39 @@ async function bytesOf(answer: Response, length: number): Promise<Uint8Array> {
   return data;
 }
 
+/** A CRS in WKT whose coordinates are degrees. */
+const GEOGRAPHIC = /^\s*GEO(GCS|GCRS|DCRS|GRAPHICCRS)/i;
+
+/** Whether x goes on by 360 along a closed axis of heights. */
+function goesRound(header: Header, metadata: Metadata): boolean {
+  try {
+    return header.closed.some((closed, axis) => {
+      const last = header.shape[axis]! - 1;
+      if (!closed || last < 1) return false;
+      const [from] = placeOf(metadata, header, 0, 0);
+      const [to] = axis === 0 ? placeOf(metadata, header, last, 0) : placeOf(metadata, header, 0, last);
+      return Math.abs((Math.abs(to - from) * (last + 1)) / last - 360) * last < 180;
+    });
+  } catch {
+    return false; // metadata of anybody, of which drawing will say what is wrong
+  }
+}
+
+/** The unit of x and y, as far as a CRS, angles, or columns that go once round the Earth tell it. */
+function planeUnitOf(header: Header, metadata: Metadata): string {
+  const crs = typeof metadata.crs === "string" ? metadata.crs : "";
+  const [x, y] = periodsOf(metadata);
+  if (GEOGRAPHIC.test(crs) || x === 360 || y === 360) return "°";
+  const isField = header.pointChannels === 1 && header.blocks.length === 1;
+  if (!isField || header.plane !== null) return typeof metadata.unit === "string" ? metadata.unit : "";
+  if (metadata.axes === undefined && (metadata.geotransform ?? null) === null) return "cells";
+  if (goesRound(header, metadata)) return "°";
+  // The unit of a projected CRS is that of its axes, the last one that is named.
+  const units = /^\s*PROJ/i.test(crs) ? [...crs.matchAll(/\b(?:LENGTH)?UNIT\s*\[\s*"([^"]{1,40})"/gi)] : [];
+  const named = units.at(-1)?.[1] ?? "";
+  return /^(metre|meter|m)$/i.test(named) ? "m" : named;
+}
+
 /** The description of a surface for those who look at it. */
 export function infoOf(header: Header, { metadata, prices, size }: Omit<Description, "windows">): SurfaceInfo {
   const text = (key: string): string => {
@@ -191,9 +225,10 @@ export function infoOf(header: Header, { metadata, prices, size }: Omit<Descript
     heights,
     georeferenced:
       heights && (header.plane !== null || metadata.axes !== undefined || (metadata.geotransform ?? null) !== null),
-    geographic: heights && /^\s*GEO(GCS|GCRS|DCRS|GRAPHICCRS)/i.test(text("crs")),
+    geographic: heights && GEOGRAPHIC.test(text("crs")),
     joined: header.arrangement !== null,
     unit: text("unit"),
+    planeUnit: planeUnitOf(header, metadata),
     exact: header.exact,
     attributes: attributesIn(header),
     size,

@@ -33,6 +33,8 @@ export interface FieldInput {
   /** [node, xyz], not normalised. */
   readonly normals: Float64Array;
   readonly frame: Frame;
+  /** By how much z are drawn higher than x and y of the same length. */
+  readonly rise: number;
 }
 
 /** The values of a field, [node]; NaN where there is none. */
@@ -44,7 +46,7 @@ export function fieldValues(field: Field, input: FieldInput): Float64Array {
     case "height":
       return heights(nodes, frame);
     case "slope":
-      return slopes(input.normals);
+      return slopes(input.normals, input.rise);
     case "change":
       return changes(input);
     case "attribute":

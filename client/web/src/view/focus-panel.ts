@@ -13,7 +13,10 @@ export interface FocusActions {
   /** null: the latest moment, and those to come. */
   show(moment: number | null): void;
   setTarget(target: Target): void;
+  /** Another rate was chosen. */
   throttle(rate: number | null): void;
+  /** A session begins at this rate. */
+  limit(rate: number): void;
   stopBelowPixel(on: boolean): void;
 }
 
@@ -98,7 +101,7 @@ export class FocusPanel {
     this.slider.addEventListener("input", () => this.slide(Number(this.slider.value)));
     this.target.addEventListener("change", () => this.chooseTarget());
     this.amount.addEventListener("change", () => this.sendTarget());
-    this.rate.addEventListener("change", () => actions.throttle(Number(this.rate.value) || null));
+    this.rate.addEventListener("change", () => actions.throttle(this.chosenRate));
     this.below.addEventListener("change", () => actions.stopBelowPixel(this.below.checked));
   }
 
@@ -108,10 +111,21 @@ export class FocusPanel {
     return state === "connecting" || state === "receiving" || state === "resuming" || state === "waiting";
   }
 
-  /** Asks another session for what is chosen, as far as that is not what it does anyway. */
-  begin(): void {
+  /** Bytes a second at most; null: as it comes. */
+  get chosenRate(): number | null {
+    return Number(this.rate.value) || null;
+  }
+
+  /**
+   * Asks another session for what is chosen, as far as that is not what it does anyway.
+   *
+   * @param rate - Bytes a second that an address asks for, if it is one of those that can be chosen.
+   */
+  begin(rate?: number): void {
+    if (RATES.some(([known]) => known === rate)) this.rate.value = String(rate);
     if (this.target.value !== "all") this.sendTarget();
-    if (Number(this.rate.value) > 0) this.actions.throttle(Number(this.rate.value));
+    this.last = null;
+    if (this.chosenRate !== null) this.actions.limit(this.chosenRate);
   }
 
   /** Chooses a target, as the user would. */
@@ -163,8 +177,8 @@ export class FocusPanel {
     // Whoever follows sees where the picture is, which may take longer to draw than to come.
     if (following) this.slider.value = String(drawn?.number ?? last);
     setText(this.shown, drawn === null ? "" : formatBytes(drawn.bytes));
-    const at = moments.find(({ number }) => number === Number(this.slider.value));
-    this.slider.setAttribute("aria-valuetext", at === undefined ? "nothing yet" : momentText(at, unit));
+    // Of the picture, as the label is: the knob may be elsewhere already.
+    this.slider.setAttribute("aria-valuetext", drawn === null ? "nothing yet" : momentText(drawn, unit));
     setText(this.button, this.canStop ? "Stop" : progress.state === "failed" ? "Try again" : "Continue");
     this.button.hidden = isWhole(state);
   }

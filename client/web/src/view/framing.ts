@@ -102,10 +102,12 @@ export class Framing {
    * @returns pixels of a length of 1 at the camera's target, 0 where a length means nothing, and the unit.
    */
   scale(orbit: Orbit, height: number): { pixels: number; unit: string } {
-    const { geographic, unit, georeferenced, heights } = this.info;
+    const { geographic, planeUnit } = this.info;
     const drawn = height / (2 * orbit.distance * Math.tan((VIEW_ANGLE * Math.PI) / 360));
-    if (!heights && unit === "") return { pixels: 0, unit: "" };
+    // Of x, y, z whose z has a scale of its own, the unit is that of z.
+    const unit = !this.info.heights && this.isFitted && planeUnit !== "°" ? "" : planeUnit;
+    if (!this.info.heights && unit === "") return { pixels: 0, unit: "" };
     if (geographic) return { pixels: (drawn * this.frame.scale[1]) / DEGREE, unit: "m" };
-    return { pixels: drawn * this.frame.scale[0], unit: unit || (georeferenced ? "" : "cells") };
+    return { pixels: drawn * this.frame.scale[0], unit };
   }
 }

@@ -1,10 +1,11 @@
 /** The drawn surface: which patches there are, at which strides, and their buffers. Runs in a worker. */
 
 import { type BoundaryNormals, boundaryNormals } from "./boundary-normals";
-import { boundsOf, boxOf, type FrameOptions, frameOf, gridsFit } from "./bounds";
+import { boundsOf, boxOf, DEGREE, type FrameOptions, frameOf, gridsFit } from "./bounds";
 import { extremes, type FieldInput, fieldBefore, fieldValues, inner, NO_VALUE } from "./fields";
 import type { Box, Colouring, Eye, Field, Hit, PatchBuffers } from "./geometry-messages";
 import { type Frame, latticeBetween, latticeOf, placesOf } from "./lattice";
+import { withoutJumps } from "./maps";
 import { normalSums, packedNormals } from "./normals";
 import { isLine, linesOf, type Patch, patchesOf, patchSize, piecesOf, quadsOf } from "./patches";
 import { pick } from "./picking";
@@ -39,6 +40,8 @@ export class Geometry {
   private strides: Int32Array = new Int32Array();
   private ends: BoundaryNormals = new Map();
   private joined = false;
+  private geographic = false;
+  private heights = false;
   private field: Field = { kind: "height" };
   private known: [number, number] | null = null;
   private base: { low: number; span: number } | null = null;
@@ -72,6 +75,8 @@ export class Geometry {
     this.before = !fresh && gridsFit(this.grids, grids) ? this.grids : null;
     this.grids = grids;
     this.joined = joined;
+    this.geographic = options.geographic;
+    this.heights = options.heights;
     const fitting = frameOf(this.box, options);
     if (this.fixed === null || isOther(this.fixed, fitting)) this.fixed = fitting;
     this.ends = boundaryNormals(grids, this.fixed);
@@ -126,11 +131,13 @@ export class Geometry {
     return this.chosen?.finer ?? 0;
   }
 
-  /** Pixels of a length of 1 in the surface's unit where it is nearest. */
+  /** Pixels of an error of 1 in the surface's unit where it is nearest. */
   get pixels(): number {
     const { chosen, eye } = this;
     if (chosen === null || eye === null || !Number.isFinite(chosen.nearest)) return 0;
-    return (eye.focal / chosen.nearest) * Math.max(this.frame.scale[0], this.frame.scale[2] * eye.exaggeration);
+    const upwards = this.frame.scale[2] * eye.exaggeration;
+    // Heights err in z only, which may have a scale of its own.
+    return (eye.focal / chosen.nearest) * (this.heights ? upwards : Math.max(this.frame.scale[0], upwards));
   }
 
   /** What of the only block is in the view, at full resolution; null: more than half of it, or there are more blocks. */
@@ -169,6 +176,12 @@ export class Geometry {
     return { low, span, range: this.range() };
   }
 
+  /** By how much z are drawn higher than x and y of the same length. */
+  private get rise(): number {
+    const { scale } = this.frame;
+    return scale[2] / (this.geographic ? scale[1] / DEGREE : scale[1]);
+  }
+
   private wishedStrides(): Int32Array {
     const everywhere = (stride: number): Int32Array => new Int32Array(this.patches.length).fill(stride);
     if (this.eye === null) return everywhere(1);
@@ -203,12 +216,13 @@ export class Geometry {
     }
     const nodes = inner(lattice);
     const before = beforeAround === null ? null : inner(beforeAround);
-    const input: FieldInput = { grid, rows, columns, nodes, before, normals, frame: this.frame };
+    const input: FieldInput = { grid, rows, columns, nodes, before, normals, frame: this.frame, rise: this.rise };
     const values = this.packed(fieldValues(this.field, input));
     const blended = withBefore && old !== undefined && before !== null && beforeAround !== null ? before : null;
     const valuesBefore = blended !== null && old !== undefined ? fieldBefore(this.field, old, input) : null;
     const beside = patch.beside.map((other) => (other < 0 ? 0 : this.strides[other]!)) as unknown as StridesBeside;
-    const triangles = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
+    const whole = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
+    const triangles = withoutJumps(whole, nodes.points, this.frame.scale, grid.periods);
     const { centre, half } = this.bounds[number]!;
     const line = isLine(patch);
     return {
@@ -266,11 +280,12 @@ export class Geometry {
         return linesOf([0, length - 1], stride);
       };
       const [rows, columns] = [lines(grid.rowsAt.length), lines(grid.columnsAt.length)];
+      const { frame, rise } = this;
       const all = (of: number[]): number[] => [2 * of[0]! - (of[1] ?? 1), ...of, 2 * of.at(-1)! - (of.at(-2) ?? 0)];
       if (this.field.kind === "attribute" || this.field.kind === "none") {
         const empty = new Float64Array();
         const nodes = { rows: 0, columns: 0, points: empty, valid: new Uint8Array() };
-        return fieldValues(this.field, { grid, rows, columns, nodes, before: null, normals: empty, frame: this.frame });
+        return fieldValues(this.field, { grid, rows, columns, nodes, before: null, normals: empty, frame, rise });
       }
       const lattice = latticeOf(grid, all(rows), all(columns), this.frame);
       const old = this.field.kind === "change" ? this.before?.[block] : undefined;
@@ -279,7 +294,16 @@ export class Geometry {
       const before = old === undefined ? null : latticeBetween(old, places(rows, 0), places(columns, 1), this.frame);
       const normals = this.field.kind === "height" ? new Float64Array() : normalSums(lattice);
       const nodes = inner(lattice);
-      return fieldValues(this.field, { grid, rows, columns, nodes, before, normals, frame: this.frame });
+      return fieldValues(this.field, {
+        grid,
+        rows,
+        columns,
+        nodes,
+        before,
+        normals,
+        frame: this.frame,
+        rise: this.rise,
+      });
     });
     const ranges = parts.map((values) => extremes(values, trimmed)).filter(([low]) => !Number.isNaN(low));
     if (ranges.length === 0) return [Number.NaN, Number.NaN];

@@ -6,6 +6,7 @@ import type { Metadata } from "../container/sections";
 import { evaluate, type RulePlane } from "../coordinates/coordinate-rules";
 import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../coordinates/height-fields";
 import type { Block, PointArray } from "../types";
+import { unrolled } from "./maps";
 import type { AttributeGrid, AttributeInfo, Grid } from "./source";
 
 /** Whether the points are heights that the header gives no x and y for. */
@@ -20,7 +21,7 @@ function numbers({ values }: PointArray): Float64Array {
 }
 
 /**
- * A block as a grid.
+ * A block as a grid to draw; where a closed axis is that of a map, the grid goes on to the end of the turn.
  *
  * @param metadata - Of the whole surface, which may be known before its container's have come.
  */
@@ -52,15 +53,9 @@ export function gridOf(block: Block, number: number, header: Header, level: numb
       }
     }
   }
-  return {
-    rowsAt,
-    columnsAt,
-    full,
-    closed: block.closed,
-    points,
-    mask: block.mask,
-    attributes: attributesOf(block, values),
-  };
+  const { closed, mask } = block;
+  const grid: Grid = { rowsAt, columnsAt, full, closed, points, mask, attributes: attributesOf(block, values) };
+  return unrolled(grid, areHeights(header) || header.plane !== null, metadata);
 }
 
 /** Rules of x and y at a level, and where its rows and columns stand. */

@@ -95,5 +95,6 @@ export class ScaleBar {
 
 function lengthText(length: number, unit: string): string {
   if (unit === "m" && length >= 1000) return `${formatNumber(length / 1000)} km`;
+  if (unit === "°") return `${formatNumber(length)}°`;
   return `${formatNumber(length)} ${unit}`.trim();
 }

@@ -72,9 +72,13 @@ export class LodestreamView extends HTMLElement {
     this.focusPanel = new FocusPanel({
       stop: () => this.session?.stop(),
       resume: () => this.goOn(),
-      show: (moment) => this.session?.show(moment),
+      show: (moment) => {
+        this.session?.show(moment);
+        this.refresh();
+      },
       setTarget: (target) => this.session?.setTarget(target),
-      throttle: (rate) => this.session?.source.throttle(rate),
+      throttle: (rate) => this.throttle(rate),
+      limit: (rate) => this.session?.source.throttle(rate),
       stopBelowPixel: (on) => this.stopBelowPixel(on),
     });
     this.lookPanel = new LookPanel(
@@ -254,7 +258,7 @@ export class LodestreamView extends HTMLElement {
     this.stopBelowPixel(this.getAttribute("autostop") !== "off");
     this.look = { ...this.look, field: this.shared.field ?? { kind: "height" }, range: this.shared.range ?? null };
     this.session.setField(this.look.field);
-    this.focusPanel.begin();
+    this.focusPanel.begin(this.shared.rate);
   }
 
   /** Goes on; where what has come is of no use, from the beginning, seen as it is now. */
@@ -264,10 +268,23 @@ export class LodestreamView extends HTMLElement {
       session?.resume();
       return;
     }
-    const below = session.stopsBelowPixel;
+    this.again();
+  }
+
+  /** Begins anew, seen as it is now. */
+  private again(): void {
+    const below = this.session?.stopsBelowPixel ?? true;
     this.shared = this.view();
     this.open();
     this.stopBelowPixel(below);
+  }
+
+  /** Asks for at most so many bytes a second; where nothing is under way any more, for all of them again. */
+  private throttle(rate: number | null): void {
+    const { session } = this;
+    this.sharing.later();
+    if (rate !== null && session !== null && !this.focusPanel.canStop) this.again();
+    else session?.source.throttle(rate);
   }
 
   private stopBelowPixel(on: boolean): void {
@@ -364,6 +381,7 @@ export class LodestreamView extends HTMLElement {
         drawn: session.drawnMoment,
         drawnLevel: this.latest?.level ?? 0,
         following: session.following,
+        awaited: session.awaitsChosen,
         progress: session.progress,
         belowPixel: session.stoppedBelowPixel,
         silent,
@@ -403,7 +421,7 @@ export class LodestreamView extends HTMLElement {
     if (latest === null || range === null || stage === null) return;
     const { low, span } = latest.colouring;
     stage.setLook(look, (range[0] - low) / span, (range[1] - low) / span);
-    this.legend.draw(legendOf(look, range, session?.info ?? null));
+    this.legend.draw(legendOf(look, range, session?.info ?? null, this.viewpoint.framing?.isFitted));
   }
 
   /** Draws what lies over the picture: scale, north, and the place whose values are shown. */
@@ -479,6 +497,7 @@ export class LodestreamView extends HTMLElement {
   /** The view as it can be shown again: what nobody has set is left to follow the surface then too. */
   private view(): SharedView {
     const { camera, isHeld, isChosen } = this.viewpoint;
+    const { chosenRate: rate } = this.focusPanel;
     const { field, map, range, exaggeration, lines } = this.look;
     return {
       ...(isHeld && camera !== null ? { camera } : {}),
@@ -487,6 +506,7 @@ export class LodestreamView extends HTMLElement {
       ...(isHeld || isChosen ? { exaggeration } : {}),
       lines,
       ...(range === null ? {} : { range }),
+      ...(rate === null ? {} : { rate }),
     };
   }
 

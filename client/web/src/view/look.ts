@@ -30,6 +30,17 @@ export function isCentred(field: Field): boolean {
 /** The most components of one attribute that can be chosen. */
 const MOST_COMPONENTS = 16;
 
+/** Units of length as metadata write them. */
+const METRES = /^(m|met(er|re)s?)$/i;
+
+/** Whether z may have the unit of x and y, without which there is no angle to the horizontal. */
+export function hasSlope({ unit, planeUnit, geographic, heights }: SurfaceInfo): boolean {
+  // x and y of a geographic CRS are drawn in metres.
+  if (planeUnit === "°") return geographic && heights && (unit === "" || METRES.test(unit));
+  if (planeUnit === "" || planeUnit === "cells" || unit === "") return true;
+  return unit === planeUnit || (METRES.test(unit) && METRES.test(planeUnit));
+}
+
 /** What a surface can be coloured by. */
 export function fieldsOf(info: SurfaceInfo): Field[] {
   const attributes = info.attributes.flatMap(({ name, components }) => {
@@ -37,7 +48,8 @@ export function fieldsOf(info: SurfaceInfo): Field[] {
     const all: Component[] = components > 1 ? ["magnitude", ...each] : each;
     return all.map((component): Field => ({ kind: "attribute", name, component }));
   });
-  return [{ kind: "height" }, { kind: "slope" }, { kind: "change" }, ...attributes, { kind: "none" }];
+  const slope: Field[] = hasSlope(info) ? [{ kind: "slope" }] : [];
+  return [{ kind: "height" }, ...slope, { kind: "change" }, ...attributes, { kind: "none" }];
 }
 
 /** Whether two fields are the same. */
@@ -73,10 +85,16 @@ export function legendOf(
   { field, map }: Look,
   range: readonly [number, number],
   info: SurfaceInfo | null,
+  fitted = false,
 ): LegendData | null {
   if (field.kind === "none") return null;
   const unit = info?.unit ?? "";
   const own = field.kind === "slope" ? "degrees" : field.kind === "attribute" ? "" : unit;
-  const note = field.kind === "attribute" ? "Grey: no value" : "";
+  const note =
+    field.kind === "attribute"
+      ? "Grey: no value"
+      : field.kind === "slope" && fitted
+        ? "If z has the unit of x and y"
+        : "";
   return { title: fieldName(field, info), unit: own, map, range, note };
 }

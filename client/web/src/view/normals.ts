@@ -64,13 +64,18 @@ export function packedNormals(sums: Float64Array, line = false): Int8Array {
   return packed;
 }
 
-/** The slope at each node in degrees, 0 to 90: the angle between its normal and the vertical. */
-export function slopes(sums: Float64Array): Float64Array {
+/**
+ * The slope at each node in degrees, 0 to 90: the angle between the normal of the surface and the vertical.
+ *
+ * @param sums - Of what is drawn.
+ * @param rise - By how much z are drawn higher than x and y of the same length.
+ */
+export function slopes(sums: Float64Array, rise: number): Float64Array {
   const result = new Float64Array(sums.length / 3);
   for (let node = 0; node < result.length; node += 1) {
     const [x, y, z] = [sums[3 * node]!, sums[3 * node + 1]!, sums[3 * node + 2]!];
     result[node] =
-      x === 0 && y === 0 && z === 0 ? Number.NaN : (Math.atan2(Math.hypot(x, y), Math.abs(z)) * 180) / Math.PI;
+      x === 0 && y === 0 && z === 0 ? Number.NaN : (Math.atan2(Math.hypot(x, y), Math.abs(z) * rise) * 180) / Math.PI;
   }
   return result;
 }

@@ -2,6 +2,7 @@
 
 import type { Hit } from "./geometry-messages";
 import { type Frame, latticeOf, placesOf } from "./lattice";
+import { jumps } from "./maps";
 import { isLine, linesOf } from "./patches";
 import type { Grid } from "./source";
 import type { PatchBounds } from "./strides";
@@ -82,6 +83,7 @@ function inPatch(grid: Grid, of: PatchBounds, frame: Frame, origin: Triple, dire
         [d, c, false],
       ] as const) {
         if (lattice.valid[a] === 0 || lattice.valid[p] === 0 || lattice.valid[q] === 0) continue;
+        if (grid.periods !== undefined && jumps(lattice.points, [a, p, q], frame.scale, grid.periods)) continue;
         const met = meets(origin, direction, node(a), node(p), node(q));
         if (met === null || (best !== null && met.distance >= best.distance)) continue;
         // Corners of the triangle in lines from node a: (0, 0), then p and q.

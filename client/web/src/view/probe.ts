@@ -90,7 +90,8 @@ export class Probe {
     const step = of.max > 0 ? of.max / 10 : 0;
     const text = (value: number): string => (step > 0 ? formatAt(value, step) : formatStored(value));
     const names = ["x", "y", info.heights ? "height" : "z"];
-    const unit = (k: number): string => (k === 2 || !info.geographic ? info.unit : "°");
+    const unit = (k: number): string =>
+      k > 1 || info.planeUnit === "cells" ? (k > 1 ? info.unit : "") : info.planeUnit;
     this.element.replaceChildren(
       part(info.blocks.length > 1 ? `block ${of.block}, row` : "row", `${of.row}`),
       part("column", `${of.column}`),

@@ -93,6 +93,11 @@ export class Session {
     return this.chosen === null;
   }
 
+  /** Whether a moment was chosen that is not drawn yet. */
+  get awaitsChosen(): boolean {
+    return this.chosen !== null && this.shown?.moment.number !== this.chosen;
+  }
+
   /** Goes back to a moment, or with null to the latest one and those to come. */
   show(number: number | null): void {
     this.chosen = number;

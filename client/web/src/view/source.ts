@@ -56,7 +56,10 @@ export interface SurfaceInfo {
   readonly geographic: boolean;
   /** Whether sides of the blocks are joined, so that all of it has to be drawn at one level. */
   readonly joined: boolean;
+  /** Of heights, and of all coordinates where x and y are no other: see `planeUnit`. */
   readonly unit: string;
+  /** Of x and y: `°`, a length, or empty where it is not known. */
+  readonly planeUnit: string;
   /** Whether the end is exact. */
   readonly exact: boolean;
   readonly attributes: readonly AttributeInfo[];
@@ -83,7 +86,10 @@ export interface Grid {
   readonly columnsAt: Float64Array;
   /** Lengths of the axes at full resolution. */
   readonly full: readonly [number, number];
+  /** Of a map that goes round, the first line follows the last one a turn further, and the axis is not closed. */
   readonly closed: readonly [boolean, boolean];
+  /** Full turns of those coordinates that are angles, 0 for others; without it, none is. */
+  readonly periods?: readonly [number, number, number];
   /** [row, column, xyz] in the surface's unit. */
   readonly points: Float64Array;
   /** [row, column], 0 at holes; null: there are none. */

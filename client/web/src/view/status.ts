@@ -15,6 +15,8 @@ export interface FocusState {
   readonly drawnLevel: number;
   /** Whether new moments are drawn as they come. */
   readonly following: boolean;
+  /** A moment was chosen that is not drawn yet. */
+  readonly awaited: boolean;
   readonly progress: Progress;
   readonly belowPixel: boolean;
   /** Seconds without a byte, while receiving. */
@@ -36,6 +38,7 @@ export function isWhole({ progress, moments }: FocusState): boolean {
 export function statusText(state: FocusState): string {
   const { progress, belowPixel, silent, info, moments, drawn, following } = state;
   const last = moments.at(-1);
+  if (state.awaited && progress.state !== "failed") return "Drawing the moment chosen";
   const whole = isWhole(state) && progress.state !== "failed";
   if (last !== undefined && drawn?.number !== last.number && (whole || belowPixel || progress.state === "target"))
     return following ? "Received: drawing" : "Earlier moment";

@@ -13,6 +13,8 @@ export interface SharedView {
   range?: readonly [number, number];
   exaggeration?: number;
   lines?: boolean;
+  /** Bytes a second that are asked for at most. */
+  rate?: number;
 }
 
 /** A number with as many digits as matter beside a step. */
@@ -46,6 +48,7 @@ export function formatView(view: SharedView): string {
   if (view.range !== undefined) parts.push(`r=${view.range.map((value) => Number(value.toPrecision(6))).join(",")}`);
   if (view.exaggeration !== undefined) parts.push(`x=${Number(view.exaggeration.toPrecision(4))}`);
   if (view.lines === true) parts.push("l=1");
+  if (view.rate !== undefined) parts.push(`b=${view.rate}`);
   return parts.join("&");
 }
 
@@ -90,11 +93,13 @@ export function parseView(text: string): SharedView {
   const [exaggeration] = numbersOf(get("x"), 1) ?? [];
   if (exaggeration !== undefined && exaggeration >= 0.01 && exaggeration <= 1000) view.exaggeration = exaggeration;
   if (get("l") === "1") view.lines = true;
+  const [rate] = numbersOf(get("b"), 1) ?? [];
+  if (rate !== undefined && rate > 0) view.rate = rate;
   return view;
 }
 
 /** Keys of `formatView`; others in an address belong to the page. */
-const KEYS = new Set(["v", "c", "m", "r", "x", "l"]);
+const KEYS = new Set(["v", "c", "m", "r", "x", "l", "b"]);
 
 /** An address's part after #, with another view in it and what else there was. */
 export function withView(hash: string, view: SharedView): string {

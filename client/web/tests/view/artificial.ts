@@ -156,7 +156,15 @@ export class ArtificialSource implements Source {
   }
 }
 
-const BASE = { unit: "m", exact: true, georeferenced: false, geographic: false, joined: false, heights: false };
+const BASE = {
+  unit: "m",
+  planeUnit: "m",
+  exact: true,
+  georeferenced: false,
+  geographic: false,
+  joined: false,
+  heights: false,
+};
 const TURN = 2 * Math.PI;
 
 /** Mountains with a lake that is a hole, 10 km wide, far from the origin of their coordinates. */

@@ -81,6 +81,7 @@ describe("what is drawn of a large surface", () => {
     geographic: false,
     joined: false,
     unit: "",
+    planeUnit: "",
     exact: true,
     attributes: [],
     size: 0,

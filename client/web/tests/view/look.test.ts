@@ -170,6 +170,7 @@ describe("levels", () => {
     geographic: false,
     joined: false,
     unit: "",
+    planeUnit: "",
     exact: true,
     attributes: [],
     size: 0,
@@ -263,6 +264,21 @@ describe("numbers", () => {
   });
 });
 
+describe("slope", () => {
+  it.each([
+    ["m", "m", false, true],
+    ["METERS", "m", false, true],
+    ["m", "", false, true],
+    ["m", "°", true, true],
+    ["METERS", "°", false, false],
+    ["degC", "°", true, false],
+    ["ft", "m", false, false],
+  ])("of heights in %j over %j, geographic: %j, is offered: %j", (unit, planeUnit, geographic, offered) => {
+    const info = { unit, planeUnit, geographic, heights: true, attributes: [] } as unknown as SurfaceInfo;
+    expect(fieldsOf(info).some(({ kind }) => kind === "slope")).toBe(offered);
+  });
+});
+
 describe("an attribute of several components", () => {
   const info: SurfaceInfo = {
     name: "",
@@ -274,6 +290,7 @@ describe("an attribute of several components", () => {
     geographic: false,
     joined: false,
     unit: "m",
+    planeUnit: "m",
     exact: true,
     attributes: [
       { name: "wind", components: 2 },

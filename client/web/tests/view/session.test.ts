@@ -84,9 +84,11 @@ it("moments that come while another is drawn are left out, but for the last", as
   expect(session.drawnMoment?.number).toBe(7);
   // A moment that is chosen is drawn by itself, however many came after it.
   session.show(3);
+  expect(session.awaitsChosen).toBe(true);
   await expect.poll(() => asked.length).toBe(3);
   expect(asked[2]!.moment).toBe(3);
   asked[2]!.answer({ moment: 3, grids: [] });
   await expect.poll(() => drawn).toEqual([0, 7, 3]);
+  expect(session.awaitsChosen).toBe(false);
   session.close();
 });

@@ -20,6 +20,7 @@ function state(progress: Progress["state"], given: Partial<FocusState> = {}): Fo
     drawn: MOMENTS.at(-1)!,
     drawnLevel: 2,
     following: true,
+    awaited: false,
     progress: { state: progress, bytes: 300, planned: 300, rate: 0, detail: "" },
     belowPixel: false,
     silent: 0,
@@ -33,6 +34,13 @@ describe("the status", () => {
     expect(statusText(state("complete", { drawn: MOMENTS[1]! }))).toBe("Received: drawing");
     expect(statusText(state("complete", { drawn: null }))).toBe("Received: drawing");
     expect(statusText(state("complete", { drawn: MOMENTS[0]!, following: false }))).toBe("Earlier moment");
+  });
+
+  it("claims nothing of a moment that is not drawn yet", () => {
+    const early = { drawn: MOMENTS.at(-1)!, following: false, awaited: true };
+    expect(statusText(state("complete", early))).toBe("Drawing the moment chosen");
+    expect(statusText(state("receiving", early))).toBe("Drawing the moment chosen");
+    expect(statusText(state("failed", early))).toBe("Failed");
   });
 
   it("says so also of an end that is not all of it", () => {

@@ -15,6 +15,7 @@ const INFO: SurfaceInfo = {
   geographic: false,
   joined: false,
   unit: "",
+  planeUnit: "",
   exact: true,
   attributes: [],
   size: 0,
