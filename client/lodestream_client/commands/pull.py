@@ -27,16 +27,14 @@ from .arguments import (
     add_json_option,
     add_rate_option,
     add_size_option,
-    add_target_options,
     add_token_option,
-    parse_seconds,
-    parse_source,
     standard_output_once,
-    target_of,
     token_of,
 )
 from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
+from .target_options import add_target_options, target_of
+from .values import parse_seconds, parse_source
 
 if TYPE_CHECKING:
     from ..stream.reconnecting import Transport
