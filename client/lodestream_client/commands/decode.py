@@ -100,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
         job.read.total,
+        job.read.total,
         view.level,
         view.rms,
         view.max_error,
