@@ -13,6 +13,7 @@ from PIL import Image
 
 import lodestream as ls
 from lodestream.formats import write
+from lodestream.grid.layout import Layout
 from lodestream_client import sync
 from lodestream_client.commands import watching
 
@@ -76,7 +77,7 @@ def test_a_picture_is_drawn_beside_it(run: Run, surface: str, tmp_path: Path, mo
     drawn: list[int] = []
     draw = pictures.draw
 
-    def seen(view: ls.View, layout: pictures.Layout | None, name: str, path: Path) -> None:
+    def seen(view: ls.View, layout: Layout | None, name: str, path: Path) -> None:
         draw(view, layout, name, path)
         with Image.open(path) as picture:
             picture.load()
