@@ -84,7 +84,7 @@ def metadata_left_out(surface: Surface, held: Collection[str]) -> list[str]:
             continue
         # An attribute of a VTK file is often called scalars too, and that one is kept.
         single = key == "scalars" and isinstance(value, dict)
-        names.append(f"the single numbers {listing(value)}" if single else str(key))
+        names.append(f"single numbers (scalars: {listing(value)})" if single else str(key))
     return names
 
 
