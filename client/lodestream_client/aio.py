@@ -49,6 +49,17 @@ def connect(url: str, **options: Unpack[ConnectKeywords]) -> Stream:
 
     Parameters and errors are those of `lodestream_client.sync.connect`. The connection is opened, and errors of the
     server are raised, on entering.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> async def receive():
+    ...     async with lodestream_client.connect(url, target=lodestream.Target(level=3)) as stream:
+    ...         views = [view async for view in stream]
+    ...     return stream.ended, views[-1].points_at(3).shape
+    >>> asyncio.run(receive())
+    ('level', (7, 6))
     """
     return Stream(url, ConnectOptions(**options))
 
@@ -70,6 +81,12 @@ async def upload(
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
     A surface in memory is encoded in a thread, and files are read in threads; `progress` is called from there.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy", precision=0.01)).state
+    'ready'
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
     parcel = await _prepared(sources, asked, progress)
@@ -81,17 +98,42 @@ async def upload(
 async def retry(
     url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None
 ) -> Description:
-    """Ask the server to build a surface again that waits, failed or is missing; see `lodestream_client.sync.retry`."""
+    """Ask the server to build a surface again that waits, failed or is missing; see `lodestream_client.sync.retry`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> asyncio.run(lodestream_client.retry(url)).state  # nothing to do: it is ready
+    'ready'
+    """
     return await _run(api.retry(url, wait, progress), url, token)
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`."""
+    """All surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> found = asyncio.run(lodestream_client.list("http://127.0.0.1:8000"))
+    >>> url in [description.url for description in found]
+    True
+    """
     return await _run(api.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface; errors as in `lodestream_client.sync`."""
+    """State and description of one surface; errors as in `lodestream_client.sync`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> asyncio.run(lodestream_client.describe(url)).details["shape"]
+    [97, 70]
+    """
     return await _run(api.describe(url), url, token)
 
 
@@ -99,24 +141,54 @@ async def describe_file(url: str, *, token: str | None = None, max_vertices: int
     """Description of a container file on any web server: what ``lodestream info --json`` prints.
 
     `max_vertices` limits the memory of the container's tables, see `connect`. Errors as in `lodestream_client.sync`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> asyncio.run(lodestream_client.describe_file(f"{url}/container"))["shape"]  # or of any web server
+    [97, 70]
     """
     return await _run(api.describe_file(url, max_vertices), url, token)
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file; errors as in `lodestream_client.sync`."""
+    """What identifies a surface's container, or a container file; errors as in `lodestream_client.sync`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> len(asyncio.run(lodestream_client.identify(url)).container)
+    64
+    """
     return await _run(api.identify(url), url, token)
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server; errors as in `lodestream_client.sync`."""
+    """Delete a surface from its server; errors as in `lodestream_client.sync`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> description = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy", name="for a while"))
+    >>> asyncio.run(lodestream_client.delete(description.url))
+    """
     await _run(api.delete(url), url, token)
 
 
 async def fetch_range(
     url: str, offset: int, length: int, *, token: str | None = None, timeout: float = calls.TIMEOUT
 ) -> bytes:
-    """Fetch bytes of a surface's container over HTTP; see `lodestream_client.sync.fetch_range`."""
+    """Fetch bytes of a surface's container over HTTP; see `lodestream_client.sync.fetch_range`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> asyncio.run(lodestream_client.fetch_range(url, 1, 4))
+    b'LODE'
+    """
     return await _run(api.fetch_range(url, offset, length), url, token, timeout)
 
 

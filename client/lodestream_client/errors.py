@@ -15,8 +15,29 @@ __all__ = ["SilenceError", "UnreachableError"]
 
 
 class UnreachableError(LodestreamError, ConnectionError):
-    """There is no connection to the server, or it broke before the end."""
+    """There is no connection to the server, or it broke before the end.
+
+    Examples
+    --------
+    >>> from lodestream_client import UnreachableError, sync
+    >>> try:
+    ...     sync.list("http://127.0.0.1:9")
+    ... except UnreachableError:
+    ...     print("no connection")
+    no connection
+    """
 
 
 class SilenceError(LodestreamError, TimeoutError):
-    """The server sent nothing for longer than allowed."""
+    """The server sent nothing for longer than allowed.
+
+    Examples
+    --------
+    >>> from lodestream_client import SilenceError, sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> try:
+    ...     with sync.connect(url, silence=10, deadline=0) as stream:
+    ...         views = list(stream)
+    ... except SilenceError:
+    ...     print("ten seconds without a word")
+    """

@@ -100,6 +100,16 @@ def connect(url: str, **options: Unpack[ConnectKeywords]) -> Stream:
         If the server refuses, or is not a Lodestream server.
     TooLargeError
         If the surface needs more memory than allowed.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> with sync.connect(url, target=lodestream.Target(level=3)) as stream:
+    ...     *_, view = stream
+    >>> stream.ended, view.points_at(3).shape
+    ('level', (7, 6))
     """
     return Stream(url, ConnectOptions(**options))
 
@@ -167,6 +177,16 @@ def upload(
         and ``waiting`` or ``missing`` if the reason is on the server: it keeps the upload, see `retry`.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> import lodestream
+    >>> sync.upload("http://127.0.0.1:8000", "terrain.npy", name="hills").state
+    'ready'
+    >>> surface = lodestream.Surface([[1.0, 2.0], [3.0, 4.0]], metadata={"unit": "m"})
+    >>> sync.upload("http://127.0.0.1:8000", surface, precision=0.01).details["shape"]
+    [2, 2]
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
     parcel = prepared(sources, asked, progress)
@@ -201,6 +221,13 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
         If the server refuses, or the surface does not become ready: code ``failed``, ``waiting`` or ``missing``.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> sync.retry(url).state  # nothing to do: it is ready
+    'ready'
     """
     return _run(api.retry(url, wait, progress), url, token)
 
@@ -214,6 +241,13 @@ def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, .
         If the server refuses, or is not a Lodestream server.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> url in [description.url for description in sync.list("http://127.0.0.1:8000")]
+    True
     """
     return _run(api.list_surfaces(url), url, token)
 
@@ -227,6 +261,13 @@ def describe(url: str, *, token: str | None = None) -> Description:
         If there is no such surface, the server refuses, or is not a Lodestream server.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> sync.describe(url).details["shape"]
+    [97, 70]
     """
     return _run(api.describe(url), url, token)
 
@@ -244,6 +285,13 @@ def describe_file(url: str, *, token: str | None = None, max_vertices: int | Non
         If the file is not a container that can be read.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> sync.describe_file(f"{url}/container")["shape"]  # or of any web server
+    [97, 70]
     """
     return _run(api.describe_file(url, max_vertices), url, token)
 
@@ -257,6 +305,13 @@ def identify(url: str, *, token: str | None = None) -> Identity:
         If there is no such surface or file, or the server refuses; the code ``not-ready``: it cannot be streamed now.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> len(sync.identify(url).container)
+    64
     """
     return _run(api.identify(url), url, token)
 
@@ -270,6 +325,12 @@ def delete(url: str, *, token: str | None = None) -> None:
         If there is no such surface, or the server refuses.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy", name="for a while").url
+    >>> sync.delete(url)
     """
     _run(api.delete(url), url, token)
 
@@ -298,6 +359,13 @@ def fetch_range(
         If there are fewer bytes.
     UnreachableError
         If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> sync.fetch_range(url, 1, 4)
+    b'LODE'
     """
     return _run(api.fetch_range(url, offset, length), url, token, timeout)
 

@@ -49,43 +49,138 @@ __all__ = [
 
 
 class LodestreamError(Exception):
-    """Base class of all exceptions of Lodestream."""
+    """Base class of all exceptions of Lodestream.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> try:
+    ...     lodestream.decode(b"something else")
+    ... except lodestream.LodestreamError as error:
+    ...     print(type(error).__name__)
+    CorruptStreamError
+    """
 
 
 class InputError(LodestreamError, ValueError):
-    """The caller's input cannot be used."""
+    """The caller's input cannot be used.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> lodestream.encode([1.0, 2.0, 3.0])
+    Traceback (most recent call last):
+    lodestream.errors.InputError: expected an array of shape (H, W), (H, W, 2), (H, W, 3) ..., got shape (3,)
+    """
 
 
 class FormatError(InputError):
-    """A file is invalid, cut short, or not a structured surface."""
+    """A file is invalid, cut short, or not a structured surface.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> number = pathlib.Path("notes.tif").write_text("no raster")
+    >>> lodestream.read("notes.tif")
+    Traceback (most recent call last):
+    lodestream.errors.FormatError: notes.tif: expected a file of format npy, ..., got text that begins with 'no raster'
+    """
 
 
 class SwitchedOffError(FormatError):
-    """A file has a format that is switched off here; its contents were not looked at."""
+    """A file has a format that is switched off here; its contents were not looked at.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> lodestream.read("terrain.npy", allowed=["geotiff"])
+    Traceback (most recent call last):
+    lodestream.errors.SwitchedOffError: terrain.npy: ...
+    """
 
 
 class FormatWarning(UserWarning):
-    """Something was left out of a file or of a surface, or had to be assumed; the message says what."""
+    """Something was left out of a file or of a surface, or had to be assumed; the message says what.
+
+    Examples
+    --------
+    >>> import lodestream, warnings
+    >>> surface = lodestream.Surface([[1.0, 2.0], [3.0, 4.0]], metadata={"unit": "m"})
+    >>> with warnings.catch_warnings(record=True) as notes:
+    ...     warnings.simplefilter("always")
+    ...     lodestream.write(surface, "small.npy")
+    >>> print(notes[0].message)
+    NPY is written without unit, which it cannot hold
+    """
 
 
 class TooLargeError(InputError):
-    """More bytes or vertices than allowed."""
+    """More bytes or vertices than allowed.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> lodestream.decode(pathlib.Path("terrain.lode").read_bytes(), max_vertices=100)
+    Traceback (most recent call last):
+    lodestream.errors.TooLargeError: expected at most 100 vertices (max_vertices), got 6,790
+    """
 
 
 class OptionError(InputError):
-    """An option, level or format that does not exist, or a value that it does not take."""
+    """An option, level or format that does not exist, or a value that it does not take.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> lodestream.Target(order="size")
+    Traceback (most recent call last):
+    lodestream.errors.OptionError: expected order quality or level, got 'size'
+    """
 
 
 class UnavailableError(LodestreamError):
-    """Something that is needed is missing, whatever the input: a library is not installed, or a process was killed."""
+    """Something that is needed is missing, whatever the input: a library is not installed, or a process was killed.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> surface = lodestream.read("terrain.npy")
+    >>> try:
+    ...     mesh = surface.to_trimesh()
+    ... except lodestream.UnavailableError as error:
+    ...     print(error)  # names the extra to install
+    """
 
 
 class NotFoundError(LodestreamError, LookupError):
-    """There is no such surface."""
+    """There is no such surface.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> from lodestream_client import sync
+    >>> try:
+    ...     sync.describe("http://127.0.0.1:8000/v1/surfaces/00000000000000000000")
+    ... except lodestream.NotFoundError:
+    ...     print("no such surface")
+    no such surface
+    """
 
 
 class StreamError(LodestreamError):
-    """The bytes of a container cannot be used."""
+    """The bytes of a container cannot be used.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> decoder = lodestream.Decoder()
+    >>> try:
+    ...     views = decoder.feed(pathlib.Path("terrain.lode").read_bytes()[:3000] + bytes(1000))
+    ... except lodestream.StreamError:
+    ...     surface = decoder.surface()  # what came before the damage
+    >>> surface.shape
+    (97, 70)
+    """
 
 
 class CorruptStreamError(StreamError):
@@ -95,6 +190,15 @@ class CorruptStreamError(StreamError):
     ----------
     offset : int
         Offset in the container, in bytes, of the part that failed its check.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> try:
+    ...     lodestream.decode(b"something else")
+    ... except lodestream.CorruptStreamError as error:
+    ...     print(error.offset)
+    0
     """
 
     def __init__(self, message: str, offset: int) -> None:
@@ -103,15 +207,44 @@ class CorruptStreamError(StreamError):
 
 
 class TruncatedStreamError(StreamError):
-    """A container ends too early."""
+    """A container ends too early.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> try:
+    ...     lodestream.decode(pathlib.Path("terrain.lode").read_bytes()[:3000])
+    ... except lodestream.TruncatedStreamError:
+    ...     print("cut short")
+    cut short
+    """
 
 
 class UnsupportedVersionError(StreamError):
-    """A container or a peer has a version that this program does not support."""
+    """A container or a peer has a version that this program does not support.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> container = pathlib.Path("terrain.lode").read_bytes()
+    >>> lodestream.decode(container[:7] + bytes([9]) + container[8:])
+    Traceback (most recent call last):
+    lodestream.errors.UnsupportedVersionError: expected a container of version 1, the one this program reads, got ...
+    """
 
 
 class ProtocolError(LodestreamError):
-    """A message that the protocol does not allow."""
+    """A message that the protocol does not allow.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> from lodestream_client import sync
+    >>> try:
+    ...     found = sync.list("http://127.0.0.1:8000")
+    ... except lodestream.ProtocolError:
+    ...     print("not a server of Lodestream")
+    """
 
 
 class LocalProtocolError(ProtocolError):
@@ -129,6 +262,15 @@ class RemoteError(LodestreamError):
     ----------
     code : str
         Code from the table of error codes in ``docs/protocol.md``.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> from lodestream_client import sync
+    >>> try:
+    ...     description = sync.upload("http://127.0.0.1:8000", "terrain.npy")
+    ... except lodestream.RemoteError as error:
+    ...     print(error.code)  # waiting, busy, disk-full, ...
     """
 
     def __init__(self, code: str, message: str) -> None:

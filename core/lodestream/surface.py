@@ -49,6 +49,13 @@ class Block:
     InputError
         If an array has another shape or type, there are fewer than two points, no point is valid, or an attribute of
         integers is masked at a valid point.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> block = lodestream.Block([[1.0, 2.0], [3.0, float("nan")]], attributes={"kind": [[1, 2], [2, 1]]})
+    >>> block.shape, block.holes
+    ((2, 2), 1)
     """
 
     def __init__(
@@ -177,6 +184,17 @@ class Surface:
     ------
     InputError
         If the arrays are not valid, see `Block`, or the blocks differ in type, channels or attributes.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> heights = [[1.0, 2.0, 3.0], [3.0, 4.0, 6.0]]
+    >>> place = {"geotransform": [500000.0, 30.0, 0.0, 4200000.0, 0.0, -30.0], "unit": "m"}
+    >>> surface = lodestream.Surface(heights, metadata=place)
+    >>> surface.shape, surface.dtype
+    ((2, 3), dtype('float64'))
+    >>> surface.to_xarray().z.attrs["units"]
+    'm'
     """
 
     def __init__(

@@ -32,6 +32,12 @@ class Tolerance:
     """An error in the surface's unit, or relative to its extent.
 
     The extent is the range of the heights, or the diagonal of the bounding box of other points.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> lodestream.Tolerance.of("1e-3d").absolute(extent=2000.0)
+    2.0
     """
 
     value: float
@@ -110,6 +116,14 @@ class Target:
         Names of the attributes to include; None: all.
     first : ((int, int), (int, int)) or None
         The data that this region needs come first, then the rest; rows and columns as in `region`.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> print(lodestream.Target(until_rms=0.5).until_rms)
+    0.5
+    >>> lodestream.Target(region=((0, 40), (0, 40)), attributes=()).order
+    'quality'
     """
 
     level: int | None = None

@@ -60,6 +60,14 @@ What all commands have in common:
   was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `seconds` and `ended`: complete,
   level, rms, max, bytes, seconds, stopped or truncated.
 
+`pull --watch`:
+
+- OUT and the picture of `--picture` are replaced, never changed in place: whoever opens them finds a whole file. A line
+  on standard error says when OUT was, and with which error.
+- While they are written the next data arrive; what is written then is the newest state, and others are left out. The
+  last one is always written. Notes on what the format cannot hold come once, with it.
+- Name and position of the surface are in each of them, since its metadata are requested first.
+
 An interrupted `pull`:
 
 - If `pull` is interrupted, or the server does not come back, OUT is written from the data received so far. The exit

@@ -22,7 +22,7 @@ from lodestream.surface import Block, Surface
 #: What these files have that a surface, or a mesh that is written, has not.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:VIEWPOINT .* left out:lodestream.errors.FormatWarning"),
-    pytest.mark.filterwarnings("ignore:.* is written without scalars:lodestream.errors.FormatWarning"),
+    pytest.mark.filterwarnings("ignore:.* is written without single numbers.*:lodestream.errors.FormatWarning"),
 ]
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

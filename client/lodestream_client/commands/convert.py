@@ -14,18 +14,10 @@ from lodestream.quality import Quality
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import note, print_json
-from .arguments import (
-    Subparsers,
-    SurfaceOptions,
-    add_command,
-    add_json_option,
-    add_reading_options,
-    reading_options,
-    standard_input_once,
-    standard_output_once,
-)
+from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .encode import read_surface
 from .outcome import check_out, write_surface
+from .surface_options import SurfaceOptions, add_reading_options, reading_options
 
 if TYPE_CHECKING:
     from lodestream.surface import Surface

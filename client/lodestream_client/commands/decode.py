@@ -19,17 +19,10 @@ from lodestream.target import Target
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import note, progress_bar
-from .arguments import (
-    Subparsers,
-    add_command,
-    add_json_option,
-    add_size_option,
-    add_target_options,
-    standard_output_once,
-    target_of,
-)
+from .arguments import Subparsers, add_command, add_json_option, add_size_option, standard_output_once
 from .inputs import input_files, named
 from .outcome import Outcome, check_grid, check_out, note_unmet
+from .target_options import add_target_options, target_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -106,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
     outcome = Outcome(
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
+        job.read.total,
         job.read.total,
         view.level,
         view.rms,

@@ -15,17 +15,9 @@ from lodestream.errors import OptionError
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
-from .arguments import (
-    Subparsers,
-    SurfaceOptions,
-    add_command,
-    add_json_option,
-    add_surface_options,
-    standard_input_once,
-    standard_output_once,
-    surface_options,
-)
+from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .inputs import input_files
+from .surface_options import SurfaceOptions, add_surface_options, surface_options
 
 if TYPE_CHECKING:
     from lodestream.surface import Surface

@@ -79,10 +79,15 @@ def note_unmet(target: Target, ended: str, view: View, extent: float) -> None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A surface in the state in which receiving it ended, with the figures of that state."""
+    """A surface in the state in which receiving it ended, with the figures of that state.
+
+    `read` are the bytes of the container that were read or received, each counted once; `wire_bytes` all bytes, with
+    those of messages.
+    """
 
     surface: Surface
     bytes: int
+    read: int
     wire_bytes: int
     level: int
     rms: float
@@ -115,5 +120,6 @@ class Outcome:
         note(
             f"{self.ended}: level {self.level}, "
             f"RMS error {within}{self.rms:.6g}, maximum {within}{self.max_error:.6g}, "
-            f"{human_size(self.bytes)} of the surface ({human_size(self.wire_bytes)} read) in {self.seconds:.1f} s"
+            f"{human_size(self.bytes)} of the surface ({human_size(self.read)} of the container read) "
+            f"in {self.seconds:.1f} s"
         )

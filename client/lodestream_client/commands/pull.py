@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lodestream.errors import (
     CorruptStreamError,
@@ -16,27 +17,28 @@ from lodestream.errors import (
     TooLargeError,
     UnsupportedVersionError,
 )
+from lodestream.planning.byte_ranges import RangeSet
 from lodestream.target import Target
 
 from ..requests import addresses
 from ..terminal.interrupts import exit_code, interruptible
-from ..terminal.output import human_size, note, progress_bar
+from ..terminal.output import human_size, note
 from .arguments import (
     Subparsers,
     add_command,
     add_json_option,
     add_rate_option,
     add_size_option,
-    add_target_options,
     add_token_option,
-    parse_seconds,
-    parse_source,
     standard_output_once,
-    target_of,
     token_of,
 )
 from .keeping import Kept
 from .outcome import Outcome, check_grid, check_out, note_unmet
+from .receiving import Metadata, Progress
+from .target_options import add_target_options, target_of
+from .values import parse_seconds, parse_source
+from .watching import Watch, check_picture, check_watched
 
 if TYPE_CHECKING:
     from ..stream.reconnecting import Transport
@@ -46,9 +48,6 @@ __all__ = ["PullOptions", "register", "run"]
 
 # Seconds without a word after which a connection counts as lost.
 _SILENCE = 30.0
-
-# Seconds for what is fetched after an interruption: somebody waits for the end, or the server is gone.
-_HURRY = 3.0
 
 
 def register(subparsers: Subparsers) -> None:
@@ -60,7 +59,8 @@ def register(subparsers: Subparsers) -> None:
         "stream a surface from a server into a file, completely or up to a limit",
         "The suffix of OUT decides its format. Standard output is NPY. If the connection breaks, pull reconnects\n"
         "and continues where it was. After Ctrl-C, or if the server does not come back, OUT is written from the\n"
-        "data received so far, which are also kept for --resume.",
+        "data received so far, which are also kept for --resume. With --watch OUT is there after a few kilobytes, and\n"
+        "is replaced as it improves, for a program that reads it again.",
     )
     parser.add_argument(
         "url", type=parse_source, metavar="URL", help="URL of the surface, or of a container on any web server"
@@ -69,6 +69,18 @@ def register(subparsers: Subparsers) -> None:
     add_target_options(parser)
     add_rate_option(parser)
     add_size_option(parser)
+    parser.add_argument(
+        "--watch",
+        action="store_true",
+        help="write OUT, and draw P.png, with the first data, and replace them as the surface improves, as often as "
+        "they can be written while it arrives",
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="P.png",
+        help="draw into a picture too, as view --png does",
+    )
     parser.add_argument(
         "--resume",
         action="store_true",
@@ -110,7 +122,9 @@ class PullOptions:
     limit_rate : float or None
         Bytes per second.
     max_vertices : int or None
-    resume, json : bool
+    resume, json, watch : bool
+    picture : Path or None
+        Picture to draw beside OUT.
     """
 
     url: str
@@ -123,6 +137,8 @@ class PullOptions:
     max_vertices: int | None
     resume: bool
     json: bool
+    watch: bool
+    picture: Path | None
 
     @property
     def name(self) -> str:
@@ -141,6 +157,12 @@ def _options(args: argparse.Namespace) -> PullOptions:
     if args.transport == "ws" and not addresses.is_surface(args.url):
         args.parser.error("argument --transport: the URL of a file has no WebSocket")
     standard_output_once(args, "surface")
+    if args.watch and args.out == "-":
+        args.parser.error("argument --watch: standard output cannot be written again")
+    if args.picture is not None and args.picture.suffix.lower() != ".png":
+        args.parser.error(f"argument --picture: expected P.png, got {args.picture}")
+    if args.picture is not None and args.picture == Path(args.out):
+        args.parser.error("argument --picture: expected another name than OUT")
     return PullOptions(
         args.url,
         args.out,
@@ -152,6 +174,8 @@ def _options(args: argparse.Namespace) -> PullOptions:
         args.max_vertices,
         args.resume,
         args.json,
+        args.watch,
+        args.picture,
     )
 
 
@@ -159,6 +183,10 @@ def run(args: argparse.Namespace) -> int:
     """Stream, write, report; of what came before an interruption too."""
     options = _options(args)
     check_out(options.out)
+    if options.watch:
+        check_watched(options.out)
+    if options.picture is not None:
+        check_picture(options.picture)
     with interruptible(), Kept(options.resume) as kept:
         return _pull(options, kept)
 
@@ -186,7 +214,8 @@ def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterru
     started = time.monotonic()
     if options.resume:
         kept.use(sync.identify(options.url, token=options.token))
-    stream, broke = _receive(options, kept)
+    arrived = RangeSet()
+    stream, metadata, broke = _receive(options, kept, arrived)
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
@@ -194,13 +223,20 @@ def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterru
             raise broke
         note(_words(broke))
         kept.failed(broke)
-    outcome = _outcome(options, kept, stream, started, hurried=broke is not None)
+    outcome = _outcome(options, stream, metadata, arrived, started)
     outcome.write(options.out)
+    header = stream.decoder.header
+    if options.picture is not None and header is not None:
+        Watch(options.out, options.picture, options.target, metadata, options.url).draw(
+            stream.decoder.view(), header.layout
+        )
     return outcome, broke
 
 
-def _receive(options: PullOptions, kept: Kept) -> tuple[Stream, KeyboardInterrupt | LodestreamError | None]:
-    """The stream at its end, and what ended it before it had all that was asked for.
+def _receive(
+    options: PullOptions, kept: Kept, arrived: RangeSet
+) -> tuple[Stream, Metadata, KeyboardInterrupt | LodestreamError | None]:
+    """The stream at its end, its metadata, and what ended it before it had all that was asked for.
 
     Raises
     ------
@@ -209,9 +245,14 @@ def _receive(options: PullOptions, kept: Kept) -> tuple[Stream, KeyboardInterrup
     """
     from .. import sync
 
+    def take(offset: int, data: bytes) -> None:
+        arrived.add(offset, len(data))
+        if not options.resume:  # else the stream writes into the store itself
+            kept.write(offset, data)
+
     broke: KeyboardInterrupt | LodestreamError | None = None
     identity = kept.identity
-    with _Progress(options.target) as bar:
+    with Progress(options.target) as bar:
         stream = sync.connect(
             options.url,
             target=options.target,
@@ -224,85 +265,51 @@ def _receive(options: PullOptions, kept: Kept) -> tuple[Stream, KeyboardInterrup
             container=identity.container if identity is not None else None,
             size=identity.size if identity is not None else None,
             progress=bar.received,
-            sink=None if options.resume else kept.write,
+            sink=take,
             max_vertices=options.max_vertices,
         )
         kept.follow(stream)
+        metadata = Metadata(stream, kept, options.token, arrived)
+        watch = Watch(options.out, options.picture, options.target, metadata, options.url) if options.watch else None
         try:
             with stream:
-                for number, view in enumerate(stream):
-                    if number == 0 and stream.decoder.header is not None:
-                        check_grid(options.out, stream.decoder.header)
+                for number, view in enumerate(stream.latest() if watch is not None else stream):
+                    header = stream.decoder.header
+                    if number == 0 and header is not None:
+                        check_grid(options.out, header)
                     bar.figures = f"{human_size(view.bytes)}, level {view.level}, RMS error {view.rms:.4g}"
+                    if watch is not None and header is not None and not view.complete:
+                        watch.write(view, header.layout)
         except (FormatError, CorruptStreamError, TooLargeError, UnsupportedVersionError):
             raise
         except (KeyboardInterrupt, LodestreamError) as error:
             broke = error
-    return stream, broke
+            metadata.hurried = True
+    return stream, metadata, broke
 
 
-def _outcome(options: PullOptions, kept: Kept, stream: Stream, started: float, *, hurried: bool) -> Outcome:
+def _outcome(options: PullOptions, stream: Stream, metadata: Metadata, arrived: RangeSet, started: float) -> Outcome:
     seconds = time.monotonic() - started
     decoder, target = stream.decoder, options.target
-    wire_bytes = stream.wire_bytes
-    metadata = decoder.metadata
-    if metadata is None:
-        metadata, more = _metadata(stream, kept, options.token, hurried=hurried)
-        wire_bytes += more
+    values = metadata()
     view = decoder.view()
     header, ended = decoder.header, stream.ended
     assert header is not None, "there is a view, so there is a header"
     assert ended is not None, "the iteration has ended"
     note_unmet(target, ended, view, header.extent)
-    surface = view.surface(target.level, metadata)
-    return Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, view.bound, seconds, ended)
+    return Outcome(
+        view.surface(target.level, values),
+        view.bytes,
+        arrived.total,
+        stream.wire_bytes + metadata.bytes,
+        view.level,
+        view.rms,
+        view.max_error,
+        view.bound,
+        seconds,
+        ended,
+    )
 
 
 def _words(error: BaseException) -> str:
     return " ".join(str(error).split()) or "interrupted"
-
-
-class _Progress:
-    """A bar that is moved with every message, and knows how long is left."""
-
-    def __init__(self, target: Target) -> None:
-        self.figures = ""
-        self._bar = progress_bar()
-        self._seconds = target.seconds
-
-    def __enter__(self) -> _Progress:
-        self._shown = self._bar.__enter__()
-        self._started = time.monotonic()
-        self._task = self._shown.add_task("pulling", total=None, figures="", limit=self._seconds)
-        return self
-
-    def __exit__(self, *raised: Any) -> None:
-        self._bar.__exit__(*raised)
-
-    def received(self, received: int, planned: int | None) -> None:
-        """So much of so much has come."""
-        self._shown.update(self._task, total=planned, completed=received, figures=self.figures)
-
-
-def _metadata(stream: Stream, kept: Kept, token: str | None, *, hurried: bool) -> tuple[dict[str, Any], int]:
-    # A stop of our own takes effect at once, so the stream has not brought the metadata, which stand at the end.
-    from lodestream.container import ByteRange, read_metadata
-
-    from .. import sync
-    from ..requests.calls import TIMEOUT
-
-    place = stream.metadata_place
-    if place is None:  # over HTTP layers may come before it is known
-        note("written without metadata such as name and position, which have not arrived")
-        return {}, 0
-    if (data := kept.read(*place)) is not None:
-        return read_metadata(data, ByteRange(*place)), 0
-    try:
-        data = sync.fetch_range(stream.url, *place, token=token, timeout=_HURRY if hurried else TIMEOUT)
-    except LodestreamError as error:
-        if isinstance(error, NotFoundError) and not hurried:
-            raise
-        note(f"written without metadata such as name and position, which could not be fetched: {error}")
-        return {}, 0
-    kept.write(place[0], data)
-    return read_metadata(data, ByteRange(*place)), len(data)

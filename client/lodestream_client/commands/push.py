@@ -12,19 +12,10 @@ from lodestream.errors import LodestreamError
 
 from ..errors import UnreachableError
 from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
-from .arguments import (
-    Subparsers,
-    SurfaceOptions,
-    add_command,
-    add_json_option,
-    add_surface_options,
-    add_token_option,
-    parse_server,
-    standard_input_once,
-    surface_options,
-    token_of,
-)
+from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
 from .inputs import input_files
+from .surface_options import SurfaceOptions, add_surface_options, surface_options
+from .values import parse_server
 
 if TYPE_CHECKING:
     from ..requests.api import Description

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ..terminal.output import note_details, print_json, progress_bar, say
-from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_surface, token_of
+from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
+from .values import parse_surface
 
 __all__ = ["register", "run"]
 

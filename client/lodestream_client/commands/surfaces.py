@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..terminal.output import cell, console, human_size, note, print_json
-from .arguments import Subparsers, add_command, add_json_option, add_token_option, parse_server, parse_surface, token_of
+from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
+from .values import parse_server, parse_surface
 
 if TYPE_CHECKING:
     from ..requests.api import Description

@@ -19,21 +19,11 @@ from lodestream.quality import Quality
 from ..requests.addresses import is_url
 from ..terminal.interrupts import Terminated, interruptible
 from ..terminal.output import note, progress_bar, require_folder, say
-from .arguments import (
-    Subparsers,
-    SurfaceOptions,
-    add_command,
-    add_size_option,
-    add_surface_options,
-    add_token_option,
-    parse_pictures,
-    parse_port,
-    standard_input_once,
-    surface_options,
-    token_of,
-)
+from .arguments import Subparsers, add_command, add_size_option, add_token_option, standard_input_once, token_of
 from .encode import read_surface
 from .inputs import input_files
+from .surface_options import SurfaceOptions, add_surface_options, surface_options
+from .values import parse_pictures, parse_port
 
 if TYPE_CHECKING:
     from lodestream.surface import Surface

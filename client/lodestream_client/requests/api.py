@@ -72,6 +72,14 @@ class Identity:
         SHA-256 of the container, if the server gives it.
     size : int or None
         Bytes of the container.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> identity = sync.identify(url)
+    >>> identity.name == identity.container, identity.size > 6000
+    (True, True)
     """
 
     name: str | None
@@ -95,6 +103,13 @@ class Description:
         `retry`.
     details : mapping
         The complete description, by the server's keys: build progress, or what ``info --json`` prints.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> description = sync.upload("http://127.0.0.1:8000", "terrain.npy")
+    >>> description.ready, description.details["shape"]
+    (True, [97, 70])
     """
 
     url: str

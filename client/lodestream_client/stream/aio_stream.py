@@ -26,6 +26,19 @@ class Stream(BaseStream):
 
     It is an asynchronous context manager, made by `connect`. Entering it opens the connection; leaving it stops the
     stream. An iteration that is cancelled, for example by a timeout, may be continued.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> async def receive():
+    ...     async with lodestream_client.connect(url, limit_rate=4000) as stream:  # bytes a second
+    ...         async for view in stream:
+    ...             if view.rms < 5:
+    ...                 await stream.stop()
+    ...     return stream.ended, view.points.shape
+    >>> asyncio.run(receive())
+    ('stopped', (97, 70))
     """
 
     def __init__(self, url: str, options: ConnectOptions) -> None:

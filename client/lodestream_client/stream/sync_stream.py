@@ -29,6 +29,17 @@ class Stream(BaseStream):
     If the iteration raises an error, for example because the server is gone, the stream ends but keeps what it has:
     earlier views stay usable, `decoder` has all received data (``decoder.view()`` is the last complete layer), and
     `ended` is truncated.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> with sync.connect(url, limit_rate=4000) as stream:  # bytes a second
+    ...     for view in stream:
+    ...         if view.rms < 5:
+    ...             stream.stop()
+    >>> stream.ended, view.points.shape
+    ('stopped', (97, 70))
     """
 
     def __init__(self, url: str, options: ConnectOptions) -> None:

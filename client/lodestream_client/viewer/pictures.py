@@ -13,6 +13,7 @@ from lodestream.errors import UnavailableError
 from lodestream.interop.pictures import DPI, draw_surface
 from lodestream.planning.planner import plan
 from lodestream.target import Target
+from lodestream.text import printable
 
 from ..terminal.output import human_size, replacing
 from .sources import Source, read_fully
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
 
-__all__ = ["draw", "least_size", "view_after"]
+__all__ = ["draw", "least_size", "require_matplotlib", "view_after"]
 
 _PIXELS = 1000  # along the longer side of a height field
+_LONGEST = 100  # characters of a name
 
 
 def view_after(source: Source, most: int | None, max_vertices: int | None = None) -> tuple[View, Layout]:
@@ -65,14 +67,28 @@ def least_size(source: Source, max_vertices: int | None = None) -> int:
     return index.layers[0].end
 
 
-def draw(view: View, layout: Layout, name: str, path: Path) -> None:
+def require_matplotlib() -> None:
+    """Check early that pictures can be drawn.
+
+    Raises
+    ------
+    UnavailableError
+        If matplotlib is not installed.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise UnavailableError("pictures need matplotlib: pip install 'lodestream[plot]'") from None
+
+
+def draw(view: View, layout: Layout | None, name: str, path: Path) -> None:
     """Write a picture of a view, with its bytes and its errors above it.
 
     Parameters
     ----------
     view : View
-    layout : Layout
-        Of the surface.
+    layout : Layout or None
+        Of the surface: a level with enough nodes for the picture is drawn. None: the finest, as a window needs.
     name : str
         Of the surface.
     path : Path
@@ -83,16 +99,17 @@ def draw(view: View, layout: Layout, name: str, path: Path) -> None:
     UnavailableError
         If matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UnavailableError("pictures need matplotlib: pip install 'lodestream[plot]'") from None
+    require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(layout="constrained", dpi=DPI)
     FigureCanvasAgg(figure)
-    draw_surface(figure, view.surface(_level(layout)), _PIXELS)
+    draw_surface(figure, view.surface(None if layout is None else _level(layout)), _PIXELS)
     exact = "exact" if view.complete and view.rms == 0 else f"RMS error {view.rms:.3g}, maximum {view.max_error:.3g}"
-    figure.suptitle(f"{name}\n{human_size(view.bytes)}, {exact}", fontsize=11)
+    title = printable(" ".join(name.split()))[:_LONGEST]
+    # What a file or a server calls itself is no formula.
+    figure.suptitle(f"{title}\n{human_size(view.bytes)}, {exact}", fontsize=11, parse_math=False)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png")
 

@@ -59,6 +59,18 @@ class Decoder:
     TooLargeError
         From methods that take bytes: if the header announces a surface that needs more memory than allowed, or if there
         are more bytes than such a surface can have.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> decoder = lodestream.Decoder()
+    >>> with open("terrain.lode", "rb") as file:
+    ...     while data := file.read(1000):
+    ...         for view in decoder.feed(data):
+    ...             pass  # draw view.points
+    >>> decoder.finish()
+    >>> view.complete, view.rms
+    (True, 0.0)
     """
 
     def __init__(
@@ -436,6 +448,12 @@ def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | Non
         If the container is cut short; use `Decoder` for a prefix.
     TooLargeError
         If it needs more memory than allowed.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> lodestream.decode(pathlib.Path("terrain.lode").read_bytes())
+    Surface(Block(97 x 70 float32, closed=(False, False)))
     """
     decoder = Decoder(max_vertices=max_vertices)
     decoder.feed(container)

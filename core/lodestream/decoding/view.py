@@ -43,6 +43,16 @@ class View:
         container tells errors of the whole surface, and bounds of those of its parts. Else they were measured.
     complete : bool
         Whether this is the last state.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> decoder = lodestream.Decoder()
+    >>> view = decoder.feed(pathlib.Path("terrain.lode").read_bytes()[:2000])[-1]
+    >>> view.complete, view.points.shape, view.points_at(2).shape
+    (False, (97, 70), (4, 4))
+    >>> view.rms <= view.max_error
+    True
     """
 
     number: int

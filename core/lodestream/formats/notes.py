@@ -65,7 +65,7 @@ def keep_words(words: dict[str, str], key: str, text: str) -> None:
 
 
 def metadata_left_out(surface: Surface, held: Collection[str]) -> list[str]:
-    """The keys of metadata that a user would miss in a file that holds but some of them.
+    """What of the metadata, in words, a user would miss in a file that holds but some of them.
 
     Parameters
     ----------
@@ -82,7 +82,9 @@ def metadata_left_out(surface: Surface, held: Collection[str]) -> list[str]:
             continue
         if key == "faces" and not any(part in it for it in _maps(value) for part in _CUT):
             continue
-        names.append(str(key))
+        # An attribute of a VTK file is often called scalars too, and that one is kept.
+        single = key == "scalars" and isinstance(value, dict)
+        names.append(f"single numbers (scalars: {listing(value)})" if single else str(key))
     return names
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
@@ -52,7 +53,8 @@ def read(source: Source) -> Surface:
 
     Those are vectors or arrays under the usual names, or under those that options give; or the numbers dx, dy, xmin,
     xmax, ymin, ymax, where row 0 lies at ymin. All single numbers are kept in the metadata as ``scalars``, ``crs`` and
-    ``unit`` by their names. A bool array ``mask`` of the same rows and columns is False in holes.
+    ``unit`` by their names. A bool array ``mask`` of the same rows and columns is False in holes. Beside an array
+    ``heights`` or ``points``, as `write` names it, other arrays of these rows and columns are attributes.
 
     Raises
     ------
@@ -77,16 +79,20 @@ def read(source: Source) -> Surface:
         taken = {name, *scalars, *words, *[MASK] * (mask is not None)}
         if axes[0] is not None and axes[1] is not None:
             taken |= {str(contents.coordinate_name(letter, header.shape[:2], name)) for letter in "xy"}
+        attributes = contents.attributes(name, taken)
+        taken |= {*attributes}
         if left_out := [other for other in contents.headers if other not in taken]:
             warn(f"left out arrays of the archive: {listing(left_out)}")
     if axes[0] is not None and axes[1] is not None:
         if values.ndim != 2:
             raise FormatError(f"expected heights of shape (H, W) for coordinates beside them, got shape {values.shape}")
-        return place(values, axes[0], axes[1], closed=source.closed, mask=mask, metadata=metadata)
+        return place(
+            values, axes[0], axes[1], closed=source.closed, mask=mask, attributes=attributes, metadata=metadata
+        )
     transform = _bounds(metadata.get("scalars", {}), header.shape)
     if transform is not None:
         metadata["geotransform"] = transform
-    return Surface(values, mask=mask, metadata=metadata)
+    return Surface(values, mask=mask, attributes=attributes, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,22 @@ class _Contents:
         if header is None or header.dtype.kind != "b" or header.shape != shape:
             return None
         return np.asarray(self.values(MASK))
+
+    def attributes(self, surface: str, taken: Collection[str]) -> dict[str, NDArray[Any]]:
+        """The other arrays (H, W) or (H, W, K) beside a surface that has the name that our writer gives it."""
+        if surface not in (HEIGHTS, POINTS):
+            return {}
+        shape = self.headers[surface].shape[:2]
+        found = {
+            name: header
+            for name, header in self.headers.items()
+            if name not in taken and header.shape[:2] == shape and refuse_array(header.shape, header.dtype) is None
+        }
+        channels = sum(prod(header.shape[2:]) for header in found.values())
+        if channels:
+            self.source.check_array((*shape, max(channels, 2)), np.dtype(np.float64))  # of all together
+            self.source.check_expansion(sum(header.nbytes for header in found.values()))
+        return {name: self.values(name) for name in found}
 
     def words(self) -> dict[str, str]:
         """The texts that `WORDS` names."""

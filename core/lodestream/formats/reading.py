@@ -114,6 +114,13 @@ def read(
         If the values cannot be a surface because none is valid.
     OSError
         If the file cannot be opened.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> surface = lodestream.read("terrain.npy")
+    >>> surface.shape, surface.metadata["format"]
+    ((97, 70), 'npy')
     """
     path = Path(path)
     label = filename or os.fspath(path)

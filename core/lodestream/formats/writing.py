@@ -75,6 +75,14 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
         If no format that can be written has this suffix; the message names those that exist.
     FormatError
         If the format cannot hold this surface.
+
+    Examples
+    --------
+    >>> import lodestream
+    >>> surface = lodestream.read("terrain.npy")
+    >>> lodestream.write(surface, "terrain.vts")
+    >>> lodestream.read("terrain.vts").shape
+    (97, 70)
     """
     path, format_ = Path(path), for_writing(path)
     if path.exists() and not path.is_file():

@@ -28,6 +28,14 @@ class Selection:
         A window of the points: rows and columns, half-open, in full-resolution indices. None: all.
     attributes : tuple of str or None
         Names of attributes. None: all.
+
+    Examples
+    --------
+    >>> import lodestream, pathlib
+    >>> decoder = lodestream.Decoder(lodestream.Selection(region=((10, 50), (20, 60))))
+    >>> views = decoder.feed(pathlib.Path("terrain.lode").read_bytes())
+    >>> decoder.surface().shape
+    (40, 40)
     """
 
     region: Region | None = None

@@ -63,6 +63,12 @@ def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArra
     """All levels of a surface, shape (H, W) or (H, W, C), from the coarsest to the input itself (as float64).
 
     See `coarsen`.
+
+    Examples
+    --------
+    >>> import lodestream, numpy
+    >>> [level.shape for level in lodestream.hierarchy(numpy.zeros((9, 17)))]
+    [(2, 2), (2, 3), (3, 5), (5, 9), (9, 17)]
     """
     levels = [_as_floats(points)]
     while (coarser := _coarsen(levels[-1], closed)).shape != levels[-1].shape:

@@ -5,6 +5,12 @@ the one whose bilinear refinement is nearest to it in mean square. Its normal eq
 with the matrix A_p = tridiag(1, 6, 1) and corners 5. Errata, proofs, and what this module adds (closed axes, every
 length) are in ``docs/mathematics.md``. `lodestream.transform.least_squares` computes the same hierarchy as a filter;
 the two are independent of each other, and the tests hold both against dense least squares.
+
+Examples
+--------
+>>> from lodestream import paper
+>>> paper.solve([6.0, 8.0, 8.0, 6.0]).round(3).tolist()
+[1.0, 1.0, 1.0, 1.0]
 """
 
 from __future__ import annotations

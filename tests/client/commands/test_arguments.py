@@ -5,7 +5,7 @@ import argparse
 import pytest
 
 from lodestream.errors import OptionError
-from lodestream_client.commands import arguments
+from lodestream_client.commands import values
 from lodestream_client.requests import addresses
 from lodestream_client.stream import pacing
 from lodestream_client.terminal import output
@@ -16,24 +16,24 @@ from lodestream_client.terminal import output
     [("64kbit", 8000), ("1mbit", 125_000), ("1Mbit/s", 125_000), ("200kB", 200_000), ("1.5 KiB", 1536), ("8bit", 1)],
 )
 def test_rates_carry_units(text: str, bytes_per_second: float) -> None:
-    assert arguments.parse_rate(text) == bytes_per_second
+    assert values.parse_rate(text) == bytes_per_second
 
 
 @pytest.mark.parametrize("text", ["64", "64k", "kbit", "0kbit", "-1kbit", "1lightyear", "", "1e999kbit"])
 def test_other_rates_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected a rate such as"):
-        arguments.parse_rate(text)
+        values.parse_rate(text)
 
 
 @pytest.mark.parametrize(("text", "size"), [("1", 1), ("20000", 20_000), ("20kB", 20_000), ("1MiB", 1 << 20)])
 def test_sizes(text: str, size: int) -> None:
-    assert arguments.parse_size(text) == size
+    assert values.parse_size(text) == size
 
 
 @pytest.mark.parametrize("text", ["0", "-5", "many", "10 parsecs", "inf"])
 def test_other_sizes_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected"):
-        arguments.parse_size(text)
+        values.parse_size(text)
 
 
 @pytest.mark.parametrize("url", ["http://host:8000", "http://host:8000/", "HTTP://host:8000/v1/surfaces/"])

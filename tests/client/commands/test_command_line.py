@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -283,6 +284,21 @@ def test_bytes_that_are_read_twice_count_once(run: Run, container_file: Path, tm
         assert code == 0
         assert 0 < json.loads(stdout)["wire_bytes"] <= size
     assert run("decode", container_file, tmp_path / "a.npy")[2].count("read)") == 1
+
+
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_people_are_told_the_bytes_of_the_container_not_those_of_messages(
+    run: Run, surface: str, container_file: Path, tmp_path: Path, transport: str
+) -> None:
+    size = container_file.stat().st_size / 1000
+    for options in ((), ("--resume",), ("--watch",)):
+        code, _, stderr = run("pull", surface, tmp_path / "a.npy", "--transport", transport, *options)
+        assert code == 0
+        found = re.search(
+            r"([\d.]+) kB of the surface \(([\d.]+) kB of the container read\) in ", stderr.splitlines()[-1]
+        )
+        assert found is not None
+        assert float(found[1]) <= float(found[2]) <= size + 0.05
 
 
 def test_the_last_row_of_layers_is_the_exact_surface(run: Run, container_file: Path, tmp_path: Path) -> None:

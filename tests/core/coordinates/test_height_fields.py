@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -34,7 +35,7 @@ AXES: dict[str, Callable[[int], Array]] = {
     "decimals": lambda n: np.array([float(f"{234.0167 + 0.0333 * k:.4f}") for k in range(n)]),
     "parts of a degree": lambda n: (-21600 + np.arange(n)) / 120,
     "float32 of metres": lambda n: (431712.3 + 1.7 * np.arange(n)).astype(np.float32),
-    "float32 of anything": lambda n: (np.pi + np.e / 7 * np.arange(n)).astype(np.float32),
+    "float32 of anything": lambda n: (math.pi + math.e / 7 * np.arange(n)).astype(np.float32),
     "one half": lambda n: np.arange(n) + 0.5,
 }
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.errors import FormatError, FormatWarning, InputError
+from lodestream.errors import FormatError, FormatWarning, InputError, TooLargeError
 from lodestream.surface import Block, Surface
 
 rasterio = pytest.importorskip("rasterio")
@@ -134,7 +134,6 @@ def test_what_an_ascii_grid_cannot_say_is_said(tmp_path: Path, transform: list[f
         )
 
 
-@pytest.mark.filterwarnings("ignore::lodestream.errors.FormatWarning")  # of what the reader leaves out
 def test_numpy_reads_each_array_of_an_npz(tmp_path: Path) -> None:
     surface = with_hole(np.float32, unit="m", crs=utm())
     surface.blocks[0].attributes.update({"flow": np.ones((6, 9, 2)), "x": hills(), "../up": hills()})
@@ -149,6 +148,25 @@ def test_numpy_reads_each_array_of_an_npz(tmp_path: Path) -> None:
     back = formats.read(tmp_path / "a.npz")
     same(back, surface)
     assert {key: back.metadata[key] for key in ("unit", "crs")} == {"unit": "m", "crs": utm()}
+    assert set(back.attributes) == {"flow", "x_", "__up"}
+    np.testing.assert_array_equal(back.attributes["flow"], np.ones((6, 9, 2)))
+
+
+def test_arrays_beside_ours_are_attributes_and_beside_others_are_not(tmp_path: Path) -> None:
+    arrays: dict[str, Any] = {"slope": hills(), "kind": np.ones((6, 9), "u1"), "other": np.ones((9, 6))}
+    np.savez(tmp_path / "ours.npz", heights=hills(), **arrays)
+    with pytest.warns(FormatWarning, match="left out arrays of the archive: other"):
+        assert set(formats.read(tmp_path / "ours.npz").attributes) == {"slope", "kind"}
+    np.savez(tmp_path / "theirs.npz", z=hills(), **arrays)
+    with pytest.warns(FormatWarning, match="left out arrays of the archive: slope, kind, other"):
+        assert formats.read(tmp_path / "theirs.npz", array="z").attributes == {}
+
+
+def test_attributes_of_an_npz_together_are_limited(tmp_path: Path) -> None:
+    arrays: dict[str, Any] = {f"a{number}": np.zeros((6, 9, 1000), "u1") for number in range(70)}
+    np.savez_compressed(tmp_path / "a.npz", heights=hills(), **arrays)
+    with pytest.raises(TooLargeError, match="values for each vertex"):
+        formats.read(tmp_path / "a.npz", max_vertices=54)
 
 
 @pytest.mark.parametrize("channels", [2, 3, 4])
@@ -249,3 +267,10 @@ def test_nodata_that_is_no_number_is_passed_over(tmp_path: Path, kind: str, noda
     with (tmp_path / "a").open("wb") as file:
         formats.write_stream(surface, kind, file)
     same(formats.read(tmp_path / "a"), surface)
+
+
+def test_single_numbers_that_are_left_out_are_not_taken_for_an_attribute(tmp_path: Path) -> None:
+    surface = Surface(hills(), attributes={"scalars": hills()}, metadata={"scalars": {"mach": 0.5, "alpha": 2.0}})
+    with pytest.warns(FormatWarning, match="without single numbers .scalars: mach, alpha., which"):
+        formats.write(surface, tmp_path / "a.npz")
+    assert set(formats.read(tmp_path / "a.npz").attributes) == {"scalars"}

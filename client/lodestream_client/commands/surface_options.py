@@ -1,0 +1,135 @@
+"""Options that decide how files become a surface."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lodestream.errors import OptionError
+from lodestream.quality import Quality
+
+from .values import parse_pair, parse_precision, parse_tolerance
+
+if TYPE_CHECKING:
+    from ..requests.memory import Closure
+
+__all__ = [
+    "SurfaceOptions",
+    "add_reading_options",
+    "add_surface_options",
+    "quality_of",
+    "reading_options",
+    "surface_options",
+]
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How files become a surface, as the command line says.
+
+    Attributes
+    ----------
+    quality : Quality
+    closed : "auto", "none", "rows", "cols" or "both"
+    name : str or None
+        Name of the surface.
+    format_options : mapping of str to str
+        The ``-o`` options.
+    format_name : str or None
+        The format that the file must have.
+    """
+
+    quality: Quality
+    closed: Closure
+    name: str | None
+    format_options: Mapping[str, str]
+    format_name: str | None = None
+
+
+def add_surface_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that decide how a file becomes a surface."""
+    group = parser.add_argument_group("surface options")
+    group.add_argument(
+        "--precision",
+        dest="precisions",
+        action="append",
+        default=[],
+        type=parse_precision,
+        metavar="[NAME=]P",
+        help="maximum error of the complete surface: a number in the surface's unit, or 1e-3d for 1e-3 times its "
+        "extent; NAME=P sets it for an attribute, a coordinate (z) or a component (wind_0); may be repeated "
+        "(default: lossless)",
+    )
+    group.add_argument(
+        "--rms",
+        type=parse_tolerance,
+        metavar="R",
+        help="encode for one root mean square error: a container as small as possible whose complete surface has an "
+        "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
+        "with a --precision of the points",
+    )
+    add_reading_options(group)
+
+
+def add_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that decide how a file is read, whatever becomes of it."""
+    group.add_argument(
+        "--closed",
+        choices=("auto", "none", "rows", "cols", "both"),
+        default="auto",
+        help="closed axes of the grid; rows: the last row is connected to the first, as on a cylinder (default: auto, "
+        "the file decides)",
+    )
+    group.add_argument("--name", metavar="N", help="name of the surface")
+    group.add_argument(
+        "--format",
+        dest="format_name",
+        metavar="F",
+        help="format of the file, as its name would say it, such as hgt or geotiff; standard input needs it where the "
+        "content does not tell (default: the content decides)",
+    )
+    group.add_argument(
+        "-o",
+        dest="options",
+        action="append",
+        default=[],
+        type=parse_pair,
+        metavar="KEY=VALUE",
+        help="option of the file's format, see lodestream formats; may be repeated",
+    )
+
+
+def surface_options(args: argparse.Namespace) -> SurfaceOptions:
+    """The options that `add_surface_options` adds.
+
+    Ends the program if they are wrong, for example if a key is given twice.
+    """
+    return reading_options(args, quality_of(args))
+
+
+def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
+    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice."""
+    return SurfaceOptions(quality, args.closed, args.name, _format_options(args), args.format_name)
+
+
+def _format_options(args: argparse.Namespace) -> dict[str, str]:
+    options: dict[str, str] = {}
+    for key, value in args.options:
+        if key in options:
+            args.parser.error(f"argument -o: {key} given twice")
+        options[key] = value
+    return options
+
+
+def quality_of(args: argparse.Namespace) -> Quality:
+    """The quality that ``--precision`` and ``--rms`` ask for.
+
+    Ends the program if a precision is given twice, or one of the points together with ``--rms``.
+    """
+    try:
+        return Quality.parse(args.precisions, None if args.rms is None else str(args.rms))
+    except OptionError as error:
+        args.parser.error(f"argument --precision: {error}")
+        raise  # not reached: the parser has ended the program

@@ -1,0 +1,106 @@
+"""What ``pull --watch`` writes and draws before the end: the surface as far as it has come."""
+
+from __future__ import annotations
+
+import stat
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lodestream.errors import FormatWarning, InputError
+
+from ..terminal.output import human_size, note, require_folder
+from .outcome import write_surface
+
+if TYPE_CHECKING:
+    from lodestream.decoding.view import View
+    from lodestream.grid.layout import Layout
+    from lodestream.target import Target
+
+__all__ = ["Watch", "check_picture", "check_watched"]
+
+
+def check_watched(out: str) -> None:
+    """Check early that OUT can be replaced again and again.
+
+    Raises
+    ------
+    InputError
+        If it is a pipe or a device.
+    """
+    try:
+        mode = Path(out).stat().st_mode
+    except OSError:
+        return
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a folder is refused by others, in their words
+        raise InputError(f"cannot write {out} again and again: it is no file")
+
+
+def check_picture(picture: Path) -> None:
+    """Check early that a picture can be drawn.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder.
+    UnavailableError
+        If matplotlib is not installed.
+    """
+    from ..viewer.pictures import require_matplotlib
+
+    require_folder(picture)
+    require_matplotlib()
+
+
+class Watch:
+    """The surface as far as it has come, in OUT and in a picture.
+
+    Parameters
+    ----------
+    out : str
+        File to replace.
+    picture : Path or None
+        PNG to replace.
+    target : Target
+        What of the surface is written.
+    metadata : callable
+        Returns the metadata of the surface; called when the first state is written.
+    name : str
+        What the surface is called in the picture if its metadata do not say.
+    """
+
+    def __init__(
+        self, out: str, picture: Path | None, target: Target, metadata: Callable[[], Mapping[str, Any]], name: str
+    ) -> None:
+        self._out = out
+        self._picture = picture
+        self._target = target
+        self._metadata = metadata
+        self._name = name
+
+    def write(self, view: View, layout: Layout) -> None:
+        """Write and draw a state that better ones follow.
+
+        What the format leaves out is not told here, since it is told of the last state.
+
+        Raises
+        ------
+        FormatError, CorruptStreamError
+            If the surface cannot be written, or has no value.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FormatWarning)
+            write_surface(view.surface(self._target.level, self._metadata()), self._out)
+        self.draw(view, layout)
+        within = "at most " if view.bound else ""
+        note(f"{self._out}: {human_size(view.bytes)}, level {view.level}, RMS error {within}{view.rms:.4g}")
+
+    def draw(self, view: View, layout: Layout) -> None:
+        """Draw a state, if a picture is wanted."""
+        if self._picture is not None:
+            from ..viewer.pictures import draw
+
+            name = self._metadata().get("name")
+            window = self._target.region is not None
+            draw(view, None if window else layout, name if isinstance(name, str) else self._name, self._picture)
