@@ -29,7 +29,7 @@ from .arguments import (
     target_of,
 )
 from .inputs import input_files, named
-from .outcome import Outcome, check_grid, check_out, note_unmet
+from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
             raise named(error, options.container) from None
     view = job.view or job.decoder.view()
     assert job.decoder.header is not None, "there is a view, so there is a header"
-    note_unmet(target, job.ended, view, job.decoder.header.extent)
+    note_unmet(target, job.ended, view, job.decoder.header)
     outcome = Outcome(
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
@@ -113,6 +113,7 @@ def run(args: argparse.Namespace) -> int:
         view.bound,
         time.monotonic() - started,
         job.ended,
+        channel_errors(view, job.decoder.header),
     )
     outcome.write(options.out)
     outcome.report(options.json)
@@ -226,12 +227,11 @@ class _Job:
         self.decoder.finish()
 
     def _met(self, view: View) -> str:
+        from lodestream.planning.limits import ErrorLimits
+
         header = self.decoder.header
         assert header is not None, "there is a view, so there is a header"
         if view.complete:
             return "complete"
-        if self._target.until_rms is not None and view.rms <= self._target.until_rms.absolute(header.extent):
-            return "rms"
-        if self._target.until_max is not None and view.max_error <= self._target.until_max.absolute(header.extent):
-            return "max"
-        return "complete"
+        limits = ErrorLimits.of(self._target, header)
+        return limits.met(view.rms, view.max_error, view.channels) or "complete"

@@ -36,7 +36,7 @@ from .arguments import (
     token_of,
 )
 from .keeping import Kept
-from .outcome import Outcome, check_grid, check_out, note_unmet
+from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 
 if TYPE_CHECKING:
     from ..stream.reconnecting import Transport
@@ -253,9 +253,10 @@ def _outcome(options: PullOptions, kept: Kept, stream: Stream, started: float, *
     header, ended = decoder.header, stream.ended
     assert header is not None, "there is a view, so there is a header"
     assert ended is not None, "the iteration has ended"
-    note_unmet(target, ended, view, header.extent)
-    surface = view.surface(target.level, metadata)
-    return Outcome(surface, view.bytes, wire_bytes, view.level, view.rms, view.max_error, view.bound, seconds, ended)
+    note_unmet(target, ended, view, header)
+    surface, errors = view.surface(target.level, metadata), (view.rms, view.max_error, view.bound)
+    channels = channel_errors(view, header)
+    return Outcome(surface, view.bytes, wire_bytes, view.level, *errors, seconds, ended, channels)
 
 
 def _words(error: BaseException) -> str:
