@@ -103,7 +103,7 @@ class ErrorLimits:
 def _named(target: Target, header: Header) -> dict[str, list[tuple[int, ...]]]:
     """The channels that each name stands for; a name that several have stands for each of them."""
     wanted = selection_of(target).channels(header)
-    groups = [(name, (number,)) for number, name in enumerate(header.channel_names)]
+    groups: list[tuple[str, tuple[int, ...]]] = [(name, (number,)) for number, name in enumerate(header.channel_names)]
     first = header.point_channels
     for kind in header.attributes:
         if kind.components:

@@ -186,7 +186,7 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
             _append(ranges, chunk.range)
             size += chunk.range.length
         state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
-        figures = state.errors
+        figures = state.errors if target.region is None else Errors(state.rms, state.max_error)
         if bounded or target.region is None:
             figures = within(figures, None if chosen.chunks else number)
         last, ended = Mark(size, number, finest, size, *figures), "complete"

@@ -6,7 +6,7 @@ import itertools
 import re
 from dataclasses import replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from lodestream.container import Index
 from lodestream.planning.limits import ErrorLimits
 from lodestream.planning.planner import plan
 from lodestream.protocol.connection import State
-from lodestream.protocol.messages import Opened, Stop
+from lodestream.protocol.messages import Open, Opened, Stop
 from lodestream.protocol.wire import parse, serialize
 from lodestream.target import Order
 from lodestream.transfer.download import Download, Ended
@@ -43,16 +43,17 @@ def made() -> tuple[bytes, Index]:
     return container, index_of(container)
 
 
-def differences(view: ls.View, name: str) -> NDArray[np.float64]:
+def differences(view: ls.View, name: str) -> NDArray[Any]:
     """Distances of a view from the original, (row, column), of a channel or an attribute."""
     shown, original = view.surface(), surface()
-    if name == "z":
-        return shown.points.astype(np.float64) - original.points
     base, _, part = name.partition("_")
-    delta = shown.attributes[base].astype(np.float64) - original.attributes[base]
+    one, other = (each.points if base == "z" else each.attributes[base] for each in (shown, original))
+    delta: NDArray[Any] = one.astype(np.float64) - other
     if part:
-        return delta[..., int(part)]
-    return delta if delta.ndim == 2 else np.sqrt((delta**2).sum(axis=2))
+        delta = delta[..., int(part)]
+    elif delta.ndim == 3:
+        delta = np.sqrt((delta**2).sum(axis=2))
+    return delta
 
 
 def error(view: ls.View, name: str, which: str) -> float:
@@ -91,7 +92,7 @@ class Old(Sender):
 
     def receive(self, message: bytes) -> Any:
         event = parse(message)
-        if event.type == "open":
+        if isinstance(event, Open):
             message = serialize(replace(event, target=replace(event.target, until_rms=None, until_max=None)))
         return super().receive(message)
 
@@ -129,11 +130,10 @@ def test_a_client_stops_by_itself_where_the_server_does_not_know_them(kind: type
 def test_of_components_the_error_is_that_of_the_distance() -> None:
     _, index = made()
     header = index.header
-    for record, which in itertools.product(index.layers, (0, 1)):
-        own = [record.channels[k][which] for k in (2, 3)]
-        kind: Literal["until_rms", "until_max"] = "until_max" if which else "until_rms"
-        together = ErrorLimits.of(ls.Target(**{kind: {"wind": 1.0}}), header).channels[0].error(record.channels)
-        assert together == pytest.approx(np.hypot(*own))
+    targets = ls.Target(until_rms={"wind": 1.0}), ls.Target(until_max={"wind": 1.0})
+    for record, (which, target) in itertools.product(index.layers, enumerate(targets)):
+        together = ErrorLimits.of(target, header).channels[0].error(record.channels)
+        assert together == pytest.approx(np.hypot(record.channels[2][which], record.channels[3][which]))
 
 
 def test_a_surface_of_one_channel_has_the_error_of_the_whole() -> None:

@@ -56,7 +56,7 @@ export function regionFirst(index: Index, chosen: Plan, region: Region): Plan {
   }
   return {
     ...chosen,
-    before: [index.index],
+    before: [index.index, ...chosen.before.filter(({ offset }) => offset !== index.index.offset)],
     ranges: [...head, ...first, ...rest],
     marks: [...reordered(steps)],
     prefix: false,
@@ -96,7 +96,7 @@ function* reordered(steps: readonly Step[]): Generator<Mark> {
         const sent = inRegion ? size : end.ahead + size;
         // Figures are those of a state by itself: all of it, and nothing else, is there.
         const alone = inRegion ? step.behind === 0 : step.ahead === end.ahead;
-        const unknown = { bytes: sent, rms: Number.NaN, maxError: Number.NaN };
+        const unknown = { bytes: sent, rms: Number.NaN, maxError: Number.NaN, channels: [] };
         yield { ...step.mark, sent, ...(alone ? {} : unknown) };
       }
       before = size;
