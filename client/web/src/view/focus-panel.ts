@@ -65,6 +65,14 @@ export class FocusPanel {
     "aria-label": "Target value",
     hidden: true,
   });
+  private readonly attribute = html("select", { class: "grow", id: "attribute" });
+  private readonly attributeRow = html(
+    "div",
+    { class: "row", hidden: true },
+    html("label", { for: "attribute" }, "Error of"),
+    this.attribute,
+  );
+  private attributes = "";
   private readonly rate = html("select", { id: "rate", class: "grow" }, ...options(RATES));
   private readonly below = html("input", { type: "checkbox", checked: true, id: "below" });
   private readonly button = html("button", { type: "button", class: "primary" }, "Stop");
@@ -87,6 +95,7 @@ export class FocusPanel {
     html("div", { class: "row end" }, this.axis),
     html("div", { class: "row" }, html("label", { for: "moment" }, "Moment"), this.slider, this.shown),
     html("div", { class: "row" }, html("label", { for: "target" }, "Target"), this.target, this.amount),
+    this.attributeRow,
     html("div", { class: "row" }, html("label", { for: "rate" }, "Link"), this.rate),
     html("div", { class: "row check" }, html("label", {}, this.below, "Stop when below a pixel")),
     html("div", { class: "row" }, this.button),
@@ -98,6 +107,7 @@ export class FocusPanel {
     this.slider.addEventListener("input", () => this.slide(Number(this.slider.value)));
     this.target.addEventListener("change", () => this.chooseTarget());
     this.amount.addEventListener("change", () => this.sendTarget());
+    this.attribute.addEventListener("change", () => this.sendTarget());
     this.rate.addEventListener("change", () => actions.throttle(Number(this.rate.value) || null));
     this.below.addEventListener("change", () => actions.stopBelowPixel(this.below.checked));
   }
@@ -110,6 +120,7 @@ export class FocusPanel {
 
   /** Asks another session for what is chosen, as far as that is not what it does anyway. */
   begin(): void {
+    this.attribute.value = ""; // another surface may have others
     if (this.target.value !== "all") this.sendTarget();
     if (Number(this.rate.value) > 0) this.actions.throttle(Number(this.rate.value));
   }
@@ -134,6 +145,7 @@ export class FocusPanel {
     const unit = info?.unit ?? "";
     setText(this.status, statusText(state));
     setText(this.detail, detailText(state));
+    this.offer(info?.attributes.map(({ name }) => name) ?? []);
     const total = progress.planned || info?.size || 0;
     this.done.style.width = `${total > 0 ? Math.min(100, (100 * progress.bytes) / total) : 0}%`;
     setText(this.rms, drawn === null ? "–" : errorText(drawn.rms, unit));
@@ -152,6 +164,18 @@ export class FocusPanel {
     this.button.hidden = isWhole(state);
   }
 
+  /** Lets an error be that of an attribute, where there are any. */
+  private offer(names: readonly string[]): void {
+    const known = JSON.stringify(names);
+    if (known !== this.attributes) {
+      this.attributes = known;
+      const all: [string, string][] = [["", "the surface"], ...names.map((name): [string, string] => [name, name])];
+      this.attribute.replaceChildren(...options(all));
+    }
+    const { value } = this.target;
+    this.attributeRow.hidden = names.length === 0 || (value !== "rms" && value !== "max");
+  }
+
   private slide(to: number): void {
     this.actions.show(to >= Number(this.slider.max) ? null : to);
   }
@@ -159,6 +183,7 @@ export class FocusPanel {
   private chooseTarget(): void {
     const kind = this.target.value;
     this.amount.hidden = kind === "all";
+    this.offer(this.last?.info?.attributes.map(({ name }) => name) ?? []);
     const drawn = this.last?.drawn;
     const suggestion: Readonly<Record<string, number>> = {
       rms: (drawn?.rms ?? 1) / 4,
@@ -179,7 +204,10 @@ export class FocusPanel {
     else if (kind === "level")
       this.actions.setTarget({ level: Math.min(Math.round(amount), this.last?.info?.levels ?? 0) });
     else if (kind === "bytes") this.actions.setTarget({ bytes: Math.round(amount * 1000) });
-    else this.actions.setTarget(kind === "rms" ? { rms: amount } : { max: amount });
+    else {
+      const of = this.attribute.value === "" ? {} : { attribute: this.attribute.value };
+      this.actions.setTarget(kind === "rms" ? { rms: amount, ...of } : { max: amount, ...of });
+    }
   }
 }
 
